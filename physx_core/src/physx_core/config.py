@@ -1,0 +1,250 @@
+"""Configurations: frozen, validated dataclasses that load from and save to one TOML file."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import tomllib
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar, dataclass_transform
+
+from physx_core.errors import ConfigError, ConfigFileError, UnknownOptionError
+
+T = TypeVar("T")
+
+
+@dataclass_transform(field_specifiers=(field,), frozen_default=True)
+def configuration(cls: type[T]) -> type[T]:
+    """Make a frozen dataclass whose constructor names what is wrong with its arguments.
+
+    Field metadata may hold ``minimum`` (a number) and ``choices`` (the only values allowed).
+    Attribute docstrings become the help texts of the command line.
+    """
+    return options(dataclass(frozen=True)(cls))
+
+
+def options(cls: type[T]) -> type[T]:
+    """Give a dataclass a constructor that raises `ConfigError` for unknown or unfit options."""
+    construct = cls.__init__
+    names = [f.name for f in dataclasses.fields(cls) if f.init]  # type: ignore[arg-type]
+
+    @functools.wraps(construct)
+    def checked(self: Any, *args: Any, **kwargs: Any) -> None:
+        unknown = kwargs.keys() - set(names)
+        if unknown and type(self).__init__ is checked:
+            raise UnknownOptionError(cls.__name__, unknown, names)
+        try:
+            construct(self, *args, **kwargs)
+        except TypeError as error:
+            raise ConfigError(f"{cls.__name__}: {str(error).split('() ')[-1]}.") from error
+        _validate(self, cls)
+
+    cls.__init__ = checked  # type: ignore[assignment]
+    return cls
+
+
+@functools.lru_cache(maxsize=None)
+def _hints(cls: type[Any]) -> dict[str, Any]:
+    return typing.get_type_hints(cls)
+
+
+def _validate(instance: Any, cls: type[Any]) -> None:
+    import typeguard
+
+    for option in dataclasses.fields(cls):
+        if not option.init:
+            continue
+        value = getattr(instance, option.name)
+        where = f"{cls.__name__}.{option.name}"
+        try:
+            typeguard.check_type(value, _hints(cls)[option.name])
+        except typeguard.TypeCheckError as error:
+            raise ConfigError(f"{where} is {value!r}, of the wrong type: {error}.") from None
+        if value is None:
+            continue
+        minimum, choices = option.metadata.get("minimum"), option.metadata.get("choices")
+        if minimum is not None and value < minimum:
+            raise ConfigError(f"{where} is {value!r} but must be at least {minimum}.")
+        if choices is not None and value not in choices:
+            allowed = ", ".join(repr(choice) for choice in choices)
+            raise ConfigError(f"{where} is {value!r} but must be one of {allowed}.")
+
+
+def at_least(minimum: float, default: Any = dataclasses.MISSING) -> Any:
+    """Return a dataclass field for a number that is not below `minimum`."""
+    return field(default=default, metadata={"minimum": minimum})
+
+
+MODES = ("training", "validation", "prediction")
+"""The modes of a dataset."""
+
+
+@configuration
+class EnvironmentConfig:
+    """Which environment makes the samples, and how its instances run."""
+
+    environment: str | type[Any]
+    """Reference "plugin/name", "package.module:Class", "script.py:Class", or the class itself."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the environment's constructor."""
+    as_tcp_ip_client: bool = True
+    """Run each instance in a process of its own; otherwise all of them in this process."""
+    num_clients: int = at_least(1, 1)
+    """Number of instances. The same seed and number give the same samples, however they run."""
+    ip_address: str = "127.0.0.1"
+    """Address that the server listens at."""
+    port: int = at_least(0, 0)
+    """Port that the server listens at; 0: any free one."""
+    simulations_per_step: int = at_least(1, 1)
+    """Calls of `step` for one sample; `compute_training_data` is False in all but the last."""
+    max_wrong_samples_per_step: int = at_least(0, 10)
+    """How many samples in a row `check_sample` may refuse before the run ends with an error."""
+    always_produce: bool = False
+    """Make new samples in every epoch of a training, not only in the first."""
+    visualizer: str | None = None
+    """Visualizer, for example "rerun"; None: the environment has no factory."""
+    visualizer_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the visualizer."""
+    seed: int | None = None
+    """Seed of all instances' random streams; None: a fresh one, noted in the session."""
+    timeout: float = at_least(0.1, 60.0)
+    """Longest time in s that a client may stay silent while the server waits for it."""
+
+
+@configuration
+class DatasetConfig:
+    """Where samples are kept and how they are read."""
+
+    existing_dir: str | None = None
+    """Folder of an existing session or dataset to read; it is never modified."""
+    mode: str = field(default="training", metadata={"choices": MODES})
+    """Mode that is written or read: "training", "validation" or "prediction"."""
+    max_file_size: float = at_least(1e-6, 0.25)
+    """Size in GB at which a partition is full and the next one begins."""
+    shuffle: bool = True
+    """Read each epoch in a new random order; otherwise in the order of writing."""
+    normalize: bool = False
+    """Give networks each component with mean 0 and standard deviation 1."""
+    recompute_normalization: bool = False
+    """Compute mean and standard deviation from the stored rows instead of the stored values."""
+
+
+@configuration
+class NetworkConfig:
+    """Which network is trained or asked, and how it is optimized."""
+
+    network: str | type[Any] | None = None
+    """Reference of the network; None: the one that the checkpoint names (prediction only)."""
+    network_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the network's constructor."""
+    optimization: str | type[Any] | None = None
+    """Reference of the optimization; None: the one that the network brings."""
+    optimization_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the optimization's constructor."""
+    transformation: str | type[Any] | None = None
+    """Reference of the transformation; None: the one that the network brings."""
+    transformation_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the transformation's constructor."""
+    loss: str | type[Any] | None = None
+    """Loss function, a class or the name of one of the network's library."""
+    optimizer: str | type[Any] | None = None
+    """Optimizer, a class or the name of one of the network's library."""
+    optimizer_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Further keyword arguments of the optimizer."""
+    lr: float | None = None
+    """Learning rate; None: the optimizer's own."""
+    network_dir: str | None = None
+    """Session or network folder whose parameters a training starts from."""
+    network_name: str = "network"
+    """Name of the checkpoints in the session."""
+    which_network: int = -1
+    """Number of the checkpoint to load; -1: the last."""
+    save_each_epoch: bool = False
+    """Keep a checkpoint of every epoch, not only the one at the end."""
+    data_type: str = field(default="float32", metadata={"choices": ("float32", "float64")})
+    """Floating type that the network computes in."""
+    device: str = "auto"
+    """Where the network computes: "cpu", "cuda", "cuda:1" ... or "auto"."""
+    require_training_stuff: bool = True
+    """Whether a training needs `loss` and `optimizer`; False where the optimization has its own."""
+
+
+def to_plain(config: Any) -> dict[str, Any]:
+    """Return a configuration as data that TOML can hold; options that are None are left out."""
+    return {
+        name: _plain_value(f"{type(config).__name__}.{name}", getattr(config, name))
+        for name in (f.name for f in dataclasses.fields(config) if f.init and f.repr)
+        if getattr(config, name) is not None
+    }
+
+
+def _plain_value(where: str, value: Any) -> Any:
+    if isinstance(value, type):
+        return f"{value.__module__}:{value.__qualname__}"
+    if dataclasses.is_dataclass(value):
+        return to_plain(value)
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {
+            str(key): _plain_value(f"{where}.{key}", item)
+            for key, item in value.items()
+            if item is not None
+        }
+    if isinstance(value, (list, tuple)):
+        return [_plain_value(where, item) for item in value]
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, (bool, int, float, str)):
+        return value
+    raise ConfigError(f"{where} is {value!r}, which a TOML file cannot hold.")
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Return the content of a TOML file.
+
+    Raises:
+        ConfigFileError: The file is missing or is not TOML.
+    """
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigFileError(f"There is no configuration file {path}.") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigFileError(f"{path} is not valid TOML: {error}.") from None
+
+
+def write_toml(path: str | Path, plain: Mapping[str, Any]) -> None:
+    """Write plain data as a TOML file."""
+    import tomli_w
+
+    Path(path).write_text(tomli_w.dumps(plain), encoding="utf-8")
+
+
+def from_plain(make: Callable[..., T], plain: Mapping[str, Any]) -> T:
+    """Make a configuration from plain data; tables become the configurations that belong there.
+
+    Args:
+        make: A configuration, or another dataclass made by `options`.
+        plain: Option names to values, as `to_plain` gives them.
+
+    Raises:
+        ConfigError: An option is unknown or has an unfit value.
+    """
+    hints = _hints(make)  # type: ignore[arg-type]
+    values = {}
+    for name, value in plain.items():
+        nested = _configuration_in(hints.get(name))
+        is_table = nested is not None and isinstance(value, Mapping)
+        values[name] = from_plain(nested, value) if nested and is_table else value
+    return make(**values)
+
+
+def _configuration_in(hint: Any) -> type[Any] | None:
+    for candidate in (hint, *typing.get_args(hint)):
+        if isinstance(candidate, type) and dataclasses.is_dataclass(candidate):
+            return candidate
+    return None

@@ -1,0 +1,99 @@
+"""Network: what learns to predict fields from fields."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from physx_core.fields import Batch, Field
+
+Tensors = dict[str, Any]
+"""Field name to a tensor of the network's library, with a leading sample axis."""
+
+
+class Network(ABC):
+    """Base of all networks; a plugin's base class implements it for one library.
+
+    Tensors are of the library's own type. Every dictionary of tensors has the sample axis first.
+
+    Attributes:
+        net_fields: Fields that the network reads.
+        opt_fields: Fields that the loss compares the prediction with.
+        pred_fields: Fields that the network predicts; the i-th has shape, unit and normalization
+            of the i-th of `opt_fields`.
+        parameters_file: Name of the file that `save_parameters` writes into a checkpoint.
+        default_optimization: Reference of the optimization used where none is configured.
+        default_transformation: Reference of the transformation used where none is configured.
+    """
+
+    parameters_file: ClassVar[str]
+    default_optimization: ClassVar[str]
+    default_transformation: ClassVar[str]
+
+    net_fields: Sequence[str] = ("input",)
+    opt_fields: Sequence[str] = ("ground_truth",)
+    pred_fields: Sequence[str] = ("prediction",)
+
+    def bind(self, fields: Mapping[str, Field]) -> None:
+        """Learn the shapes of the fields in `net_fields` and `opt_fields` before the first batch.
+
+        Args:
+            fields: The dataset's or checkpoint's fields by name.
+
+        Raises:
+            FieldsMismatchError: A field is missing, or its shape is not what the network takes.
+        """
+
+    @abstractmethod
+    def predict(self, data: Tensors) -> Tensors:
+        """Return ``{field: tensor}`` for `pred_fields` from the `net_fields` in `data`."""
+
+    @abstractmethod
+    def set_train(self) -> None:
+        """Get ready to be trained."""
+
+    @abstractmethod
+    def set_eval(self) -> None:
+        """Get ready to predict: no gradients are recorded."""
+
+    @abstractmethod
+    def set_device(self, device: str) -> None:
+        """Move to a device, ``"auto"``: the fastest that is there.
+
+        Raises:
+            ConfigError: The device does not exist on this machine.
+        """
+
+    @abstractmethod
+    def set_data_type(self, data_type: str) -> None:
+        """Compute in ``"float32"`` or ``"float64"``."""
+
+    @abstractmethod
+    def get_parameters(self) -> dict[str, Any]:
+        """Return the parameters by name."""
+
+    @abstractmethod
+    def nb_parameters(self) -> int:
+        """Return how many numbers the parameters hold."""
+
+    @abstractmethod
+    def save_parameters(self, path: Path) -> None:
+        """Write the parameters to a file that can be read without running code."""
+
+    @abstractmethod
+    def load_parameters(self, path: Path) -> None:
+        """Read parameters that `save_parameters` wrote.
+
+        Raises:
+            CheckpointError: The file is missing, damaged or of another architecture.
+        """
+
+    @abstractmethod
+    def numpy_to_tensor(self, batch: Batch) -> Tensors:
+        """Return arrays as tensors of the network's type and device; shares memory if it can."""
+
+    @abstractmethod
+    def tensor_to_numpy(self, tensors: Tensors) -> Batch:
+        """Return tensors as arrays on the processor's side."""

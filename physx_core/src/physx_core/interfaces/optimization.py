@@ -1,0 +1,58 @@
+"""Optimization: computes the loss and improves the network's parameters."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+from physx_core.interfaces.network import Network, Tensors
+
+
+class Optimization(ABC):
+    """Base of all optimizations."""
+
+    @abstractmethod
+    def set_loss(self, loss: str | type[Any] | None) -> None:
+        """Choose the loss function, by class or by its name in the network's library.
+
+        Raises:
+            ConfigError: There is no such loss, or one is needed and none was given.
+        """
+
+    @abstractmethod
+    def set_optimizer(
+        self, optimizer: str | type[Any] | None, network: Network, **kwargs: Any
+    ) -> None:
+        """Choose what changes the network's parameters, by class or by its name.
+
+        Args:
+            optimizer: Class or name.
+            network: Whose parameters are changed.
+            kwargs: Arguments of the optimizer, ``lr`` among them where it was configured.
+
+        Raises:
+            ConfigError: There is no such optimizer, or it refuses the arguments.
+        """
+
+    @abstractmethod
+    def compute_loss(self, prediction: Tensors, targets: Tensors, data: Tensors) -> Any:
+        """Return the loss of a prediction.
+
+        Args:
+            prediction: The network's `pred_fields`.
+            targets: The network's `opt_fields`.
+            data: The whole batch, for losses that need more.
+        """
+
+    def transform_loss(self, loss: Any, data: Tensors) -> dict[str, Any]:
+        """Return the statistics of this step; entries beside ``loss`` are recorded too.
+
+        Args:
+            loss: What `compute_loss` returned.
+            data: The whole batch.
+        """
+        return {"loss": loss}
+
+    @abstractmethod
+    def optimize(self, loss: Any) -> None:
+        """Change the parameters along the gradient of the loss."""

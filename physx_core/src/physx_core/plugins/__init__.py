@@ -1,0 +1,23 @@
+"""Plugins: components of pip-installed packages, found by the name of their entry point.
+
+A plugin is a module that an entry point of the group ``physx`` names. It implements some of the
+hooks in `physx_core.plugins.hookspecs` with the marker `hookimpl`.
+"""
+
+from __future__ import annotations
+
+from physx_core.plugins.hookspecs import GROUP, KINDS, hookimpl
+from physx_core.plugins.references import reference_of, resolve
+from physx_core.plugins.registry import Plugin, PluginInfo, available, load
+
+__all__ = [
+    "GROUP",
+    "KINDS",
+    "Plugin",
+    "PluginInfo",
+    "available",
+    "hookimpl",
+    "load",
+    "reference_of",
+    "resolve",
+]

@@ -1,0 +1,149 @@
+"""References: how a user names a component, and how it is found."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from physx_core.errors import ComponentNotFoundError, PluginError, ReferenceFormError, UsageError
+from physx_core.plugins.hookspecs import KINDS
+from physx_core.plugins.registry import load
+
+
+def resolve(kind: str, reference: Any) -> Any:
+    """Return the component that a reference names.
+
+    Args:
+        kind: ``environment``, ``network``, ``optimization``, ``transformation``, ``visualizer``
+            or ``backend``.
+        reference: ``"plugin/name"``; ``"plugin"`` where it has just one of the kind;
+            ``"package.module:Class"``; ``"script.py:Class"``; or the class itself.
+
+    Returns:
+        The class or factory; for ``backend`` an instance of it, ready to build simulations.
+
+    Raises:
+        PluginNotFoundError: The plugin is not installed.
+        PluginError: It is installed but broken.
+        ComponentNotFoundError: The plugin, module or script has nothing of that name.
+        ReferenceFormError: The reference has none of the forms above.
+    """
+    if kind not in KINDS:
+        raise ReferenceFormError(f'"{kind}" is no kind of component: {", ".join(KINDS)}.')
+    component = _find(kind, reference)
+    return component() if kind == "backend" and isinstance(component, type) else component
+
+
+def _find(kind: str, reference: Any) -> Any:
+    if not isinstance(reference, str):
+        if isinstance(reference, type):
+            return reference
+        raise ReferenceFormError(f"{reference!r} is neither a class nor the name of one.")
+    if ":" in reference:
+        place, _, name = reference.rpartition(":")
+        return _attribute(kind, _module(kind, place), name, place)
+    plugin_name, _, name = reference.partition("/")
+    if not plugin_name:
+        raise ReferenceFormError(
+            f'"{reference}" names no {kind}: give "plugin/name", "package.module:Class" '
+            'or "script.py:Class".'
+        )
+    plugin = load(plugin_name)
+    components = plugin.components.get(kind, {})
+    if not name and len(components) == 1:
+        name = next(iter(components))
+    if name not in components:
+        raise ComponentNotFoundError(kind, name, f'Plugin "{plugin_name}"', components)
+    component = components[name]
+    if not isinstance(component, str):
+        return component
+    try:
+        place, _, attribute = component.rpartition(":")
+        return getattr(importlib.import_module(place), attribute)
+    except Exception as error:  # a plugin's own import may fail in any way
+        text = f'Plugin "{plugin_name}" fails to import its {kind} "{name}": {error}'
+        raise PluginError(plugin_name, text) from error
+
+
+def _module(kind: str, place: str) -> ModuleType:
+    if place.endswith(".py"):
+        return _script(kind, Path(place))
+    try:
+        return importlib.import_module(place)
+    except ModuleNotFoundError as error:
+        if error.name is not None and (place == error.name or place.startswith(error.name + ".")):
+            raise ComponentNotFoundError(kind, place, "Python's module path", []) from error
+        raise
+
+
+def _script(kind: str, path: Path) -> ModuleType:
+    path = path.resolve()
+    main = sys.modules.get("__main__")
+    if main is not None and Path(getattr(main, "__file__", None) or ".").resolve() == path:
+        return main
+    digest = hashlib.sha1(str(path).encode(), usedforsecurity=False).hexdigest()[:12]
+    name = f"_physx_script_{digest}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise ComponentNotFoundError(kind, str(path), "The file system", [])
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    sys.path.insert(0, str(path.parent))
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _attribute(kind: str, module: ModuleType, name: str, place: str) -> Any:
+    found: Any = module
+    for part in name.split("."):
+        if not hasattr(found, part):
+            classes = [n for n, value in vars(module).items() if isinstance(value, type)]
+            raise ComponentNotFoundError(kind, name, place, classes)
+        found = getattr(found, part)
+    return found
+
+
+def reference_of(component: Any) -> str:
+    """Return the text by which another process finds a component.
+
+    Args:
+        component: A reference, which is returned as it is, or a class.
+
+    Raises:
+        UsageError: The class cannot be found from outside: it was defined in a function or in an
+            interactive session.
+    """
+    if isinstance(component, str):
+        return component
+    module, name = component.__module__, component.__qualname__
+    if "<locals>" in name:
+        raise UsageError(
+            f"{name} is defined inside a function, where no other process can find it. "
+            "Define it at the top level of a module, or run with as_tcp_ip_client=False."
+        )
+    source = sys.modules.get(module)
+    file = getattr(source, "__file__", None)
+    if module.startswith("_physx_script_") and file:
+        return f"{file}:{name}"
+    if module != "__main__":
+        return f"{module}:{name}"
+    spec = getattr(source, "__spec__", None)
+    if spec is not None and spec.name:
+        return f"{spec.name.removesuffix('.__main__') if not file else spec.name}:{name}"
+    if not file or not Path(file).is_file():
+        raise UsageError(
+            f"{name} is defined in an interactive session, where no other process can find it. "
+            "Put it into a file, or run with as_tcp_ip_client=False."
+        )
+    return f"{Path(file).resolve()}:{name}"
