@@ -46,7 +46,7 @@ def options(cls: type[T]) -> type[T]:
     return cls
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _hints(cls: type[Any]) -> dict[str, Any]:
     return typing.get_type_hints(cls)
 

@@ -100,16 +100,14 @@ class Factory:
         self._update("mesh", name, changes)
 
     def add_points(self, name: str, positions: ArrayLike, **look: Any) -> str:
-        """Add points: positions (n, 3) in m; ``color``, ``alpha``, ``scalar_field``, ``size`` in m."""
+        """Add points at positions (n, 3) in m; ``size`` is their radius in m."""
         return self._add("points", name, positions=positions, **look)
 
     def update_points(self, name: str, **changes: Any) -> None:
         """Change ``positions`` or the look of points."""
         self._update("points", name, changes)
 
-    def add_arrows(
-        self, name: str, positions: ArrayLike, vectors: ArrayLike, **look: Any
-    ) -> str:
+    def add_arrows(self, name: str, positions: ArrayLike, vectors: ArrayLike, **look: Any) -> str:
         """Add arrows from positions (n, 3) along vectors (n, 3), both in m."""
         return self._add("arrows", name, positions=positions, vectors=vectors, **look)
 
@@ -194,7 +192,7 @@ class Factory:
         )
 
     def update_robot(self, name: str, **changes: Any) -> None:
-        """Place a robot's links: ``poses`` (bodies, 7), each x, y, z in m and quaternion x, y, z, w."""
+        """Place a robot's links: ``poses`` (bodies, 7), x, y, z in m and quaternion x, y, z, w."""
         self._update("robot", name, changes)
 
     def _add(self, kind: str, name: str, **values: Any) -> str:

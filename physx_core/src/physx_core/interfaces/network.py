@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+from physx_core.errors import FieldsMismatchError, listed
 from physx_core.fields import Batch, Field
 
 Tensors = dict[str, Any]
@@ -45,6 +46,13 @@ class Network(ABC):
         Raises:
             FieldsMismatchError: A field is missing, or its shape is not what the network takes.
         """
+        missing = {
+            name: f"not there; there are {listed(fields)}"
+            for name in (*self.net_fields, *self.opt_fields)
+            if name not in fields
+        }
+        if missing:
+            raise FieldsMismatchError(f"{type(self).__name__} needs other fields", missing)
 
     @abstractmethod
     def predict(self, data: Tensors) -> Tensors:

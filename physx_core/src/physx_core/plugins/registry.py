@@ -91,7 +91,7 @@ def _owner(entry: EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _load(entry: EntryPoint) -> Plugin:
     info = PluginInfo(entry.name, (_owner(entry),), entry.value)
 
