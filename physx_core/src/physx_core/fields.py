@@ -72,10 +72,6 @@ class Field:
         count = int(np.prod(self.shape, dtype=np.int64)) if self.shape is not None else 0
         return count * np.dtype(self.dtype).itemsize
 
-    def with_value(self, value: Array) -> Field:
-        """Return this field with the shape of `value`, an array of one sample."""
-        return replace(self, shape=value.shape)
-
     def to_dict(self) -> dict[str, Any]:
         """Return the field as plain data for JSON or TOML."""
         plain: dict[str, Any] = {"name": self.name, "dtype": self.dtype, "role": self.role}

@@ -1,0 +1,1 @@
+"""Sources: where a pipeline's samples come from, all behind one interface."""
