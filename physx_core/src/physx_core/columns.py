@@ -145,17 +145,18 @@ def _converted(
     instance_id: int,
     step: int,
 ) -> Array:
-    place = {"field": name, "instance_id": instance_id, "step": step}
+    """Return a value that is no array of the field's shape and type as one, or raise."""
+    error: type[FieldShapeError | FieldTypeError] = FieldShapeError
     try:
-        array = np.asarray(value)
-    except ValueError as error:
-        raise FieldShapeError(f'field "{name}" is ragged: {error}.', **place) from error  # type: ignore[arg-type]
-    if not np.can_cast(array.dtype, dtype, "same_kind"):
-        raise FieldTypeError(  # type: ignore[arg-type]
-            f'field "{name}" holds {array.dtype} but is defined as {dtype}.', **place
-        )
-    if array.shape != shape:
-        raise FieldShapeError(  # type: ignore[arg-type]
-            f'field "{name}" has shape {array.shape} but is defined as {shape}.', **place
-        )
-    return array
+        array: Array = np.asarray(value)
+    except ValueError:
+        text = "is ragged: its parts have different lengths"
+    else:
+        if array.shape == shape and np.can_cast(array.dtype, dtype, "same_kind"):
+            return array
+        if array.shape != shape:
+            text = f"has shape {array.shape} but is defined as {shape}"
+        else:
+            text = f"holds {array.dtype} but is defined as {dtype}"
+            error = FieldTypeError
+    raise error(f'field "{name}" {text}.', field=name, instance_id=instance_id, step=step)

@@ -42,7 +42,7 @@ def options(cls: type[T]) -> type[T]:
             raise ConfigError(f"{cls.__name__}: {str(error).split('() ')[-1]}.") from error
         _validate(self, cls)
 
-    cls.__init__ = checked  # type: ignore[assignment]
+    cls.__init__ = checked  # type: ignore[method-assign]
     return cls
 
 
@@ -54,13 +54,14 @@ def _hints(cls: type[Any]) -> dict[str, Any]:
 def _validate(instance: Any, cls: type[Any]) -> None:
     import typeguard
 
+    hints = _hints(cls)
     for option in dataclasses.fields(cls):
         if not option.init:
             continue
         value = getattr(instance, option.name)
         where = f"{cls.__name__}.{option.name}"
         try:
-            typeguard.check_type(value, _hints(cls)[option.name])
+            typeguard.check_type(value, hints[option.name])
         except typeguard.TypeCheckError as error:
             raise ConfigError(f"{where} is {value!r}, of the wrong type: {error}.") from None
         if value is None:
@@ -234,7 +235,7 @@ def from_plain(make: Callable[..., T], plain: Mapping[str, Any]) -> T:
     Raises:
         ConfigError: An option is unknown or has an unfit value.
     """
-    hints = _hints(make)  # type: ignore[arg-type]
+    hints = _hints(make)
     values = {}
     for name, value in plain.items():
         nested = _configuration_in(hints.get(name))

@@ -113,7 +113,7 @@ def as_fields(given: FieldLike | Iterable[FieldLike], role: Role) -> list[Field]
     single = isinstance(given, (Field, str)) or (
         isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], str)
     )
-    items: list[Any] = [given] if single else list(given)
+    items: Iterable[Any] = [given] if single else given  # type: ignore[assignment]
     fields = [_as_field(item, role) for item in items]
     for field in fields:
         if field.name in RESERVED:

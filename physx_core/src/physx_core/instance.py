@@ -71,7 +71,7 @@ class Instance:
             draw: Whether a visualizer looks on.
 
         Raises:
-            EnvironmentFailedError: The environment cannot be imported, or one of its methods raised.
+            EnvironmentFailedError: The environment does not import, or one of its methods raised.
             PhysxError: What the environment raised, if it is an error of physx.
         """
         make = self._call("import", resolve, "environment", self._reference)

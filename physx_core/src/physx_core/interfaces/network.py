@@ -37,6 +37,14 @@ class Network(ABC):
     opt_fields: Sequence[str] = ("ground_truth",)
     pred_fields: Sequence[str] = ("prediction",)
 
+    @classmethod
+    def set_seed(cls, seed: int) -> None:  # noqa: B027
+        """Seed the random numbers from which the library draws first parameters.
+
+        Args:
+            seed: Not negative.
+        """
+
     def bind(self, fields: Mapping[str, Field]) -> None:
         """Learn the shapes of the fields in `net_fields` and `opt_fields` before the first batch.
 

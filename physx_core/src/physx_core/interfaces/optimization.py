@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 from physx_core.interfaces.network import Network, Tensors
 
 
 class Optimization(ABC):
-    """Base of all optimizations."""
+    """Base of all optimizations.
+
+    Attributes:
+        extra_fields: Fields of the batch that the loss reads beside those of the network.
+    """
+
+    extra_fields: Sequence[str] = ()
 
     @abstractmethod
     def set_loss(self, loss: str | type[Any] | None) -> None:
@@ -56,3 +63,6 @@ class Optimization(ABC):
     @abstractmethod
     def optimize(self, loss: Any) -> None:
         """Change the parameters along the gradient of the loss."""
+
+    def epoch_end(self) -> None:  # noqa: B027
+        """An epoch of the training is over, for example for a schedule of the learning rate."""

@@ -1,0 +1,146 @@
+"""Checkpoint: a folder with a network's parameters and all that is needed to use them.
+
+``checkpoint.toml`` names the network, its transformation, its fields and their normalization; the
+network's own library writes the parameters beside it. Nothing in it is code.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from physx_core.config import NetworkConfig, read_toml, to_plain, write_toml
+from physx_core.errors import CheckpointError, ConfigFileError, listed
+from physx_core.fields import Field
+from physx_core.interfaces.network import Network
+from physx_core.statistics import Normalization
+
+FORMAT_VERSION = 1
+DESCRIPTION = "checkpoint.toml"
+_KEPT = (
+    "network",
+    "network_kwargs",
+    "transformation",
+    "transformation_kwargs",
+    "data_type",
+)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint says of itself.
+
+    Attributes:
+        path: The checkpoint's folder.
+        network: References and arguments of network and transformation, as in `NetworkConfig`.
+        fields: The fields that the network reads and is compared with, by name.
+        normalization: Their normalization, by name; empty if nothing was normalized.
+        epoch: Number of epochs that the network was trained for.
+    """
+
+    path: Path
+    network: dict[str, Any]
+    fields: dict[str, Field]
+    normalization: dict[str, Normalization] = field(default_factory=dict)
+    epoch: int = 0
+
+
+def numbers(network_dir: Path, name: str) -> list[int]:
+    """Return the numbers of the checkpoints of one name in a folder, sorted."""
+    pattern = re.compile(re.escape(name) + r"_(\d+)")
+    if not network_dir.is_dir():
+        return []
+    found = (pattern.fullmatch(p.name) for p in network_dir.iterdir() if (p / DESCRIPTION).exists())
+    return sorted(int(match[1]) for match in found if match)
+
+
+def save(
+    network_dir: Path,
+    config: NetworkConfig,
+    network: Network,
+    fields: Mapping[str, Field],
+    normalization: Mapping[str, Normalization],
+    epoch: int,
+) -> Path:
+    """Write the next checkpoint ``<network_name>_<number>`` and return its folder.
+
+    It appears under its name only when it is complete.
+    """
+    number = max(numbers(network_dir, config.network_name), default=-1) + 1
+    path = network_dir / f"{config.network_name}_{number}"
+    partial = network_dir / f".{path.name}.partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    network.save_parameters(partial / network.parameters_file)
+    used = [name for name in (*network.net_fields, *network.opt_fields) if name in fields]
+    plain = to_plain(config)
+    write_toml(
+        partial / DESCRIPTION,
+        {
+            "format_version": FORMAT_VERSION,
+            "epoch": epoch,
+            **{key: plain[key] for key in _KEPT if key in plain},
+            "fields": [fields[name].to_dict() for name in dict.fromkeys(used)],
+            "normalization": {
+                name: normalization[name].to_dict() for name in used if name in normalization
+            },
+        },
+    )
+    if path.exists():
+        shutil.rmtree(path)
+    partial.rename(path)
+    return path
+
+
+def find(place: Path, name: str, which: int) -> Path:
+    """Return the folder of a checkpoint.
+
+    Args:
+        place: A session's folder, its network folder, or a checkpoint's own folder.
+        name: Name of the network.
+        which: Number of the checkpoint; -1: the last.
+
+    Raises:
+        CheckpointError: There is no such checkpoint; the message lists those that are there.
+    """
+    if (place / DESCRIPTION).exists():
+        return place
+    folder = place / "network" if (place / "network").is_dir() else place
+    known = numbers(folder, name)
+    if not known or which not in (-1, *known):
+        there = [p.name for p in folder.iterdir() if p.is_dir()] if folder.is_dir() else []
+        wanted = f"{name}_{which}" if which >= 0 else f"{name}_<number>"
+        raise CheckpointError(
+            f'There is no checkpoint "{wanted}" in {folder}. There are: {listed(there)}.'
+        )
+    return folder / f"{name}_{known[-1] if which == -1 else which}"
+
+
+def read(path: Path) -> Checkpoint:
+    """Return what a checkpoint's folder says of itself.
+
+    Raises:
+        CheckpointError: The description is missing, damaged or of a later format.
+    """
+    try:
+        plain = read_toml(path / DESCRIPTION)
+        if plain["format_version"] > FORMAT_VERSION:
+            raise CheckpointError(
+                f"{path} has format version {plain['format_version']}; this physx reads up to "
+                f"{FORMAT_VERSION}. Install a newer physx-core."
+            )
+        fields = [Field.from_dict(item) for item in plain["fields"]]
+        normalization = plain.get("normalization", {})
+        return Checkpoint(
+            path=path,
+            network={key: plain[key] for key in _KEPT if key in plain},
+            fields={item.name: item for item in fields},
+            normalization={n: Normalization.from_dict(c) for n, c in normalization.items()},
+            epoch=plain["epoch"],
+        )
+    except (ConfigFileError, KeyError, TypeError) as error:
+        raise CheckpointError(f"{path} is no readable checkpoint: {error}.") from error

@@ -1,0 +1,192 @@
+"""Making a pipeline from a TOML file and the options of the command line."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import itertools
+import textwrap
+import tomllib
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, TypeVar
+
+import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from physx_core.config import from_plain, read_toml
+from physx_core.errors import ConfigFileError, UnknownOptionError, UsageError, listed
+from physx_core.pipelines.pipeline import Pipeline
+
+P = TypeVar("P", bound=Pipeline)
+Registry = ConstructorRegistry
+
+
+def pipeline_from(make: type[P], verb: str, places: Sequence[str], words: Sequence[str]) -> P:
+    """Make a pipeline from what the user typed.
+
+    Args:
+        make: The pipeline's class.
+        verb: The command, for messages.
+        places: Options that the first words without a dash are for, for example
+            ``environment.environment``.
+        words: The words after the command. ``--config FILE`` names a TOML file whose table of the
+            pipeline's kind holds options; words after it replace them.
+
+    Raises:
+        PhysxError: An option is unknown or its value unfit.
+        SystemExit: Help was asked for, or the parser has shown a mistake.
+    """
+    table, rest = _take_file(make, list(words))
+    rest = _name_positionals(verb, places, rest)
+    defaults = _nested_defaults(make, table, rest)
+    options = _options_of(make, defaults, rest)
+    known = {name for name, _, _ in options} | defaults.keys()
+    unknown = table.keys() - known
+    if unknown:
+        raise UnknownOptionError(f"The table [{make.kind}]", unknown, known)
+    form = dataclasses.make_dataclass(verb, options, kw_only=True)
+    form.__doc__ = textwrap.dedent(make.__doc__ or "").split("\n\n")[0]
+    with _registry():
+        chosen: Any = tyro.cli(form, args=rest, prog=f"physx {verb}")
+    values = {_python_name(make, name): getattr(chosen, name) for name in (o[0] for o in options)}
+    return make(**values)
+
+
+def _take_file(make: type[Pipeline], words: list[str]) -> tuple[dict[str, Any], list[str]]:
+    """Return the pipeline's table of the file after ``--config``, and the words without it."""
+    if "--config" not in words:
+        return {}, words
+    place = words.index("--config")
+    if place + 1 == len(words):
+        raise UsageError("--config needs the path of a TOML file after it.")
+    path = words[place + 1]
+    tables = read_toml(path)
+    if not isinstance(tables.get(make.kind), dict):
+        names = [name for name, table in tables.items() if isinstance(table, dict)]
+        raise ConfigFileError(f"{path} has no table [{make.kind}]. It has: {listed(names)}.")
+    return dict(tables[make.kind]), words[:place] + words[place + 2 :]
+
+
+def _name_positionals(verb: str, places: Sequence[str], words: list[str]) -> list[str]:
+    named: list[str] = []
+    count = 0
+    while count < len(words) and not words[count].startswith("-"):
+        if count == len(places):
+            raise UsageError(f'"{words[count]}" is too much: see physx {verb} --help.')
+        named += [f"--{places[count].replace('_', '-')}", words[count]]
+        count += 1
+    return named + words[count:]
+
+
+def _nested_defaults(
+    make: type[Pipeline], table: Mapping[str, Any], words: Sequence[str]
+) -> dict[str, Any]:
+    """Return the configurations that the file describes, by option name."""
+    defaults: dict[str, Any] = {}
+    for option in _dataclass_fields(make):
+        name = _option_name(option.name)
+        if name != option.name and name in table:
+            plain = dict(table[name])
+            flag = f"--{name}.{name}"  # --environment.environment, --network.network
+            if name not in plain and flag in words[:-1]:
+                plain[name] = words[words.index(flag) + 1]
+            defaults[name] = from_plain(_configuration(make, option.name), plain)
+        elif name in table:
+            defaults[name] = table[name]
+    return defaults
+
+
+def _options_of(
+    make: type[Pipeline], defaults: Mapping[str, Any], words: Sequence[str]
+) -> list[tuple[str, Any, Any]]:
+    """Return name, type and default of the options, as `dataclasses.make_dataclass` takes them."""
+    hints, docs = typing.get_type_hints(make), _docstrings(make)
+    options: list[tuple[str, Any, Any]] = []
+    for option in _dataclass_fields(make):
+        name = _option_name(option.name)
+        default = defaults.get(name, option.default)
+        hint = hints[option.name]
+        if name != option.name:
+            hint = _configuration(make, option.name)
+            if default is None:
+                asked = any(word.startswith(f"--{name}.") for word in words)
+                if name == "environment" and not asked:
+                    continue  # it is optional, but has an option that is not
+                default = dataclasses.MISSING if name == "environment" else hint()
+        help_text = tyro.conf.arg(help=docs.get(option.name, ""))
+        annotated = Annotated[hint, help_text] if name == option.name else hint
+        options.append((name, annotated, dataclasses.field(default=default)))
+    return options
+
+
+def _dataclass_fields(make: type[Any]) -> list[dataclasses.Field[Any]]:
+    return [option for option in dataclasses.fields(make) if option.init]
+
+
+def _option_name(python_name: str) -> str:
+    return python_name.removesuffix("_config")
+
+
+def _python_name(make: type[Pipeline], name: str) -> str:
+    names = [option.name for option in _dataclass_fields(make)]
+    return name if name in names else f"{name}_config"
+
+
+def _configuration(make: type[Pipeline], python_name: str) -> Any:
+    hint = typing.get_type_hints(make)[python_name]
+    return next((c for c in typing.get_args(hint) if dataclasses.is_dataclass(c)), hint)
+
+
+def _docstrings(cls: type[Any]) -> dict[str, str]:
+    """Return the docstrings below the attributes in a class's source."""
+    tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
+    body = typing.cast("ast.ClassDef", tree.body[0]).body
+    docs: dict[str, str] = {}
+    for statement, following in itertools.pairwise(body):
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+            text = following.value if isinstance(following, ast.Expr) else None
+            docs[statement.target.id] = str(text.value) if isinstance(text, ast.Constant) else ""
+    return docs
+
+
+def _registry() -> Registry:
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def arguments(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+        if info.type != dict[str, Any]:
+            return None
+        return PrimitiveConstructorSpec(
+            nargs="*",
+            metavar="NAME=VALUE ...",
+            instance_from_str=lambda words: dict(_argument(word) for word in words),
+            is_instance=lambda value: isinstance(value, dict),
+            str_from_instance=lambda value: [f"{name}={item}" for name, item in value.items()],
+        )
+
+    @registry.primitive_rule
+    def reference(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+        if info.type not in (str | type[Any], str | type[Any] | None):
+            return None
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="REFERENCE",
+            instance_from_str=lambda words: words[0],
+            is_instance=lambda value: True,
+            str_from_instance=lambda value: [str(value)],
+        )
+
+    return registry
+
+
+def _argument(word: str) -> tuple[str, Any]:
+    """Return name and value of ``NAME=VALUE``; the value is TOML, or else a text."""
+    name, equals, text = word.partition("=")
+    if not equals:
+        raise ValueError(f"{word!r} is not NAME=VALUE")
+    try:
+        return name, tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name, text

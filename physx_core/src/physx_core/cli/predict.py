@@ -1,0 +1,23 @@
+"""``physx predict``: put a network into a running environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from physx_core.cli.options import pipeline_from
+from physx_core.pipelines.prediction import Prediction
+
+
+def run(words: Sequence[str]) -> None:
+    """Predict as the words say; the first word is a session's folder."""
+    words = list(words)
+    if words and not words[0].startswith("-"):
+        session = Path(words.pop(0))
+        words += ["--session-dir", str(session.parent), "--session-name", session.name]
+    places = ("environment.environment",)
+    with pipeline_from(Prediction, "predict", places, words) as pipeline:
+        pipeline.execute()
+    print(f"{pipeline.step_id} steps with {pipeline.learner.config.network}")
+    if pipeline.record:
+        print(f"recorded: {pipeline.session.dataset_dir}")

@@ -1,0 +1,19 @@
+"""``physx train``: train a network."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from physx_core.cli.options import pipeline_from
+from physx_core.pipelines.training import Training
+
+
+def run(words: Sequence[str]) -> None:
+    """Train as the words say and print the last losses and where the network is."""
+    with pipeline_from(Training, "train", ("dataset.existing_dir",), words) as pipeline:
+        pipeline.execute()
+    print(f"training loss {pipeline.training_loss:.6g}")
+    if not math.isnan(pipeline.validation_loss):
+        print(f"validation loss {pipeline.validation_loss:.6g}")
+    print(f"network: {pipeline.checkpoint_path}")

@@ -1,0 +1,55 @@
+"""ProgressBar: shows how far a run is."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from physx_core.interfaces.visualizer import Observer
+
+
+class ProgressBar(Observer):
+    """A bar on a terminal; elsewhere one line a minute and one at the end, fit for a log."""
+
+    def __init__(self) -> None:
+        self._bar: Any = None
+        self._is_terminal = sys.stderr.isatty()
+
+    def begin(self, task: str, total: int | None, unit: str) -> None:
+        """Begin a bar."""
+        from tqdm.auto import tqdm
+
+        self.end()
+        interval = 0.1 if self._is_terminal else 60.0
+        self._bar = tqdm(
+            desc=task,
+            total=total,
+            unit=f" {unit}",
+            mininterval=interval,
+            maxinterval=interval,
+            miniters=None if self._is_terminal else 0,
+            delay=0 if self._is_terminal else 60.0,
+            unit_scale=True,
+            file=sys.stderr,
+        )
+
+    def advance(self, count: int) -> None:
+        """Move the bar on."""
+        if self._bar is not None:
+            self._bar.update(count)
+
+    def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
+        """Show the numbers of an epoch behind the bar."""
+        if self._bar is not None and timeline == "epoch":
+            self._bar.set_postfix_str(", ".join(f"{k} {v:.3g}" for k, v in values.items()), False)
+
+    def end(self) -> None:
+        """Leave the finished bar standing."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+    def close(self) -> None:
+        """Leave the bar standing."""
+        self.end()

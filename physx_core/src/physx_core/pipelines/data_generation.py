@@ -1,0 +1,124 @@
+"""DataGeneration: environments make samples, and the dataset keeps them."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import KW_ONLY, dataclass, field
+from typing import ClassVar
+
+from physx_core.config import MODES, DatasetConfig, EnvironmentConfig, at_least, options
+from physx_core.dataset import Dataset
+from physx_core.errors import ConfigError
+from physx_core.fields import Batch
+from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
+from physx_core.pipelines.storage import describe_environment, open_own
+from physx_core.session import Session
+from physx_core.sources.source import Source
+
+
+@options
+@dataclass(eq=False)
+class DataGeneration(Pipeline):
+    """Makes ``batch_nb`` batches of ``batch_size`` samples and stores them in its session.
+
+    Attributes:
+        dataset: The session's dataset, open for writing.
+        source: The environments.
+        batch: The batch that was made last.
+        batch_id: Number of batches that are stored.
+    """
+
+    environment_config: EnvironmentConfig
+    dataset_config: DatasetConfig | None = None
+    session_dir: str = "sessions"
+    """Folder of the sessions, relative to the working directory."""
+    session_name: str = "data_generation"
+    """Name of the session's folder."""
+    new_session: bool = True
+    """Leave an existing session of this name alone and number the new one; otherwise add to it."""
+    _: KW_ONLY
+    batch_nb: int = at_least(1)
+    """Number of batches to make."""
+    batch_size: int = at_least(1)
+    """Number of samples in a batch."""
+    mode: str | None = field(default=None, metadata={"choices": MODES})
+    """Mode that the samples are stored in; None: that of the dataset's configuration."""
+
+    kind: ClassVar[str] = "data_generation"
+    dataset: Dataset = field(init=False, repr=False)
+    source: Source = field(init=False, repr=False)
+    batch: Batch = field(init=False, repr=False)
+    batch_id: int = field(init=False, repr=False, default=0)
+
+    def execute(self) -> None:
+        """Make all batches.
+
+        Raises:
+            PhysxError: An environment failed or gave data that cannot be stored; what was
+                committed stays.
+        """
+        with self._running():
+            self.data_generation_begin()
+            while self.batch_condition():
+                self.batch_begin()
+                self.batch_produce()
+                self.batch_count()
+                self.batch_end()
+            self.data_generation_end()
+
+    def data_generation_begin(self) -> None:
+        """The first batch is about to be made."""
+        self.batch_id = 0
+        self.observers.begin("generation", self.batch_nb * self.batch_size, "samples")
+
+    def batch_condition(self) -> bool:
+        """Return whether there are batches left to make."""
+        return self.batch_id < self.batch_nb
+
+    def batch_begin(self) -> None:
+        """A batch is about to be made."""
+
+    def batch_produce(self) -> None:
+        """Make a batch and store it; the samples are committed when this returns."""
+        self.batch = self.source.batch(self.batch_size)
+        if self.batch_id == 0:
+            self.dataset.define_fields(self._mode, self.source.fields)
+        self.dataset.append(self._mode, self.batch)
+
+    def batch_count(self) -> None:
+        """Count the batch."""
+        self.batch_id += 1
+        self.observers.advance(self.batch_size)
+
+    def batch_end(self) -> None:
+        """A batch is stored."""
+
+    def data_generation_end(self) -> None:
+        """The last batch is stored."""
+        self.observers.end()
+
+    @property
+    def _mode(self) -> str:
+        return self.mode or (self.dataset_config or DatasetConfig()).mode
+
+    def _open(self, resources: contextlib.ExitStack) -> None:
+        dataset_config = self.dataset_config or DatasetConfig()
+        if dataset_config.existing_dir is not None:
+            raise ConfigError(
+                "DataGeneration writes into the dataset of its own session, so it takes no "
+                "existing_dir. To add to a session, give its name and new_session=False."
+            )
+        config = self.environment_config
+        seed = chosen_seed(config.seed)
+        self.session = Session.create(self.session_dir, self.session_name, self.new_session)
+        self.dataset = resources.enter_context(open_own(self.session, dataset_config))
+        offset = self.dataset.num_samples(self._mode) if self._mode in self.dataset.modes else 0
+        self.dataset.update_info(**describe_environment(config, seed))
+        self._record_config(seed)
+        self._observe(resources, config)
+        self.source = self._open_source(
+            resources,
+            config,
+            stream_seed(seed, self._mode, offset),
+            total=self.batch_nb * self.batch_size,
+        )

@@ -1,0 +1,161 @@
+"""Pipeline: what the three pipelines share: a session, observers, and an orderly end."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
+from types import TracebackType
+from typing import ClassVar, Self
+
+import numpy as np
+
+from physx_core.config import EnvironmentConfig, to_plain
+from physx_core.errors import UsageError
+from physx_core.interfaces.visualizer import Observer
+from physx_core.observers import Observers, ProgressBar, ScalarsFile
+from physx_core.pipelines.services import Predict, RunServices
+from physx_core.plugins import resolve
+from physx_core.session import Session
+from physx_core.sources.source import Source
+
+_STREAMS = {"training": 0, "validation": 1, "prediction": 2}
+
+
+class Pipeline(ABC):
+    """Base of the pipelines.
+
+    A pipeline is a context manager: entering it opens its session, dataset, environments and
+    network, leaving it closes them, whatever happened. `execute` does both where it is called on a
+    pipeline that is not open. Subclasses may override every event method.
+
+    Attributes:
+        session: The run's folder; known once the pipeline is open.
+        observers: Progress bar, statistics and viewers.
+        kind: The pipeline's table in configuration files.
+    """
+
+    kind: ClassVar[str]
+    session: Session
+    observers: Observers
+    _resources: contextlib.ExitStack | None = None
+
+    @abstractmethod
+    def execute(self) -> None:
+        """Run the pipeline from its begin to its end."""
+
+    @abstractmethod
+    def _open(self, resources: contextlib.ExitStack) -> None:
+        """Open everything; what must be closed goes on the stack, in the order of opening."""
+
+    def __enter__(self) -> Self:
+        """Open the session and everything that the pipeline works with.
+
+        Raises:
+            UsageError: A script without ``if __name__ == "__main__":`` runs in a client.
+            PhysxError: Something that the pipeline needs is missing or fails.
+        """
+        if os.environ.get("PHYSX_CLIENT"):
+            raise UsageError(
+                "A client imports the script that defines its environment, and the script started "
+                'a pipeline. Put the pipeline under  if __name__ == "__main__":'
+            )
+        with contextlib.ExitStack() as resources:
+            self._open(resources)
+            self._resources = resources.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close everything."""
+        resources, self._resources = self._resources, None
+        if resources is not None:
+            resources.__exit__(kind, error, trace)
+
+    @contextlib.contextmanager
+    def _running(self) -> Iterator[None]:
+        """Be open for a while: open now and close at the end, unless the user did it."""
+        if self._resources is not None:
+            yield
+        else:
+            with self:
+                yield
+
+    def _observe(
+        self,
+        resources: contextlib.ExitStack,
+        environment: EnvironmentConfig | None,
+        further: Iterable[Observer] = (),
+    ) -> None:
+        """Open the observers of the run."""
+        observers: list[Observer] = [ProgressBar(), ScalarsFile(), *further]
+        instance_nb = 0
+        if environment is not None:
+            instance_nb = environment.num_clients
+            if environment.visualizer is not None:
+                make = resolve("visualizer", environment.visualizer)
+                observers.append(make(**environment.visualizer_kwargs))
+        self.observers = Observers(observers)
+        self.observers.open(self.session.name, self.session.path, instance_nb)
+        resources.callback(self.observers.close)
+
+    def _open_source(
+        self,
+        resources: contextlib.ExitStack,
+        config: EnvironmentConfig,
+        seed: Sequence[int],
+        *,
+        predict: Predict | None = None,
+        total: int | None = None,
+        in_process: bool = False,
+    ) -> Source:
+        """Open the environments, in this process or in clients.
+
+        Args:
+            resources: Closes them at the end.
+            config: Which environment, and where.
+            seed: Seed of the instances.
+            predict: The network's prediction for a batch; None: there is no network.
+            total: How many rows will be asked; None: unknown.
+            in_process: Whether they must run in this process.
+        """
+        services = RunServices(self.session.dataset_dir, self.observers, predict)
+        source: Source
+        if in_process or not config.as_tcp_ip_client:
+            from physx_core.sources.local import LocalSource
+
+            source = LocalSource(config, services, seed)
+        else:
+            from physx_core.sources.clients import ClientSource
+
+            ahead = None if predict is None else 0  # a network that learns changes its answers
+            source = ClientSource(config, services, seed, run_ahead=ahead, total=total)
+        return resources.enter_context(source)
+
+    def _record_config(self, seed: int) -> None:
+        plain = {**to_plain(self), "session_name": self.session.name}
+        plain = {name.removesuffix("_config"): value for name, value in plain.items()}
+        self.session.record(self.kind, plain, seed)
+
+
+def chosen_seed(seed: int | None) -> int:
+    """Return the seed, or a fresh one where none was given."""
+    if seed is not None:
+        return seed
+    return int(np.random.SeedSequence().generate_state(1, np.uint32)[0])
+
+
+def stream_seed(seed: int, mode: str, offset: int) -> list[int]:
+    """Return the seed of the environments of one run.
+
+    Args:
+        seed: The configured seed.
+        mode: Mode of the samples: two modes never get the same samples.
+        offset: Samples that the mode already holds: a run that adds some does not repeat them.
+    """
+    return [seed, _STREAMS[mode], offset]

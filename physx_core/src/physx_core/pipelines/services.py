@@ -1,0 +1,80 @@
+"""RunServices: what environments may ask of the pipeline that they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from physx_core.errors import UsageError
+from physx_core.fields import Batch, Sample
+from physx_core.interfaces.visualizer import Observer
+from physx_core.scene import Event
+from physx_core.transport.values import decode, encode
+
+Predict: TypeAlias = Callable[[Batch], Batch]
+"""The network's prediction for a batch, both in physical units."""
+
+
+class RunServices:
+    """Answers the requests of environments in this process; the server passes on the clients'."""
+
+    def __init__(self, dataset_dir: Path, observer: Observer, predict: Predict | None) -> None:
+        """Keep whom to ask.
+
+        Args:
+            dataset_dir: Where the instances' parameters are kept.
+            observer: Who looks at drawing events.
+            predict: The network's prediction; None: the pipeline has no network.
+        """
+        self._dir = dataset_dir
+        self._observer = observer
+        self._predict = predict
+
+    def predict(self, fields: Sample) -> Sample:
+        """Return the prediction for one sample.
+
+        Raises:
+            UsageError: The pipeline has no network.
+        """
+        batch = {name: np.asarray(value)[np.newaxis] for name, value in fields.items()}
+        return {name: values[0] for name, values in self.predict_batch(batch).items()}
+
+    def predict_batch(self, batch: Batch) -> Batch:
+        """Return the prediction for several samples.
+
+        Raises:
+            UsageError: The pipeline has no network.
+        """
+        if self._predict is None:
+            raise UsageError(
+                "get_prediction() needs a network, and data generation has none. "
+                "It works in training and prediction."
+            )
+        return self._predict(batch)
+
+    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
+        """Keep an instance's values beside the dataset; earlier ones of other names stay."""
+        path = self._parameters_file(instance_id)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        merged = {**self.load_parameters(instance_id), **values}
+        partial = path.with_suffix(".partial")
+        partial.write_bytes(encode(merged))
+        partial.replace(path)
+
+    def load_parameters(self, instance_id: int) -> dict[str, Any]:
+        """Return what an instance kept."""
+        path = self._parameters_file(instance_id)
+        if not path.exists():
+            return {}
+        values: dict[str, Any] = decode(path.read_bytes())
+        return values
+
+    def show(self, instance_id: int, step: int, events: list[Event]) -> None:
+        """Hand drawing events to the observers."""
+        self._observer.events(instance_id, step, events)
+
+    def _parameters_file(self, instance_id: int) -> Path:
+        return self._dir / f"parameters_{instance_id}.bin"

@@ -1,0 +1,243 @@
+"""Training: a network learns from a dataset, or from environments that make it."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import KW_ONLY, dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+from physx_core import checkpoint
+from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, at_least, options
+from physx_core.dataset import Dataset
+from physx_core.errors import ConfigError
+from physx_core.fields import Batch
+from physx_core.pipelines.learner import Learner
+from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
+from physx_core.pipelines.storage import describe_environment, open_existing, open_own
+from physx_core.pipelines.training_data import TrainingData
+from physx_core.plugins import resolve
+from physx_core.session import Session
+from physx_core.sources.source import Source
+
+
+@options
+@dataclass(eq=False)
+class Training(Pipeline):
+    """Trains a network for ``epoch_nb`` epochs of ``batch_nb`` batches of ``batch_size`` samples.
+
+    The samples come from an existing dataset (``dataset_config.existing_dir``), from the session's
+    own one, or from environments: these make new samples in the first epoch, which are stored and
+    used again in the later ones, or in every epoch with ``always_produce``.
+
+    Attributes:
+        learner: The network, its transformation and its optimization.
+        data: Where the batches come from.
+        batch: The present batch, in physical units.
+        epoch_id: Number of epochs that are finished.
+        batch_id: Number of batches of the present epoch that are finished.
+        losses: What `Optimization.transform_loss` returned for the present batch.
+        training_loss: Mean loss over the batches of the last epoch; NaN before its end.
+        validation_loss: Mean loss over the validation mode; NaN before the first validation.
+        checkpoint_path: Folder of the checkpoint that was written last.
+    """
+
+    network_config: NetworkConfig
+    dataset_config: DatasetConfig | None = None
+    environment_config: EnvironmentConfig | None = None
+    session_dir: str = "sessions"
+    """Folder of the sessions, relative to the working directory."""
+    session_name: str = "training"
+    """Name of the session's folder."""
+    new_session: bool = True
+    """Leave an existing session of this name alone and number the new one; otherwise use it."""
+    _: KW_ONLY
+    epoch_nb: int = at_least(1)
+    """Number of epochs."""
+    batch_size: int = at_least(1)
+    """Number of samples in a batch."""
+    batch_nb: int | None = at_least(1, None)
+    """Batches in an epoch; None: as many as it takes to see each stored sample once."""
+    seed: int | None = at_least(0, None)
+    """Seed of the network's first parameters and of the order of samples; None: a fresh one."""
+    validation_every: int = at_least(0, 1)
+    """Validate after each so many epochs, if the dataset has a validation mode; 0: never."""
+
+    kind: ClassVar[str] = "training"
+    learner: Learner = field(init=False, repr=False)
+    data: TrainingData = field(init=False, repr=False)
+    batch: Batch = field(init=False, repr=False)
+    epoch_id: int = field(init=False, repr=False, default=0)
+    batch_id: int = field(init=False, repr=False, default=0)
+    losses: dict[str, Any] = field(init=False, repr=False, default_factory=dict)
+    training_loss: float = field(init=False, repr=False, default=float("nan"))
+    validation_loss: float = field(init=False, repr=False, default=float("nan"))
+    checkpoint_path: Path | None = field(init=False, repr=False, default=None)
+
+    def execute(self) -> None:
+        """Train. Ctrl-C ends the training in order, with a checkpoint of what it reached.
+
+        Raises:
+            PhysxError: Data, network or environments are not what the training needs.
+        """
+        with self._running():
+            self.train_begin()
+            try:
+                while self.epoch_condition():
+                    self.epoch_begin()
+                    while self.batch_condition():
+                        self.batch_begin()
+                        self.batch_produce()
+                        self.optimize()
+                        self.batch_count()
+                        self.batch_end()
+                    self.epoch_count()
+                    self.epoch_end()
+            except KeyboardInterrupt:
+                if self._batch_total:
+                    self.save_checkpoint()
+                raise
+            self.train_end()
+
+    def train_begin(self) -> None:
+        """The first epoch is about to begin."""
+        self.epoch_id = 0
+
+    def epoch_condition(self) -> bool:
+        """Return whether there are epochs left."""
+        return self.epoch_id < self.epoch_nb
+
+    def epoch_begin(self) -> None:
+        """An epoch is about to begin."""
+        self.batch_id = 0
+        self._loss_sum = 0.0
+        self._epoch_batches = self.data.begin_epoch(self.epoch_id, self.learner.batch_fields)
+        task = f"epoch {self.epoch_id + 1}/{self.epoch_nb}"
+        self.observers.begin(task, self._epoch_batches, "batches")
+
+    def batch_condition(self) -> bool:
+        """Return whether there are batches left in the present epoch."""
+        return self.batch_id < self._epoch_batches
+
+    def batch_begin(self) -> None:
+        """A batch is about to be made or read."""
+
+    def batch_produce(self) -> None:
+        """Read the next batch, or have the environments make and the dataset store it."""
+        self.batch = self.data.next_batch()
+        if self.data.produces:  # the normalization grows with the samples
+            self.learner.bind(self.data.fields, self.data.normalization())
+            self.learner.network.set_train()
+
+    def optimize(self) -> None:
+        """Let the network learn from the batch."""
+        self.losses = self.learner.optimize(self.batch)
+
+    def batch_count(self) -> None:
+        """Count the batch and record its losses."""
+        self.batch_id += 1
+        self._batch_total += 1
+        self._loss_sum += self.losses["loss"]
+        values = {f"{name}/batch": value for name, value in self.losses.items()}
+        self.observers.scalars(values, self._batch_total, "batch")
+        self.observers.advance(1)
+
+    def batch_end(self) -> None:
+        """A batch is learned."""
+
+    def epoch_count(self) -> None:
+        """Count the epoch."""
+        self.epoch_id += 1
+
+    def epoch_end(self) -> None:
+        """Validate, record the epoch's losses, and keep a checkpoint if that is wanted."""
+        self.training_loss = self._loss_sum / self.batch_id
+        values = {"loss/training": self.training_loss}
+        every = self.validation_every
+        if every and self.epoch_id % every == 0 and self.data.has_validation:
+            self.validation_loss = values["loss/validation"] = self.validate()
+        self.learner.epoch_end()
+        self.observers.scalars(values, self.epoch_id, "epoch")
+        self.observers.end()
+        if self.network_config.save_each_epoch and self.epoch_id < self.epoch_nb:
+            self.save_checkpoint()
+
+    def train_end(self) -> None:
+        """The last epoch is over: keep the network."""
+        self.save_checkpoint()
+
+    def validate(self) -> float:
+        """Return the mean loss over the samples of the validation mode."""
+        return self.learner.mean_loss(self.data.validation_batches(self.learner.batch_fields))
+
+    def save_checkpoint(self) -> Path:
+        """Write the network into the session and return the checkpoint's folder."""
+        self.checkpoint_path = self.learner.save(self.session.network_dir, self.epoch_id)
+        return self.checkpoint_path
+
+    # Opening --------------------------------------------------------------------------------
+
+    def _open(self, resources: contextlib.ExitStack) -> None:
+        seed = chosen_seed(self.seed)
+        self._batch_total = 0
+        config = self.dataset_config or DatasetConfig()
+        environment = self.environment_config
+        if environment is not None and config.existing_dir is not None:
+            raise ConfigError(
+                "A training takes its samples from existing_dir or from an environment, not both."
+            )
+        if config.existing_dir is not None:  # a missing dataset leaves no session behind
+            Dataset.open(config.existing_dir).close()
+        self._seed_network(seed)
+        self.learner = Learner(self.network_config, trains=True)
+        self.session = Session.create(self.session_dir, self.session_name, self.new_session)
+        make = open_existing if environment is None else open_own
+        dataset = resources.enter_context(make(self.session, config))
+        self._record_config(seed)
+        self._observe(resources, environment)
+        source = None
+        if environment is not None:
+            source = self._open_environments(resources, environment, dataset, seed)
+        self.data = TrainingData(
+            dataset,
+            source,
+            config,
+            batch_size=self.batch_size,
+            batch_nb=self.batch_nb,
+            seed=seed,
+            always_produce=environment is not None and environment.always_produce,
+            data_type=self.network_config.data_type,
+        )
+        if source is None:
+            self.learner.bind(self.data.fields, self.data.normalization())
+        if self.network_config.network_dir is not None:
+            self._load_parameters(Path(self.network_config.network_dir))
+        self.learner.network.set_train()
+
+    def _seed_network(self, seed: int) -> None:
+        if self.network_config.network is not None:
+            component = resolve("network", self.network_config.network)
+            if hasattr(component, "set_seed"):
+                component.set_seed(seed)
+
+    def _load_parameters(self, place: Path) -> None:
+        config = self.network_config
+        path = checkpoint.find(place, config.network_name, config.which_network)
+        self.learner.network.load_parameters(path / self.learner.network.parameters_file)
+
+    def _open_environments(
+        self,
+        resources: contextlib.ExitStack,
+        config: EnvironmentConfig,
+        dataset: Dataset,
+        training_seed: int,
+    ) -> Source:
+        seed = training_seed if config.seed is None else config.seed
+        dataset.update_info(**describe_environment(config, seed))
+        stored = dataset.num_samples("training") if "training" in dataset.modes else 0
+        return self._open_source(
+            resources,
+            config,
+            stream_seed(seed, "training", stored),
+            predict=self.learner.predict_in_training,
+        )

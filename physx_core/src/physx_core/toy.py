@@ -1,0 +1,252 @@
+"""The plugin ``toy``: a spring and a linear model in pure NumPy.
+
+Documentation, tests and the template use it; it comes through the same hooks as any plugin.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.errors import CheckpointError, ConfigError, FieldsMismatchError
+from physx_core.fields import Array, Batch, Field
+from physx_core.interfaces.environment import Environment
+from physx_core.interfaces.network import Network, Tensors
+from physx_core.interfaces.optimization import Optimization
+from physx_core.interfaces.transformation import Transformation
+from physx_core.plugins import hookimpl
+from physx_core.scene import Factory
+
+
+class Spring(Environment):
+    """A damped mass on a spring under a random force; semi-implicit Euler steps.
+
+    Each sample holds the ``state`` (position in m, velocity in m/s) and ``force`` before the step
+    and the ``next_state`` after it.
+    """
+
+    def __init__(
+        self,
+        *,
+        mass: float = 1.0,
+        stiffness: float = 20.0,
+        damping: float = 0.5,
+        period: float = 0.02,
+        **kwargs: Any,
+    ) -> None:
+        """Keep the parameters.
+
+        Args:
+            mass: Mass in kg.
+            stiffness: Stiffness of the spring in N/m.
+            damping: Damping in N s/m.
+            period: Length of a step in s.
+            kwargs: See `Environment`.
+        """
+        super().__init__(**kwargs)
+        self.mass, self.stiffness, self.damping = mass, stiffness, damping
+        self.period = period
+        self.predicted = np.zeros(2)
+
+    def create(self) -> None:
+        """Put the mass at a random place."""
+        self.state = self.rng.standard_normal(2)
+
+    def init_database(self) -> None:
+        """Define the three fields."""
+        self.define_training_fields(
+            [
+                Field("state", (2,), unit="m, m/s"),
+                Field("force", (1,), unit="N"),
+                Field("next_state", (2,), unit="m, m/s"),
+            ]
+        )
+
+    def init_visualization(self) -> None:
+        """Draw the mass, the spring and the predicted mass."""
+        if self.factory is not None:
+            self.factory.add_sphere("mass", 0.1, color="orange")
+            self.factory.add_sphere("prediction", 0.1, color="blue", alpha=0.4)
+            self.factory.add_lines("spring", [[-3, 0, 0], [0, 0, 0]], color="gray")
+
+    def step(self) -> None:
+        """Move the mass by one period."""
+        position, velocity = self.state
+        force = self.rng.standard_normal(1)
+        pull = force[0] - self.stiffness * position - self.damping * velocity
+        velocity = velocity + self.period * pull / self.mass
+        following = np.array([position + self.period * velocity, velocity])
+        self.set_training_data(state=self.state, force=force, next_state=following)
+        self.state = following
+        if self.factory is not None:
+            self._draw(self.factory, following[0])
+
+    def apply_prediction(self, prediction: Batch) -> None:
+        """Remember the predicted state, which is drawn beside the real one."""
+        self.predicted = next(iter(prediction.values()))
+
+    def _draw(self, factory: Factory, position: float) -> None:
+        factory.update_sphere("mass", position=[position, 0, 0])
+        factory.update_sphere("prediction", position=[self.predicted[0], 0, 0])
+        factory.update_lines("spring", positions=[[-3, 0, 0], [position, 0, 0]])
+        self.update_visualization()
+
+
+class Linear(Network):
+    """Predicts a field as a linear function of others; arrays are its tensors."""
+
+    parameters_file = "parameters.npz"
+    default_optimization = "toy/least-squares"
+    default_transformation = "toy/identity"
+
+    def __init__(
+        self,
+        net_fields: list[str] | str = "state",
+        opt_fields: list[str] | str = "next_state",
+    ) -> None:
+        """Choose the fields.
+
+        Args:
+            net_fields: Names of the fields that are read.
+            opt_fields: Name of the one field that is predicted.
+
+        Raises:
+            ConfigError: More than one field shall be predicted.
+        """
+        self.net_fields = [net_fields] if isinstance(net_fields, str) else list(net_fields)
+        self.opt_fields = [opt_fields] if isinstance(opt_fields, str) else list(opt_fields)
+        if len(self.opt_fields) != 1:
+            raise ConfigError("toy/linear predicts one field, so opt_fields has one name.")
+        self.pred_fields = self.opt_fields
+        self.weights: Array = np.zeros((0, 0))
+        self._shape: tuple[int, ...] = ()
+        self._dtype = "float64"
+
+    def bind(self, fields: dict[str, Field]) -> None:  # type: ignore[override]
+        """Take the sizes from the fields; known weights stay."""
+        super().bind(fields)
+        inputs = sum(int(np.prod(fields[name].shape or ())) for name in self.net_fields)
+        self._shape = fields[self.opt_fields[0]].shape or ()
+        size = (inputs + 1, int(np.prod(self._shape)))
+        if self.weights.size == 0:
+            self.weights = np.zeros(size, self._dtype)
+        elif self.weights.shape != size:
+            was = f"weights {self.weights.shape} do not fit, {size} would"
+            raise FieldsMismatchError("toy/linear was made for other fields", {"weights": was})
+
+    def rows(self, data: Tensors) -> Array:
+        """Return the inputs and a column of ones, shape (samples, inputs + 1)."""
+        parts = [data[name].reshape(len(data[name]), -1) for name in self.net_fields]
+        return np.concatenate([*parts, np.ones((len(parts[0]), 1))], axis=1)
+
+    def predict(self, data: Tensors) -> Tensors:
+        """Return the linear function of the inputs."""
+        flat = self.rows(data) @ self.weights
+        return {self.pred_fields[0]: flat.reshape(len(flat), *self._shape)}
+
+    def set_train(self) -> None:
+        """Nothing differs between training and prediction."""
+
+    def set_eval(self) -> None:
+        """Nothing differs between training and prediction."""
+
+    def set_device(self, device: str) -> None:
+        """Accept the processor only."""
+        if device not in ("auto", "cpu"):
+            raise ConfigError(f'toy/linear computes on "cpu", not on "{device}".')
+
+    def set_data_type(self, data_type: str) -> None:
+        """Compute in this type."""
+        self._dtype = data_type
+
+    def get_parameters(self) -> dict[str, Any]:
+        """Return the weights, shape (inputs + 1, outputs)."""
+        return {"weights": self.weights}
+
+    def nb_parameters(self) -> int:
+        """Return the number of weights."""
+        return int(self.weights.size)
+
+    def save_parameters(self, path: Path) -> None:
+        """Write the weights as an npz file."""
+        np.savez(path, weights=self.weights)
+
+    def load_parameters(self, path: Path) -> None:
+        """Read the weights from an npz file."""
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                weights = stored["weights"]
+        except (OSError, ValueError, KeyError, EOFError) as error:
+            raise CheckpointError(f"{path} holds no weights of toy/linear: {error}.") from error
+        if self.weights.size and weights.shape != self.weights.shape:
+            raise CheckpointError(
+                f"{path} holds weights {weights.shape}, not {self.weights.shape}."
+            )
+        self.weights = weights
+
+    def numpy_to_tensor(self, batch: Batch) -> Tensors:
+        """Return the arrays themselves."""
+        return dict(batch)
+
+    def tensor_to_numpy(self, tensors: Tensors) -> Batch:
+        """Return the arrays themselves."""
+        return dict(tensors)
+
+
+class LeastSquares(Optimization):
+    """Solves for the weights that fit all batches so far best; the loss is the mean square."""
+
+    def set_loss(self, loss: str | type[Any] | None) -> None:
+        """Accept the mean square only."""
+        if loss is not None:
+            raise ConfigError("toy/least-squares has the mean square as its loss: give none.")
+
+    def set_optimizer(
+        self, optimizer: str | type[Any] | None, network: Network, **kwargs: Any
+    ) -> None:
+        """Remember whose weights to solve for."""
+        if optimizer is not None or kwargs or not isinstance(network, Linear):
+            raise ConfigError("toy/least-squares solves for toy/linear and takes no optimizer.")
+        self._network = network
+        self._normal: Array | None = None
+        self._right: Array | None = None
+
+    def compute_loss(self, prediction: Tensors, targets: Tensors, data: Tensors) -> Any:
+        """Return the mean square of the difference and keep the batch for `optimize`."""
+        self._rows = self._network.rows(data)
+        target = targets[self._network.opt_fields[0]]
+        self._targets = target.reshape(len(target), -1)
+        return float(np.mean((prediction[self._network.pred_fields[0]] - target) ** 2))
+
+    def optimize(self, loss: Any) -> None:
+        """Add the batch to the normal equations and solve them."""
+        normal, right = self._rows.T @ self._rows, self._rows.T @ self._targets
+        self._normal = normal if self._normal is None else self._normal + normal
+        self._right = right if self._right is None else self._right + right
+        self._network.weights = np.linalg.lstsq(self._normal, self._right, rcond=None)[0]
+
+
+@hookimpl
+def physx_environments() -> dict[str, Any]:
+    """Return the spring."""
+    return {"spring": Spring}
+
+
+@hookimpl
+def physx_networks() -> dict[str, Any]:
+    """Return the linear model."""
+    return {"linear": Linear}
+
+
+@hookimpl
+def physx_optimizations() -> dict[str, Any]:
+    """Return the least-squares solver."""
+    return {"least-squares": LeastSquares}
+
+
+@hookimpl
+def physx_transformations() -> dict[str, Any]:
+    """Return the identity."""
+    return {"identity": Transformation}
