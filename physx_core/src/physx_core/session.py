@@ -63,7 +63,7 @@ class Session:
         Raises:
             SessionError: The name is no folder's name, or something else is in the way.
         """
-        if not session_name or Path(session_name).name != session_name:
+        if session_name in ("", "..") or Path(session_name).name != session_name:
             raise SessionError(f'"{session_name}" cannot be the name of a session\'s folder.')
         root = Path(session_dir)
         path = root / session_name

@@ -1,0 +1,44 @@
+# make demo    install into .venv and run the main job: examples/arm_dynamics
+# make test    install into .venv and run the tests; PYTEST_ARGS are handed on
+# make lint    ruff, mypy and import-linter
+# make bench   print the measured ratios of benchmarks/
+# make clean   remove .venv and everything that was built
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+DEMO_ARGS ?=
+PYTEST_ARGS ?= -n 2
+BIN := .venv/bin
+PACKAGES := -e ./physx_core -e "./physx_dart[robots]" -e ./physx_torch -e ./physx_rerun
+PROJECTS := $(wildcard physx_*/pyproject.toml) constraints.txt
+
+.PHONY: demo test lint bench clean
+
+demo: .venv/packages
+	$(BIN)/python examples/arm_dynamics/run.py $(DEMO_ARGS)
+
+test: .venv/tools
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: .venv/tools
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: .venv/packages
+	$(BIN)/python benchmarks/generation.py
+	$(BIN)/python benchmarks/training.py
+
+clean:
+	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -prune -exec rm -rf {} +
+
+.venv/packages: $(PROJECTS)
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "physx needs Python 3.11 or later: make PYTHON=...")'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(PACKAGES)
+	touch $@
+
+.venv/tools: .venv/packages requirements-dev.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
+	touch $@

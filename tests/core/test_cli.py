@@ -1,0 +1,118 @@
+import os
+import subprocess
+import sys
+
+import pytest
+
+from physx_core.cli import main
+
+GENERATE = ["generate", "toy/spring", "--batch-nb", "2", "--batch-size", "10"]
+TRAIN = ["train", "nowhere", "--network.network", "toy/linear"]
+LOCAL = ["--environment.no-as-tcp-ip-client"]
+
+
+def test_the_main_job_by_commands(capsys):
+    assert (
+        main([*GENERATE, *LOCAL, "--environment.env-kwargs", "mass=2", "--environment.seed", "3"])
+        == 0
+    )
+    assert "20 samples" in capsys.readouterr().out
+    train = ["train", "sessions/data_generation", "--network.network", "toy/linear"]
+    assert main([*train, "--epoch-nb", "1", "--batch-size", "5"]) == 0
+    assert "training loss" in capsys.readouterr().out
+    predict = ["predict", "sessions/training", "toy/spring", "--step-nb", "3", "--record"]
+    assert main(predict) == 0
+    assert "3 steps with toy/linear" in capsys.readouterr().out
+    assert main(["info", "sessions/data_generation"]) == 0
+    text = capsys.readouterr().out
+    assert "toy/spring" in text and "m, m/s" in text and "{'mass': 2}" in text
+    assert main(["info", "sessions/training"]) == 0
+    assert "checkpoint network_0: toy/linear, 1 epochs" in capsys.readouterr().out
+
+
+def test_a_file_gives_options_and_words_replace_them(capsys, tmp_path):
+    (tmp_path / "job.toml").write_text(
+        "[data_generation]\nbatch_nb = 3\nbatch_size = 4\nsession_name = 'mine'\n"
+        "[data_generation.environment]\nenvironment = 'toy/spring'\nas_tcp_ip_client = false\n"
+    )
+    assert main(["generate", "--config", "job.toml", "--batch-size", "5"]) == 0
+    text = capsys.readouterr().out
+    assert "15 samples" in text and "sessions/mine" in text
+    assert main(["generate", "--config", "sessions/mine/config.toml"]) == 0
+    assert "sessions/mine_1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["generat"], 'Did you mean "generate"'),
+        ([*GENERATE, "--environment.num-client", "2"], "num-clients"),
+        ([*GENERATE, "--environment.num-clients", "0"], "must be at least 1"),
+        (["generate", "toy/sprin", *GENERATE[2:]], 'Did you mean "spring"'),
+        (["generate", "tooy/spring", *GENERATE[2:]], "pip install"),
+        (["generate", *GENERATE[2:]], "environment"),
+        ([*GENERATE, "--environment.env-kwargs", "masss=1"], 'Did you mean "mass"'),
+        ([*GENERATE, "--config", "none.toml"], "no configuration file"),
+        (["generate", "--config"], "needs the path"),
+        (["info", "nowhere"], "nowhere"),
+        (["info"], "one folder"),
+        (["predict", "sessions/none", "toy/spring"], "no session"),
+        ([*TRAIN, "--epoch-nb", "1", "--batch-size", "1"], "nowhere"),
+    ],
+)  # fmt: skip
+def test_mistakes_end_with_one_clear_error(words, message, capsys):
+    words = [*words, *LOCAL] if words[0] == "generate" and "--config" not in words else words
+    assert main(words) == 1
+    text = capsys.readouterr()
+    assert message in text.err + text.out
+    assert "Traceback" not in text.err
+
+
+@pytest.mark.parametrize(
+    ("table", "environment", "name"),
+    [("batch_n = 3", "", "batch_n"), ("", "num_client = 3", "num_client")],
+)
+def test_misspelt_keys_in_a_file_are_named(table, environment, name, capsys, tmp_path):
+    (tmp_path / "job.toml").write_text(
+        f"[data_generation]\nbatch_nb = 1\nbatch_size = 1\n{table}\n"
+        f"[data_generation.environment]\nenvironment = 'toy/spring'\n{environment}\n"
+    )
+    assert main(["generate", "--config", "job.toml"]) == 1
+    assert f'no option "{name}"' in capsys.readouterr().err
+
+
+def test_debug_shows_the_traceback(capsys):
+    assert main(["info", "nowhere", "--debug"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys; from physx_core.cli import main; main(['--help']); "
+        "heavy = ('torch', 'dartpy', 'pinocchio', 'rerun', 'h5py', 'numpy'); "
+        "print([m for m in heavy if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip().endswith("[]")
+    code = code.replace("main(['--help'])", "main(['generate', '--help'])").replace(
+        ", 'h5py', 'numpy'", ""
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "--environment.num-clients" in out.stdout
+    assert out.stdout.splitlines()[-1] == "[]"
+
+
+def test_import_of_the_core_is_light():
+    code = (
+        "import sys, physx_core; "
+        "heavy = ('torch', 'dartpy', 'pinocchio', 'rerun', 'h5py', 'gymnasium'); "
+        "print([m for m in heavy if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def test_module_is_the_command():
+    words = [sys.executable, "-m", "physx_core", "--version"]
+    out = subprocess.run(words, capture_output=True, text=True, check=True, env=os.environ)
+    assert out.stdout.startswith("physx 0.")

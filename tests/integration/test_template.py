@@ -1,0 +1,28 @@
+"""The template of a plugin is installed as a user would do it, and selected by name."""
+
+import pytest
+
+pytest.importorskip("torch")
+
+
+def test_the_template_brings_an_environment_and_a_network(root, run, tmp_path):
+    template = root / "examples/plugin_template"
+    files = [template / "pyproject.toml", *template.rglob("*.py")]
+    assert sum(len(file.read_text().splitlines()) for file in files) < 60
+    packages = tmp_path / "packages"
+    run(
+        "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation",
+        "--disable-pip-version-check", "--target", packages, template,
+    )  # fmt: skip
+    path = {"PYTHONPATH": str(packages)}
+    physx = ("-m", "physx_core")
+    listing = run(*physx, "plugins", **path).stdout
+    assert "environment: template/cloud" in listing and "network: template/mlp" in listing
+    generate = ("generate", "template/cloud", "--batch-nb", 4, "--batch-size", 25)
+    run(*physx, *generate, "--environment.num-clients", 2, **path)
+    train = ("train", "sessions/data_generation", "--network.network", "template/mlp")
+    fit = ("--network.loss", "MSELoss", "--network.optimizer", "Adam", "--network.lr", "0.01")
+    text = run(*physx, *train, *fit, "--epoch-nb", 2, "--batch-size", 20, **path).stdout
+    assert "training loss" in text
+    predict = ("predict", "sessions/training", "template/cloud", "--step-nb", 3)
+    assert "3 steps with template/mlp" in run(*physx, *predict, **path).stdout
