@@ -214,7 +214,7 @@ def test_training_on_a_dataset_learns_and_leaves_it_alone():
     training.execute()
     after = {p.name: p.read_bytes() for p in Path("sessions/run/dataset").iterdir() if p.is_file()}
     assert before == after
-    assert training.validation_loss < 1e-20
+    assert training.validation_loss < 1e-10
     assert (training.epoch_id, training.batch_id) == (2, 5)
     rows = Path("sessions/training/stats/scalars.csv").read_text().splitlines()
     assert rows[0] == "timeline,step,name,value"
@@ -358,8 +358,9 @@ def test_ctrl_c_keeps_what_was_committed_and_writes_a_checkpoint(tmp_path):
     script.write_text(
         "from physx_core import *\n"
         "if __name__ == '__main__':\n"
-        "    Training(NetworkConfig('toy/linear'), None,\n"
-        "             EnvironmentConfig('toy/spring', as_tcp_ip_client=False, always_produce=True),\n"
+        "    spring = EnvironmentConfig(\n"
+        "        'toy/spring', as_tcp_ip_client=False, always_produce=True)\n"
+        "    Training(NetworkConfig('toy/linear'), None, spring,\n"
         "             epoch_nb=10**6, batch_nb=10, batch_size=10).execute()\n"
     )
     process = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.PIPE, text=True)

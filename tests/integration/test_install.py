@@ -56,13 +56,16 @@ def test_the_core_alone_generates_and_torch_adds_its_network(empty, run):
     assert "training loss" in run(*train, python=python).stdout
 
 
+GENERATE = "--batch-nb 2 --batch-size 10"
+
+
 @pytest.mark.parametrize(
     ("name", "command"),
     [
-        ("physx_dart", "generate dart/double-pendulum --batch-nb 2 --batch-size 10"),
-        ("physx_rerun", "generate toy/spring --batch-nb 2 --batch-size 10 --environment.visualizer rerun"),
+        ("physx_dart", f"generate dart/double-pendulum {GENERATE}"),
+        ("physx_rerun", f"generate toy/spring {GENERATE} --environment.visualizer rerun"),
     ],
-)  # fmt: skip
+)
 def test_each_plugin_works_with_its_dependencies_alone(name, command, empty, run):
     python = empty("physx_core", name)
     assert "20 samples" in run("-m", "physx_core", *command.split(), python=python).stdout

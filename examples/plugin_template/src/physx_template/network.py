@@ -1,4 +1,5 @@
 import torch
+
 from physx_torch import TorchNetwork
 
 

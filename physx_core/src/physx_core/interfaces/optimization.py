@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 from physx_core.interfaces.network import Network, Tensors
 
@@ -14,8 +15,11 @@ class Optimization(ABC):
 
     Attributes:
         extra_fields: Fields of the batch that the loss reads beside those of the network.
+        state_file: Name of the file that `save_state` writes into a checkpoint; empty where the
+            optimization keeps nothing from step to step.
     """
 
+    state_file: ClassVar[str] = ""
     extra_fields: Sequence[str] = ()
 
     @abstractmethod
@@ -66,3 +70,16 @@ class Optimization(ABC):
 
     def epoch_end(self) -> None:  # noqa: B027
         """An epoch of the training is over, for example for a schedule of the learning rate."""
+
+    def save_state(self, path: Path) -> None:  # noqa: B027
+        """Write what a later training needs, beside the parameters, to go on exactly here.
+
+        Called only where `state_file` is not empty; the file can be read without running code.
+        """
+
+    def load_state(self, path: Path) -> None:  # noqa: B027
+        """Read what `save_state` wrote, once loss and optimizer are chosen.
+
+        Raises:
+            CheckpointError: The file is missing, damaged or of another optimization.
+        """

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 from physx_core.config import DatasetConfig, EnvironmentConfig, to_plain
 from physx_core.dataset import Dataset
-from physx_core.errors import DatasetNotFoundError
+from physx_core.errors import DatasetNotFoundError, UsageError
 from physx_core.plugins import reference_of
 from physx_core.session import Session, installed_versions
 
@@ -49,9 +50,8 @@ def open_existing(session: Session, config: DatasetConfig) -> Dataset:
 def describe_environment(config: EnvironmentConfig, seed: int) -> dict[str, Any]:
     """Return what a dataset keeps of the environment that made its samples."""
     plain = to_plain(config)
-    if isinstance(config.environment, type) and not config.as_tcp_ip_client:
-        reference = plain["environment"]
-    else:
+    reference = plain["environment"]
+    with contextlib.suppress(UsageError):  # a class that only this process can find
         reference = reference_of(config.environment)
     return {
         "environment": reference,

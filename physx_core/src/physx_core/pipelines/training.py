@@ -186,10 +186,10 @@ class Training(Pipeline):
             raise ConfigError(
                 "A training takes its samples from existing_dir or from an environment, not both."
             )
-        if config.existing_dir is not None:  # a missing dataset leaves no session behind
-            Dataset.open(config.existing_dir).close()
         self._seed_network(seed)
         self.learner = Learner(self.network_config, trains=True)
+        if config.existing_dir is not None:  # a missing dataset leaves no session behind
+            Dataset.open(config.existing_dir).close()
         self.session = Session.create(self.session_dir, self.session_name, self.new_session)
         make = open_existing if environment is None else open_own
         dataset = resources.enter_context(make(self.session, config))

@@ -1,0 +1,10 @@
+"""Datasets: samples in HDF5 partitions, written at the speed of the disk and safe at any moment.
+
+The format is described in `physx_core.dataset.layout` and `physx_core.dataset.manifest`.
+"""
+
+from __future__ import annotations
+
+from physx_core.dataset.dataset import Dataset
+
+__all__ = ["Dataset"]

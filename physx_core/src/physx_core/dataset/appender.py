@@ -1,0 +1,89 @@
+"""Rows and single samples on their way into a dataset: defined, checked, buffered, stored."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from physx_core.dataset.checks import RowBuffer, check_rows, infer_fields
+from physx_core.dataset.definitions import compare_fields, complete_shapes, shapes_of_rows
+from physx_core.dataset.manifest import Manifest, Mode
+from physx_core.dataset.writer import Writer
+from physx_core.errors import ConfigError
+from physx_core.fields import Batch, Field
+
+
+class Appender:
+    """Brings what users give into the form that the writer stores; see `Dataset` for the calls."""
+
+    def __init__(self, manifest: Manifest, writer: Writer) -> None:
+        self._manifest = manifest
+        self._writer = writer
+        self._buffers: dict[str, RowBuffer] = {}
+
+    def define_fields(self, mode: str, fields: Iterable[Field]) -> None:
+        """Define the fields of a mode: see `Dataset.define_fields`."""
+        given = {field.name: field for field in fields}
+        known = self._manifest.modes.get(mode)
+        if known is None:
+            self._add_mode(mode, given)
+        else:
+            compare_fields(f'Mode "{mode}" of the dataset', known.fields, given)
+            completed = complete_shapes(known.fields, given)
+            if completed == known.fields:
+                return
+            known.fields = completed
+        self._writer.save()
+
+    def append(self, mode: str, rows: Mapping[str, Any]) -> None:
+        """Store and commit rows: see `Dataset.append`."""
+        known = self._manifest.modes.get(mode)
+        fields = known.fields if known else {field.name: field for field in infer_fields(rows)}
+        checked, count = check_rows(fields, rows)
+        self._flush(mode)
+        self._settle(mode, fields, checked)
+        self._writer.append(mode, checked, count)
+
+    def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
+        """Store one sample, soon: see `Dataset.append_sample`."""
+        buffer = self._buffers.get(mode)
+        if buffer is None:
+            buffer = self._buffer(mode, sample)
+        buffer.put(sample)
+        if buffer.full:
+            self._flush(mode)
+
+    def flush(self) -> None:
+        """Commit the samples that wait: see `Dataset.flush`."""
+        for mode in self._buffers:
+            self._flush(mode)
+
+    def _buffer(self, mode: str, sample: Mapping[str, Any]) -> RowBuffer:
+        """Make the buffer of a mode, from whose first sample the fields may become known."""
+        known = self._manifest.modes.get(mode)
+        rows = {name: [value] for name, value in sample.items()}
+        fields = known.fields if known else {field.name: field for field in infer_fields(rows)}
+        checked, _ = check_rows(fields, rows)
+        self._settle(mode, fields, checked)
+        buffer = self._buffers[mode] = RowBuffer(self._manifest.modes[mode].fields)
+        return buffer
+
+    def _flush(self, mode: str) -> None:
+        buffer = self._buffers.get(mode)
+        if buffer is not None and buffer.count:
+            count = buffer.count
+            self._writer.append(mode, buffer.take(), count)
+
+    def _settle(self, mode: str, fields: Mapping[str, Field], rows: Batch) -> None:
+        """Add the mode, if it is new, and complete shapes that the first rows tell."""
+        if mode not in self._manifest.modes:
+            self._add_mode(mode, dict(fields))
+        known = self._manifest.modes[mode]
+        if any(field.shape is None for field in known.fields.values()):
+            known.fields = shapes_of_rows(known.fields, rows)
+
+    def _add_mode(self, mode: str, fields: dict[str, Field]) -> None:
+        if not mode.isidentifier() or not fields:
+            names = sorted(fields) or "no fields"
+            raise ConfigError(f"A mode needs an identifier and fields, not {mode!r} with {names}.")
+        self._manifest.modes[mode] = Mode(fields)

@@ -1,0 +1,393 @@
+"""Dataset: samples by mode and field, written by one process and read by any."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from physx_core.dataset import recovery
+from physx_core.dataset.appender import Appender
+from physx_core.dataset.manifest import Manifest, plain_info
+from physx_core.dataset.opening import WriterOptions, create, extend
+from physx_core.dataset.reader import Reader
+from physx_core.dataset.report import find_problems, summarize
+from physx_core.dataset.sampling import Batches, Columns
+from physx_core.dataset.sealing import cover
+from physx_core.dataset.views import ModeView
+from physx_core.dataset.writer import Writer
+from physx_core.errors import UsageError
+from physx_core.fields import Batch, Field
+from physx_core.statistics import Normalization
+
+MAX_FILE_SIZE = 0.25
+
+
+class Dataset:
+    """A folder of partition files with its manifest; make one with `create` or `open`.
+
+    A context manager. One process at a time may write; any number may read, also meanwhile. What
+    `append` returned from survives the death of the process at any later moment.
+
+    Attributes:
+        directory: The folder.
+        session: Session that new partitions are named after; empty when only reading.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        manifest: Manifest,
+        writer: Writer | None = None,
+        lock: int | None = None,
+    ) -> None:
+        self.directory = directory
+        self.session = writer.session if writer else ""
+        self._manifest = manifest
+        self._writer = writer
+        self._lock = lock
+        self._reader = Reader(directory, manifest)
+        self._columns = Columns(self._reader)
+        self._appender = Appender(manifest, writer) if writer else None
+        self._closed = False
+
+    # Opening and closing --------------------------------------------------------------------
+
+    @classmethod
+    def create(
+        cls,
+        directory: str | Path,
+        session: str = "run",
+        *,
+        max_file_size: float = MAX_FILE_SIZE,
+        durable: bool = False,
+        info: Mapping[str, Any] | None = None,
+    ) -> Self:
+        """Make a new dataset and open it for writing.
+
+        Args:
+            directory: Its folder; made if it does not exist.
+            session: Name that its files begin with.
+            max_file_size: Size in GB at which a partition is full and the next one begins.
+            durable: Whether every append waits for the disk, to survive a power cut too.
+            info: Where the data come from: see `update_info`.
+
+        Raises:
+            DatasetError: There is a dataset already, or the folder cannot be written.
+            DatasetLockedError: Another process is making one there.
+            ConfigError: The session's name or the size is not valid.
+        """
+        folder = Path(directory)
+        options = WriterOptions(session, max_file_size, durable)
+        return cls(folder, *create(folder, options, info or {}))
+
+    @classmethod
+    def open(
+        cls,
+        directory: str | Path,
+        *,
+        writable: bool = False,
+        session: str | None = None,
+        max_file_size: float = MAX_FILE_SIZE,
+        durable: bool = False,
+    ) -> Self:
+        """Open a dataset that exists.
+
+        Args:
+            directory: The dataset's folder, or the session's folder that holds it.
+            writable: Whether to add rows. Otherwise nothing on the disk is ever changed.
+            session: Name of the new files when writing; None: that of the last session.
+            max_file_size: Size in GB at which a new partition is full.
+            durable: Whether every append waits for the disk, to survive a power cut too.
+
+        Raises:
+            DatasetNotFoundError: There is no dataset.
+            DatasetLockedError: It is to be written, and another process does so.
+            DatasetError: Its manifest is not valid, or a partition is damaged and it is to be
+                written.
+            ConfigError: The session's name or the size is not valid.
+        """
+        folder = recovery.locate(directory)
+        if not writable:
+            return cls(folder, recovery.load(folder))
+        return cls(folder, *extend(folder, WriterOptions(session, max_file_size, durable)))
+
+    @property
+    def writable(self) -> bool:
+        """Whether rows can be added."""
+        return self._writer is not None and not self._closed
+
+    def close(self) -> None:
+        """Store what waits, seal the last partitions and release the lock; twice does nothing.
+
+        Raises:
+            DatasetError: What waits cannot be stored; all that was committed is intact.
+        """
+        if self._closed:
+            return
+        try:
+            if self._writer is not None:
+                try:
+                    self.flush()
+                finally:
+                    self._writer.close()
+        finally:
+            self._closed = True
+            self._columns.clear()
+            if self._lock is not None:
+                os.close(self._lock)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # Writing --------------------------------------------------------------------------------
+
+    def define_fields(self, mode: str, fields: Iterable[Field]) -> None:
+        """Define the fields of a mode, with their units and roles, before its first rows.
+
+        Args:
+            mode: Name of the mode.
+            fields: The fields; a shape of None is taken from the first rows.
+
+        Raises:
+            FieldsMismatchError: The mode has other fields already.
+            ConfigError: The mode's name is no identifier, or there is no field.
+            UsageError: The dataset is closed or only read.
+        """
+        self._writing().define_fields(mode, fields)
+
+    def append(self, mode: str, rows: Mapping[str, Any]) -> None:
+        """Store rows; they are committed when this returns.
+
+        Args:
+            mode: Name of the mode. If it has no fields yet, they are taken from the rows.
+            rows: Field name to array of shape (n, *field shape), all fields of the mode.
+
+        Raises:
+            SampleError: A field is missing, unknown, of another shape, type or length, or holds
+                NaN or an infinite number. Nothing of the rows is stored.
+            DatasetError: The disk is full or fails; says how many of the rows are stored.
+            UsageError: The dataset is closed or only read.
+        """
+        self._writing().append(mode, rows)
+
+    def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
+        """Store one sample; it is committed with some others, or by `flush`.
+
+        Args:
+            mode: Name of the mode. If it has no fields yet, they are taken from the sample.
+            sample: Field name to value of the field's shape, all fields of the mode.
+
+        Raises:
+            SampleError: The sample cannot be stored, as in `append`.
+            DatasetError: The samples that waited cannot be stored: the disk is full or fails.
+            UsageError: The dataset is closed or only read.
+        """
+        self._writing().append_sample(mode, sample)
+
+    def flush(self) -> None:
+        """Commit the samples that wait.
+
+        Raises:
+            DatasetError: The disk is full or fails; says how many of them are stored. The others
+                are forgotten.
+        """
+        self._writing().flush()
+
+    def update_info(self, **values: Any) -> None:
+        """Set entries of `info` and store them.
+
+        Args:
+            values: Numbers, texts, lists, dictionaries; tuples and arrays become lists, classes
+                and paths become texts.
+
+        Raises:
+            ConfigError: A value is nothing that JSON can hold.
+            UsageError: The dataset is closed or only read.
+        """
+        self._writing()
+        self._manifest.info |= plain_info(values)
+        self._save()
+
+    # Reading --------------------------------------------------------------------------------
+
+    @property
+    def modes(self) -> list[str]:
+        """Names of the modes."""
+        return list(self._manifest.modes)
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Where the data come from: environment, its keyword arguments, seed and the like."""
+        return dict(self._manifest.info)
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Versions of Python and of the packages that made the dataset."""
+        return dict(self._manifest.versions)
+
+    def fields(self, mode: str) -> dict[str, Field]:
+        """Return the fields of a mode by name.
+
+        Raises:
+            DatasetError: There is no such mode, or a partition is missing or damaged.
+        """
+        return dict(self._reader.mode(mode).fields)
+
+    def num_samples(self, mode: str) -> int:
+        """Return the number of committed samples of a mode.
+
+        Raises:
+            DatasetError: There is no such mode, or a partition is missing or damaged.
+        """
+        self._reading()
+        return self._reader.rows(mode)
+
+    def __getitem__(self, mode: str) -> ModeView:
+        self._reading()
+        self._reader.mode(mode)
+        return ModeView(self._reader, self._columns, mode)
+
+    def __contains__(self, mode: object) -> bool:
+        return mode in self._manifest.modes
+
+    def refresh(self) -> None:
+        """See the rows that another process has committed since the dataset was opened.
+
+        Raises:
+            DatasetError: The manifest is not valid any more.
+        """
+        self._reading()
+        if self._writer is None:
+            now = recovery.load(self.directory)
+            self._manifest.modes, self._manifest.info = now.modes, now.info
+            self._manifest.problems = now.problems
+
+    def batches(
+        self,
+        mode: str,
+        batch_size: int,
+        *,
+        shuffle: bool = False,
+        seed: int | Sequence[int] | None = None,
+        epochs: int | None = 1,
+        fields: Sequence[str] | None = None,
+        dtype: DTypeLike | None = None,
+        reuse: bool = False,
+    ) -> Iterator[Batch]:
+        """Go through the samples of a mode in batches.
+
+        Args:
+            mode: Name of the mode.
+            batch_size: Samples of a batch; only the last one of an epoch may have fewer.
+            shuffle: Whether each epoch is a new random permutation of all samples.
+            seed: Seed of the permutations; None: a different one each time.
+            epochs: How often to go through all samples; None: without end. An epoch begins with
+                the samples that are committed by then.
+            fields: Names of the fields to give; None: all of them.
+            dtype: Type that floating fields are given in; None: their own.
+            reuse: Whether every batch is given in the same arrays, which is faster; each batch is
+                then valid until the next.
+
+        Returns:
+            An iterator over batches: field name to array of shape (samples, *field shape).
+
+        Raises:
+            DatasetError: There is no such mode or field, or the mode has no samples.
+            ConfigError: `batch_size` or `epochs` is out of range.
+        """
+        self._reading()
+        return iter(
+            Batches(
+                self._columns,
+                mode,
+                list(self._reader.mode(mode).fields if fields is None else fields),
+                batch_size,
+                epochs,
+                np.random.default_rng(seed) if shuffle else None,
+                None if dtype is None else np.dtype(dtype),
+                reuse,
+            )
+        )
+
+    @property
+    def normalization(self) -> dict[str, Normalization]:
+        """Mean and standard deviation of the floating fields of mode ``training``."""
+        return self.normalization_of("training") if "training" in self else {}
+
+    def normalization_of(self, mode: str) -> dict[str, Normalization]:
+        """Return mean and standard deviation of the floating fields of a mode, of all its samples.
+
+        Raises:
+            DatasetError: There is no such mode, or a partition is missing or damaged.
+        """
+        self._reading()
+        cover(self._reader, mode)
+        statistics = self._reader.mode(mode).statistics
+        return {name: s.normalization() for name, s in statistics.items() if s.count}
+
+    def recompute_normalization(self, mode: str = "training") -> dict[str, Normalization]:
+        """Compute mean and standard deviation anew from all stored samples, and keep them.
+
+        Raises:
+            DatasetError: There is no such mode, or a partition is missing or damaged.
+        """
+        self._reading()
+        self._reader.mode(mode).statistics.clear()
+        found = self.normalization_of(mode)
+        self._save()
+        return found
+
+    def describe(self) -> list[dict[str, Any]]:
+        """Return one row of a table for each field of each mode.
+
+        Returns:
+            Rows with the entries mode, field, role, dtype, shape, unit, samples, partitions and
+            bytes (of the values).
+        """
+        self._reading()
+        return summarize(self._manifest)
+
+    def verify(self) -> list[str]:
+        """Check all partition files: there, whole, of the right rows, and unchanged.
+
+        Returns:
+            One text for each problem; empty for a sound dataset.
+        """
+        self._reading()
+        return find_problems(self.directory, self._manifest)
+
+    # Within ---------------------------------------------------------------------------------
+
+    def _writing(self) -> Appender:
+        if self._closed:
+            raise UsageError(f"The dataset in {self.directory} is closed.")
+        if self._appender is None:
+            raise UsageError(
+                f"The dataset in {self.directory} was opened for reading. To change it, use "
+                "Dataset.open(directory, writable=True)."
+            )
+        return self._appender
+
+    def _reading(self) -> None:
+        if self._closed:
+            raise UsageError(f"The dataset in {self.directory} is closed.")
+        if self._appender is not None:
+            self._appender.flush()
+
+    def _save(self) -> None:
+        if self._writer is not None:
+            self._writer.save()

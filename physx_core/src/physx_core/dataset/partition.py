@@ -1,0 +1,165 @@
+"""One field's file of the partition that is being written."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+from physx_core.dataset import files
+from physx_core.dataset.layout import Header, Identity, make_header
+from physx_core.fields import Array
+
+_SMALLEST_STEP = 2**20
+_LARGEST_STEP = 2**26
+_COPY = 2**23
+
+
+class PartitionFile:
+    """Writes rows to their places and commits them with the row count.
+
+    Attributes:
+        identity: What the file is part of.
+        data_offset: Place of the first row.
+    """
+
+    def __init__(self, path: Path, identity: Identity, header: Header, descriptor: int) -> None:
+        self.identity = identity
+        self.data_offset = header.data_offset
+        self._path = path
+        self._row_nbytes = identity.field.nbytes
+        self._rows_offset = header.rows_offset
+        self._size = header.size
+        self._reserved = len(header.content)
+        self._descriptor = descriptor
+
+    @classmethod
+    def create(cls, directory: Path, identity: Identity, capacity: int) -> PartitionFile:
+        """Write an empty partition file under a temporary name.
+
+        Args:
+            directory: The dataset's folder.
+            identity: What the file is part of.
+            capacity: How many rows fit in.
+
+        Raises:
+            OSError: The file cannot be written; nothing of it is left.
+        """
+        header = make_header(identity, capacity)
+        path = directory / identity.file_name
+        return cls(path, identity, header, _write_header(files.temporary(path), header))
+
+    def publish(self) -> None:
+        """Give the file its name."""
+        files.temporary(self._path).rename(self._path)
+
+    def discard(self) -> None:
+        """Close the file and remove it, whether it has its name or not."""
+        self.close()
+        files.temporary(self._path).unlink(missing_ok=True)
+        self._path.unlink(missing_ok=True)
+
+    def reserve(self, rows: int) -> None:
+        """Take the space on the disk for the first `rows` rows, and for some more.
+
+        Raises:
+            OSError: The disk is full; nothing was changed.
+        """
+        needed = self.data_offset + rows * self._row_nbytes
+        if needed <= self._reserved:
+            return
+        step = min(max(self._reserved, _SMALLEST_STEP), _LARGEST_STEP)
+        ample = min(max(needed, self._reserved + step), self._size)
+        try:
+            self._allocate(ample)
+        except OSError as error:
+            if error.errno in (errno.EOPNOTSUPP, errno.EINVAL):  # nothing can be reserved here
+                self._reserved = self._size
+            elif error.errno in files.FULL:
+                self._allocate(needed)
+            else:
+                raise
+
+    def write(self, row: int, block: Array) -> None:
+        """Write rows, not yet committed.
+
+        Args:
+            row: Place of the first one.
+            block: Contiguous rows of the field's own type, shape (count, *field shape).
+        """
+        if self._row_nbytes:
+            offset = self.data_offset + row * self._row_nbytes
+            files.write_at(self._descriptor, files.raw(block), offset)
+
+    def commit(self, rows: int) -> None:
+        """Make the first `rows` rows part of the dataset."""
+        files.write_at(self._descriptor, rows.to_bytes(8, "little"), self._rows_offset)
+
+    def sync(self) -> None:
+        """Wait until everything written is on the disk."""
+        os.fdatasync(self._descriptor)
+
+    def close(self) -> None:
+        """Close the file; calling it again does nothing."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _allocate(self, end: int) -> None:
+        os.posix_fallocate(self._descriptor, self._reserved, end - self._reserved)
+        self._reserved = end
+
+
+def rewrite(path: Path, identity: Identity, rows: int, data_offset: int) -> int:
+    """Replace a partition file by one that holds exactly its first `rows` rows.
+
+    Args:
+        path: The file.
+        identity: What it is part of.
+        rows: How many rows it keeps.
+        data_offset: Where they begin in the present file.
+
+    Returns:
+        Where they begin in the new file.
+
+    Raises:
+        OSError: The new file cannot be written; the present one is left as it is.
+    """
+    header = make_header(identity, rows, rows)
+    draft = files.temporary(path)
+    descriptor = _write_header(draft, header)
+    try:
+        try:
+            _copy(path, data_offset, descriptor, header.data_offset, rows * identity.field.nbytes)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        draft.replace(path)
+    except OSError:
+        draft.unlink(missing_ok=True)
+        raise
+    return header.data_offset
+
+
+def _write_header(path: Path, header: Header) -> int:
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+    try:
+        os.ftruncate(descriptor, header.size)
+        files.write_at(descriptor, header.content, 0)
+    except OSError:
+        os.close(descriptor)
+        path.unlink(missing_ok=True)
+        raise
+    return descriptor
+
+
+def _copy(source: Path, source_offset: int, target: int, target_offset: int, count: int) -> None:
+    buffer = memoryview(bytearray(min(count, _COPY)))
+    with source.open("rb", buffering=0) as file:
+        done = 0
+        while done < count:
+            part = buffer[: count - done]
+            if not files.read_at(file.fileno(), part, source_offset + done):
+                raise OSError(errno.EIO, f"{source} became shorter while it was read")
+            files.write_at(target, part, target_offset + done)
+            done += len(part)

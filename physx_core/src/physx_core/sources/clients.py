@@ -1,0 +1,230 @@
+"""ClientSource: each instance of the environment in a process of its own, over TCP."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import TracebackType
+
+import numpy as np
+
+from physx_core.columns import ROW_FIELDS
+from physx_core.config import EnvironmentConfig
+from physx_core.errors import FieldShapeError, FieldsMismatchError, UsageError
+from physx_core.fields import Batch, Field
+from physx_core.interfaces.environment import Services
+from physx_core.sources.source import Source
+from physx_core.transport.frames import Kind, pack
+from physx_core.transport.group import ClientGroup
+from physx_core.transport.peer import Peer
+from physx_core.transport.rows import row_bytes
+from physx_core.transport.values import encode
+
+_AHEAD_BYTES = 4 << 20
+_AHEAD_ROWS = 1 << 16
+
+
+class ClientSource(Source):
+    """Has clients make rows, and puts each row where its instance and step say it belongs.
+
+    Rows are the same as those of `LocalSource`, bit for bit. Requests of the environments are
+    answered while a batch is waited for. Predictions that several instances ask for at the same
+    moment go through the method ``predict_batch(batch) -> batch`` of the services, if they have it.
+    """
+
+    def __init__(
+        self,
+        config: EnvironmentConfig,
+        services: Services,
+        seed: Sequence[int],
+        *,
+        run_ahead: int | None = None,
+        total: int | None = None,
+        launch: bool = True,
+    ) -> None:
+        """Keep what the clients are started with.
+
+        Args:
+            config: Which environment, and how many clients.
+            services: What the environments may ask of the run.
+            seed: Seed of all instances.
+            run_ahead: How many rows each client may make before they are asked for; None: as many
+                as fit in 4 MB. 0: a row is made only once it is asked for, as it must be where
+                rows depend on a network that is trained, or on predictions that are applied.
+            total: How many rows will ever be asked for; no client makes rows beyond. None: nobody
+                knows.
+            launch: Whether to start the clients on this machine; otherwise `open` waits for those
+                that are started by hand with the token in ``PHYSX_TOKEN``.
+        """
+        self.instance_nb = config.num_clients
+        self.fields = []
+        self._group = ClientGroup(config, services, seed, launch=launch)
+        self._run_ahead, self._total = run_ahead, total
+        self._asked = 0
+        self._taken = [0] * self.instance_nb
+        self._first = 0
+        self._table: list[Field] = []
+        self._out: Batch = {}
+        self._capacity = 0
+        self._failed = self._closed = False
+
+    def open(self) -> None:
+        """Bring the instances to life: see `Source.open`."""
+        try:
+            self._group.open()
+            first = self._group.peer(1).fields
+            for number in range(2, self.instance_nb + 1):
+                self._agree(number, first, self._group.peer(number).fields)
+        except BaseException:
+            self._failed = True
+            raise
+        self.fields = [*first, *ROW_FIELDS]
+
+    def batch(self, size: int) -> Batch:
+        """Return the next rows: see `Source.batch`."""
+        if size < 1:
+            raise UsageError(f"A batch has at least one row, not {size}.")
+        if not self.fields or self._closed:
+            raise UsageError("This source is not open: use it in a with statement.")
+        self._first, self._asked = self._asked, self._asked + size
+        try:
+            self._grant()
+            if not self._table:
+                self._group.wait(self._without_table)
+                self._grant()
+            if self._capacity < size:
+                self._capacity = size
+                self._out = {
+                    field.name: np.empty((size, *(field.shape or ())), field.dtype)
+                    for field in self._table
+                }
+            self._group.wait(self._without_rows)
+        except BaseException:
+            self._failed = True
+            raise
+        return {name: array[:size] for name, array in self._out.items()}
+
+    def apply(self, prediction: Batch) -> None:
+        """Give predictions to the instances: see `Source.apply`.
+
+        An error that an environment raises here is raised by the next call of `batch` or `close`.
+
+        Raises:
+            UsageError: The clients run ahead, so they are no longer at the rows of the last batch.
+        """
+        if self._run_ahead != 0:
+            raise UsageError("apply() needs ClientSource(run_ahead=0).")
+        size = self._asked - self._first
+        for number in range(1, self.instance_nb + 1):
+            # The position of the instance's first row in the last batch.
+            start = (number - 1 - self._first) % self.instance_nb
+            rows = {
+                name: np.asarray(values)[start : size : self.instance_nb]
+                for name, values in prediction.items()
+            }
+            count = len(range(start, size, self.instance_nb))
+            if count:
+                self._group.server.send(
+                    number, pack(Kind.APPLY, encode(rows, "the prediction"), count)
+                )
+
+    def close(self) -> None:
+        """Close the environments and end the clients: see `Source.close`."""
+        if self._closed:
+            return
+        self._closed = True
+        self._group.close(orderly=not self._failed)
+        if self._failed:
+            return
+        for number, peer in sorted(self._group.server.peers.items()):
+            if peer.failure is not None and (
+                self._run_ahead == 0 or peer.failed_row < self._wanted(number, self._asked)
+            ):
+                raise peer.failure
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the source; after an error the clients are not waited for."""
+        self._failed = self._failed or kind is not None
+        super().__exit__(kind, error, trace)
+
+    def _wanted(self, number: int, rows: int) -> int:
+        """Return how many of the first `rows` rows belong to an instance."""
+        return (rows - number + self.instance_nb) // self.instance_nb
+
+    def _grant(self) -> None:
+        """Let the clients make what is asked for, and what they may make ahead."""
+        ahead = self._run_ahead
+        if ahead is None:
+            size = row_bytes(self._table) or _AHEAD_BYTES
+            ahead = min(max(1, _AHEAD_BYTES // size), _AHEAD_ROWS) if self._table else 0
+        for number in range(1, self.instance_nb + 1):
+            peer = self._group.peer(number)
+            needed = self._wanted(number, self._asked)
+            allowed = needed + ahead
+            if self._total is not None:
+                allowed = max(needed, min(allowed, self._wanted(number, self._total)))
+            if peer.granted < needed or allowed - peer.granted > ahead // 4:
+                peer.granted = allowed
+                peer.send(pack(Kind.CREDIT, number=allowed))
+
+    def _without_table(self) -> list[int]:
+        """Return the first instance as long as its fields are not known; it has the first row."""
+        peer = self._group.peer(1)
+        if peer.row_fields:
+            self._table = self.fields = peer.row_fields
+            return []
+        self._raise_failure(peer)
+        return [1]
+
+    def _without_rows(self) -> list[int]:
+        """Move rows that arrived into the batch; return the instances that owe some."""
+        owing = []
+        for number in range(1, self.instance_nb + 1):
+            peer, taken = self._group.peer(number), self._taken[number - 1]
+            missing = self._wanted(number, self._asked) - taken
+            if not missing:
+                continue
+            if peer.rows.count:
+                if not taken:
+                    self._agree(number, self._table, peer.row_fields)
+                start = taken * self.instance_nb + number - 1 - self._first
+                moved = peer.rows.take(missing, self._out, start, self.instance_nb)
+                self._taken[number - 1] += moved
+                missing -= moved
+            if missing:
+                self._raise_failure(peer)
+                owing.append(number)
+        return owing
+
+    def _raise_failure(self, peer: Peer) -> None:
+        """Raise what the client failed with; all its rows before were taken."""
+        if peer.failure is not None and not peer.rows.count:
+            raise peer.failure
+
+    def _agree(self, number: int, first: Sequence[Field], other: Sequence[Field]) -> None:
+        """Check that an instance has the same fields as the first one."""
+        if list(first) == list(other):
+            return
+        mine, theirs = ({field.name: field for field in fields} for fields in (first, other))
+        for name in mine.keys() & theirs.keys() if self._table else ():
+            if mine[name].shape != theirs[name].shape:
+                raise FieldShapeError(
+                    f'field "{name}" has shape {theirs[name].shape} but is defined as '
+                    f"{mine[name].shape}.",
+                    field=name,
+                    instance_id=number,
+                    step=0,
+                )
+        names = [*mine, *(name for name in theirs if name not in mine)]
+        raise FieldsMismatchError(
+            f"Instances 1 and {number} define different fields",
+            {
+                name: f"{mine.get(name, 'not defined')} and {theirs.get(name, 'not defined')}"
+                for name in names
+                if mine.get(name) != theirs.get(name)
+            },
+        )

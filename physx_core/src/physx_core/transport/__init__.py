@@ -1,0 +1,1 @@
+"""Transport: environments in processes of their own, spoken to over TCP."""

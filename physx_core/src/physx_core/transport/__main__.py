@@ -1,0 +1,31 @@
+"""The process of a client that a server started: ``python -m physx_core.transport``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+
+from physx_core.errors import PhysxError
+from physx_core.transport.client import run_client
+from physx_core.transport.handshake import TOKEN_VARIABLE
+
+
+def main() -> int:
+    """Run the client that the command line describes; return its exit status."""
+    parser = argparse.ArgumentParser(prog="python -m physx_core.transport", description=__doc__)
+    parser.add_argument("--connect", metavar="HOST:PORT", required=True, help="the server")
+    parser.add_argument("--instance", type=int, help="number of the instance; any by default")
+    options = parser.parse_args()
+    token = os.environ.pop(TOKEN_VARIABLE, "")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server decides when a run ends
+    try:
+        return run_client(options.connect, token, options.instance)
+    except PhysxError as error:
+        sys.stderr.write(f"physx client: {error}\n")
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

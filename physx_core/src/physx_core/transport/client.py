@@ -1,0 +1,147 @@
+"""Client: one instance of the environment in this process, for a server elsewhere."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from physx_core.errors import ConnectionRefusedByPeerError, PhysxError
+from physx_core.fields import Sample
+from physx_core.instance import Instance
+from physx_core.scene import Event
+from physx_core.transport.failures import decode_error, encode_error
+from physx_core.transport.frames import Kind, pack
+from physx_core.transport.launcher import CLIENT_VARIABLE
+from physx_core.transport.link import Link, RunEnded, connect
+from physx_core.transport.producer import Producer
+from physx_core.transport.values import decode, encode
+
+
+def run_client(address: str, token: str, instance: int | None = None) -> int:
+    """Run one instance of the environment for a server until it ends the run.
+
+    Args:
+        address: The server's ``HOST:PORT``.
+        token: Token of the run.
+        instance: Number of the instance to run, counted from 1; None: any that is free.
+
+    Returns:
+        Exit status of the process: 0, or 1 where the environment failed; the server knows why.
+
+    Raises:
+        ConnectionRefusedByPeerError: Nothing answers at the address, not a server with this token,
+            or the server has no place for the instance.
+    """
+    os.environ[CLIENT_VARIABLE] = "1"
+    link = connect(address, token, instance or 0)
+    try:
+        return _serve(link)
+    except RunEnded:
+        return 1
+    finally:
+        link.close()
+
+
+def _serve(link: Link) -> int:
+    frame = link.receive()
+    if frame.kind is Kind.ERROR:
+        raise decode_error(frame.payload)
+    if frame.kind is not Kind.SETUP:
+        raise ConnectionRefusedByPeerError(f"The server began with {frame.kind.name}.")
+    setup: dict[str, Any] = decode(frame.payload)
+    draw = setup.pop("draw")
+    _take_place(setup.pop("path"), setup.pop("directory"))
+    client = _Client(link, Instance(**setup))
+    try:
+        client.live(draw)
+    finally:
+        client.close()
+    link.send(pack(Kind.BYE))
+    return 1 if client.failed else 0
+
+
+def _take_place(path: list[str], directory: str) -> None:
+    """Look for modules, scripts and files where the server does, as far as they exist here."""
+    if Path(directory).is_dir():
+        os.chdir(directory)
+    found = [entry for entry in path if Path(entry).exists()]
+    sys.path[:] = [*found, *(entry for entry in sys.path if entry not in found)]
+
+
+class _Client:
+    """The life of one instance; its errors go to the server.
+
+    Attributes:
+        failed: Whether an error was sent.
+    """
+
+    def __init__(self, link: Link, instance: Instance) -> None:
+        self.failed = False
+        self._link, self._instance = link, instance
+        self._producer = Producer(link, instance)
+        self._services = RemoteServices(link, self._producer.flush)
+
+    def live(self, draw: bool) -> None:
+        """Open the environment and make rows until the run ends or the environment fails."""
+        try:
+            self._instance.open(self._services, draw)
+            fields = [field.to_dict() for field in self._instance.fields]
+            self._link.send(pack(Kind.READY, encode(fields)))
+            self._producer.run()
+        except RunEnded:
+            if self._producer.failure is not None:
+                self._report(self._producer.failure, self._producer.made)
+        except PhysxError as error:
+            self._report(error, self._producer.made)
+
+    def close(self) -> None:
+        """Close the environment."""
+        try:
+            self._instance.close()
+        except PhysxError as error:
+            if not self.failed:
+                self._report(error, 0)
+
+    def _report(self, error: PhysxError, row: int) -> None:
+        self.failed = True
+        self._link.send(pack(Kind.ERROR, encode_error(error), row))
+
+
+class RemoteServices:
+    """Services of the run, asked over the connection."""
+
+    def __init__(self, link: Link, flush: Callable[[], None]) -> None:
+        """Keep the connection.
+
+        Args:
+            link: Connection to the server.
+            flush: Sends what waits to be sent; called before each wait for an answer.
+        """
+        self._link, self._flush = link, flush
+
+    def predict(self, fields: Sample) -> Sample:
+        """Return the network's prediction: see `Services.predict`."""
+        prediction: Sample = self._ask(Kind.PREDICT, fields, "get_prediction()")
+        return prediction
+
+    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
+        """Keep values of the instance: see `Services.save_parameters`."""
+        self._ask(Kind.SAVE, values, "save_parameters()")
+
+    def load_parameters(self, instance_id: int) -> dict[str, Any]:
+        """Return the values that the instance kept: see `Services.load_parameters`."""
+        values: dict[str, Any] = self._ask(Kind.LOAD, None, "load_parameters()")
+        return values
+
+    def show(self, instance_id: int, step: int, events: list[Event]) -> None:
+        """Send drawing events: see `Services.show`."""
+        plain = [(event.action, event.kind, event.name, dict(event.values)) for event in events]
+        self._link.send(pack(Kind.SHOW, encode(plain, "update_visualization()"), step))
+
+    def _ask(self, kind: Kind, value: Any, what: str) -> Any:
+        message = encode(value, what)
+        self._flush()
+        return decode(self._link.ask(kind, message))

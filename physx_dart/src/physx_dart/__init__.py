@@ -1,0 +1,1 @@
+"""physx plugins `dart` and `pinocchio`: simulations of robots, and environments with them."""

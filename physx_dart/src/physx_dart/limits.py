@@ -1,0 +1,114 @@
+"""Joint limits and Coulomb friction as impulses, after the engine's free motion is known."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physx_core.interfaces.backend import Vector
+
+_REGULARIZATION = 1e-9
+"""Share that is added to the diagonal, as DART's solver does."""
+_FASTEST_RETURN = 10.0
+"""Speed in rad/s or m/s at which a joint comes back into its limits at most, as in DART."""
+
+
+class JointConstraints:
+    """Limits of position and velocity, and Coulomb friction, of a robot's joints.
+
+    A joint may not leave its limits in the next step, nor move faster than its velocity limit; one
+    that is outside comes back, whatever its velocity limit. Friction stops a joint if it can within its bounds.
+    """
+
+    def __init__(
+        self, lower: Vector, upper: Vector, max_velocity: Vector, friction: Vector, period: float
+    ) -> None:
+        """Keep the bounds of all degrees of freedom, each of shape (n,), and the period in s."""
+        self._lower, self._upper, self._fastest = lower, upper, max_velocity
+        self._friction = friction * period
+        self._rubs = bool(friction.any())
+        self._period = period
+
+    def impulses(
+        self, positions: Vector, velocities: Vector
+    ) -> tuple[NDArray[np.intp], Vector, Vector, Vector] | None:
+        """Return what has to change, or None where the free motion is allowed.
+
+        Args:
+            positions: Before the step, shape (n,).
+            velocities: After the step if nothing stopped the joints, shape (n,).
+
+        Returns:
+            Four vectors of one length: which degrees of freedom (one may be there twice), by how
+            much their velocities shall change, and the smallest and the largest impulse on them.
+        """
+        if not self._rubs and self._allows(positions, velocities):
+            return None
+        below, above = positions < self._lower, positions > self._upper
+        to_lower = (self._lower - positions) / self._period
+        to_upper = (self._upper - positions) / self._period
+        outside = below | above
+        slowest = np.where(below, to_lower, np.maximum(-self._fastest, to_lower))
+        slowest = np.minimum(slowest, _FASTEST_RETURN)
+        fastest = np.where(above, to_upper, np.minimum(self._fastest, to_upper))
+        fastest = np.maximum(fastest, -_FASTEST_RETURN)
+        low = below | ((velocities < slowest) & ~outside)
+        high = above | ((velocities > fastest) & ~outside & ~low)
+        rubs = (self._friction > 0) & (velocities != 0)
+        index = np.concatenate([np.flatnonzero(rows) for rows in (low, high, rubs)])
+        if not len(index):
+            return None
+        nothing, friction = np.zeros(len(velocities)), self._friction
+        target = np.concatenate([slowest[low], fastest[high], nothing[rubs]])
+        least = np.concatenate([nothing[low], nothing[high] - np.inf, -friction[rubs]])
+        most = np.concatenate([nothing[low] + np.inf, nothing[high], friction[rubs]])
+        return index, target - velocities[index], least, most
+
+    def _allows(self, positions: Vector, velocities: Vector) -> bool:
+        """Return whether no limit acts on a free motion."""
+        after = positions + self._period * velocities
+        return bool(
+            (after >= self._lower).all()
+            and (after <= self._upper).all()
+            and (np.abs(velocities) <= self._fastest).all()
+        )
+
+
+def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vector:
+    """Return the impulses that bring about a change of velocities as far as their bounds allow.
+
+    They solve the box-constrained linear complementarity problem by principal pivoting: blocks of
+    pivots as long as they help, else single ones, which always end (J. J. Judice and F. M. Pires,
+    A block principal pivoting algorithm for large-scale strictly monotone linear complementarity
+    problems, Computers & Operations Research 21, 1994).
+
+    Args:
+        response: Change of the velocities for unit impulses, shape (n, n), positive definite.
+        change: Wanted change of the velocities, shape (n,).
+        least: Smallest impulses, shape (n,), may be -inf.
+        most: Largest impulses, likewise.
+    """
+    A = response + np.diag(_REGULARIZATION * np.diag(response))
+    side = np.zeros(len(change), dtype=np.int8)  # -1: at its least, 1: at its most, 0: between
+    best, blocks = len(change) + 1, 3
+    impulses = np.zeros(len(change))
+    for _ in range(50 * (len(change) + 1)):
+        free = side == 0
+        impulses = np.where(side < 0, least, np.where(side > 0, most, 0.0))
+        if free.any():
+            rest = change[free] - A[np.ix_(free, ~free)] @ impulses[~free]
+            impulses[free] = np.linalg.solve(A[np.ix_(free, free)], rest)
+        missing = A @ impulses - change
+        under, over = free & (impulses < least), free & (impulses > most)
+        freed = ((side < 0) & (missing < 0)) | ((side > 0) & (missing > 0))
+        wrong = np.flatnonzero(under | over | freed)
+        if not len(wrong):
+            break
+        if len(wrong) < best:
+            best, blocks = len(wrong), 3
+        elif blocks:
+            blocks -= 1
+        else:
+            wrong = wrong[-1:]
+        side[wrong] = np.where(freed[wrong], 0, np.where(under[wrong], -1, 1))
+    return np.clip(impulses, least, most)

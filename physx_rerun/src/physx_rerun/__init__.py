@@ -1,0 +1,1 @@
+"""physx plugin `rerun`: shows environments and training in the Rerun viewer."""

@@ -1,0 +1,141 @@
+"""The native Rerun viewer as a process of its own, reachable from this machine only."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import rerun_cli
+
+from physx_core.errors import VisualizerError
+
+NO_VULKAN_STATUS = 102
+"""Exit status of a viewer that finds nothing to draw with."""
+NO_VULKAN = (
+    "The Rerun viewer found no graphics driver: install a software Vulkan driver, "
+    "for example: apt install mesa-vulkan-drivers"
+)
+
+
+def executable() -> Path:
+    """Return the viewer's file; the command ``rerun`` is a script that outlives being ended.
+
+    Raises:
+        VisualizerError: The package `rerun-sdk` came without it.
+    """
+    name = "rerun.exe" if sys.platform == "win32" else "rerun"
+    path = Path(rerun_cli.__file__).parent / name
+    if not path.is_file():
+        raise VisualizerError(f"The Rerun viewer {path} is missing: reinstall rerun-sdk.")
+    return path
+
+
+def has_display() -> bool:
+    """Return whether windows can be opened."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def listens(address: str, timeout: float = 0.5) -> bool:
+    """Return whether somebody listens at ``HOST:PORT``."""
+    host, _, port = address.rpartition(":")
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout):
+            return True
+    except OSError:
+        return False
+
+
+def free_port() -> int:
+    """Return a port that nobody listens at."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+class Viewer:
+    """A viewer process.
+
+    Attributes:
+        address: Where it listens, ``127.0.0.1:PORT``.
+        process: The process.
+    """
+
+    def __init__(
+        self,
+        port: int,
+        options: Sequence[str],
+        *,
+        environment: Mapping[str, str] | None = None,
+        lives_on: bool = False,
+    ) -> None:
+        """Start the process.
+
+        Args:
+            port: Port that it listens at; 0: any free one.
+            options: Further options of its command line.
+            environment: Environment variables beside those of this process.
+            lives_on: Whether the viewer outlives this process and its Ctrl-C.
+        """
+        port = port or free_port()
+        self.address = f"127.0.0.1:{port}"
+        self.process = subprocess.Popen(
+            [
+                str(executable()),
+                *("--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"),
+                *options,
+            ],
+            env={**os.environ, "RERUN_APP_ONLY": "true", **(environment or {})},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=lives_on,
+        )
+
+    def wait_until_ready(self, timeout: float = 30.0) -> None:
+        """Wait until the viewer listens.
+
+        Raises:
+            VisualizerError: It ended, or does not listen in time.
+        """
+        deadline = time.monotonic() + timeout
+        while not listens(self.address):
+            self.check()
+            if time.monotonic() > deadline:
+                self.end()
+                raise VisualizerError(f"The Rerun viewer did not start within {timeout:g} s.")
+            time.sleep(0.05)
+
+    def check(self, wait: float = 0.0) -> None:
+        """Raise if the process ended.
+
+        Args:
+            wait: Time in s that it is given to end.
+
+        Raises:
+            VisualizerError: It did; names the remedy where the graphics driver is missing.
+        """
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(wait)
+        status = self.process.returncode
+        if status == NO_VULKAN_STATUS:
+            raise VisualizerError(NO_VULKAN)
+        if status is not None:
+            raise VisualizerError(f"The Rerun viewer ended with status {status}.")
+
+    def end(self) -> None:
+        """End the process and wait for it."""
+        self.process.terminate()
+        try:
+            self.process.wait(3.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()

@@ -1,0 +1,213 @@
+"""RerunVisualizer: the observer that shows a run in the Rerun viewer."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import rerun as rr
+
+from physx_core import Visualizer
+from physx_core.config import at_least, options
+from physx_core.errors import ConfigError, VisualizerError
+from physx_core.scene import Event
+from physx_rerun import colors
+from physx_rerun.drawing import Drawing
+from physx_rerun.headless import render_picture
+from physx_rerun.layout import Layout
+from physx_rerun.rows import TIME, Rows
+from physx_rerun.streams import Recording
+from physx_rerun.viewer import Viewer, has_display, listens
+
+MODES = ("save", "spawn", "connect", "headless")
+FLUSH_SECONDS = 0.2
+FLUSH_STEPS = 100
+FLUSH_BYTES = 8_000_000
+
+
+@options
+@dataclass
+class RerunVisualizer(Visualizer):
+    """Draws environments and training curves in the Rerun viewer and saves them as a recording.
+
+    Attributes:
+        viewer: The viewer that was started, None where none was.
+        file: The recording's file, None where none is written.
+    """
+
+    mode: str = field(default="save", metadata={"choices": MODES})
+    """"save": only write a file; "spawn": open a viewer; "connect": show in a viewer that runs;
+    "headless": write a file, and a picture of it at the end."""
+    path: str | Path | None = None
+    """The .rrd file; None: a new one in the session's folder, named like the run."""
+    save: bool = True
+    """Whether the file is written."""
+    address: str | None = None
+    """Viewer to connect to, "HOST:PORT"."""
+    port: int = at_least(0, 0)
+    """Port of the viewer that is opened; 0: any free one."""
+    memory_limit: str = "2GB"
+    """Memory that the opened viewer may use before it forgets the oldest rows."""
+    picture: str | Path | None = None
+    """Picture of the headless mode; None: beside the file, ending in .png."""
+    picture_size: tuple[int, int] = (1600, 900)
+    """Its width and height in pixels."""
+    max_instances: int = at_least(0, 4)
+    """Environment instances drawn in full; of the others only numbers and texts are recorded."""
+
+    def __post_init__(self) -> None:
+        """Check that the options fit together and begin with an empty scene.
+
+        Raises:
+            ConfigError: They do not.
+        """
+        self._check_options()
+        self.viewer: Viewer | None = None
+        self.file: Path | None = None
+        self._run_name = "run"
+        self._address: str | None = None
+        self._recording: Recording | None = None
+        self._is_open = False
+        self._begun = time.monotonic()
+        self._flushed, self._waiting = float("-inf"), 0
+        self._rows, self._layout = Rows(), Layout(1)
+        self._drawings: dict[int, Drawing] = {}
+        self._curves: set[str] = set()
+        self._positions: dict[str, int] = {}
+
+    def _check_options(self) -> None:
+        if self.mode == "connect" and not re.fullmatch(r".+:\d{1,5}", self.address or ""):
+            raise ConfigError('mode "connect" needs address="HOST:PORT" of a running viewer.')
+        if self.mode != "connect" and self.address is not None:
+            raise ConfigError(f'address goes with mode "connect", not with "{self.mode}".')
+        if self.mode != "headless" and self.picture is not None:
+            raise ConfigError(f'picture goes with mode "headless", not with "{self.mode}".')
+        if self.mode in ("save", "headless") and not self.save:
+            raise ConfigError(f'mode "{self.mode}" needs the file: leave save=True.')
+        if min(self.picture_size) < 64:
+            raise ConfigError(f"picture_size {self.picture_size} is smaller than 64 pixels.")
+
+    # What the pipeline calls ----------------------------------------------------------------
+
+    def open(self, run_name: str, session_dir: Path, instance_nb: int) -> None:
+        """Reach or start the viewer and choose the file; see `Observer.open`.
+
+        Raises:
+            VisualizerError: Nobody listens at `address`, or there is no display for a window.
+        """
+        self.__post_init__()
+        self._run_name, self._layout = run_name, Layout(instance_nb)
+        if self.mode == "connect":
+            self._address = str(self.address)
+            if not listens(self._address):
+                raise VisualizerError(
+                    f"No Rerun viewer listens at {self._address}. Start one there with: "
+                    f"rerun --bind 127.0.0.1 --port {self._address.rpartition(':')[2]}"
+                )
+        if self.mode == "spawn":
+            self._spawn()
+        if self.save:
+            self.file = Path(self.path) if self.path else _unused(Path(session_dir), run_name)
+        self._is_open = True
+
+    def _spawn(self) -> None:
+        if not has_display():
+            raise VisualizerError(
+                'mode "spawn" opens a window, but there is no display. Use mode "headless" for a '
+                'picture, or mode "save" and open the file elsewhere with: rerun FILE.rrd'
+            )
+        options = ("--memory-limit", self.memory_limit, "--expect-data-soon")
+        self.viewer = Viewer(self.port, options, lives_on=True)
+        self.viewer.wait_until_ready()
+        self._address = self.viewer.address
+
+    def events(self, instance_id: int, step: int, events: list[Event]) -> None:
+        """Draw the events of one step; see `Observer.events`.
+
+        Raises:
+            VisualizerError: An event that cannot be drawn.
+            ConfigError: A color or colormap that does not exist.
+        """
+        if not self._is_open:
+            return
+        if instance_id not in self._drawings:
+            self._drawings[instance_id] = Drawing(
+                instance_id, self._rows, self._layout, in_full=instance_id <= self.max_instances
+            )
+        self._drawings[instance_id].draw(events, {"step": step, TIME: self._now()})
+        self._flush_if_due()
+
+    def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
+        """Add points to the curves of the training; see `Observer.scalars`."""
+        if not self._is_open:
+            return
+        self._positions[timeline] = step
+        times = {**self._positions, TIME: self._now()}
+        for name, value in values.items():
+            entity = "/".join(["run", *map(rr.escape_entity_path_part, name.split("/"))])
+            group, _, label = name.rpartition("/")
+            if name not in self._curves:
+                self._curves.add(name)
+                number = sum(known.rpartition("/")[0] == group for known in self._curves) - 1
+                line = rr.SeriesLines(names=[label], colors=colors.curves(1, number))
+                self._rows.static(entity, line)
+                self._layout.add_plot(group or name, entity, timeline, 1)
+            self._rows.add(entity, rr.Scalars, times, scalars=[float(value)])
+        self._flush_if_due()
+
+    def close(self) -> None:
+        """Finish the file, let the viewer go, draw the picture; see `Observer.close`.
+
+        Raises:
+            VisualizerError: The picture cannot be drawn.
+        """
+        if not self._is_open:
+            return
+        self._is_open = False
+        self._flush()
+        if self._recording is None:
+            return
+        self._recording.close()
+        self._recording = None
+        if self.mode == "headless" and self.file is not None:
+            picture = Path(self.picture) if self.picture else self.file.with_suffix(".png")
+            render_picture(self.file, picture, self.picture_size, timeline=self._layout.timeline)
+
+    # Flushing -------------------------------------------------------------------------------
+
+    def _now(self) -> float:
+        return time.monotonic() - self._begun
+
+    def _flush_if_due(self) -> None:
+        self._waiting += 1
+        full = self._waiting >= FLUSH_STEPS or self._rows.nbytes >= FLUSH_BYTES
+        if full or self._now() - self._flushed >= FLUSH_SECONDS:
+            self._flush()
+
+    def _flush(self) -> None:
+        chunks = self._rows.take()
+        self._flushed, self._waiting = self._now(), 0
+        if self._recording is None:
+            if not chunks:
+                return
+            self._recording = Recording(
+                f"physx {self._run_name} {self._layout.digest}",
+                self._run_name,
+                self.file,
+                self._address,
+                owns_viewer=self.viewer is not None,
+            )
+        self._recording.write(chunks)
+        if self._layout.changed:
+            self._recording.lay_out(self._layout.blueprint())
+
+
+def _unused(folder: Path, name: str) -> Path:
+    """Return the path of a recording that does not exist yet."""
+    path, number = folder / f"{name}.rrd", 2
+    while path.exists():
+        path, number = folder / f"{name}_{number}.rrd", number + 1
+    return path

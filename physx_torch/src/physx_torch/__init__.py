@@ -1,0 +1,43 @@
+"""The physx plugin ``torch``: PyTorch networks, optimization and transformation.
+
+The public names are imported when they are first used, so that finding the plugin does not import
+torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from physx_torch.module_network import ModuleNetwork
+    from physx_torch.network import TorchNetwork
+    from physx_torch.networks.fc import FC
+    from physx_torch.optimization import TorchOptimization
+    from physx_torch.transformation import TorchTransformation
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "FC": "networks.fc",
+    "ModuleNetwork": "module_network",
+    "TorchNetwork": "network",
+    "TorchOptimization": "optimization",
+    "TorchTransformation": "transformation",
+}
+
+__all__ = ["FC", "ModuleNetwork", "TorchNetwork", "TorchOptimization", "TorchTransformation"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"physx_torch.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted([*globals(), *__all__])

@@ -1,0 +1,74 @@
+"""Choosing classes of torch by name, and making them with a user's arguments."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from types import ModuleType
+from typing import Any
+
+from physx_core.errors import ComponentNotFoundError, ConfigError, listed, nearest
+from physx_core.plugins import resolve
+
+
+def classes_in(module: ModuleType, base: type[Any]) -> dict[str, type[Any]]:
+    """Return the public subclasses of `base` that a module or its submodules define, by name."""
+    return {
+        name: value
+        for name, value in vars(module).items()
+        if isinstance(value, type)
+        and issubclass(value, base)
+        and value is not base
+        and not name.startswith("_")
+        and value.__module__.startswith(module.__name__)
+    }
+
+
+def choose(what: str, given: Any, known: Mapping[str, Any]) -> Any:
+    """Return what a user named, or what was given if it is no text.
+
+    Args:
+        what: Kind of thing for messages, for example ``"loss"``.
+        given: One of the known names, ``"package.module:Name"``, or the thing itself.
+        known: The things that have a short name.
+
+    Raises:
+        ConfigError: Nothing has the name.
+    """
+    if not isinstance(given, str):
+        return given
+    if given in known:
+        return known[given]
+    if ":" in given:
+        try:
+            return resolve("network", given)
+        except ComponentNotFoundError as error:
+            raise ConfigError(
+                f'There is no {what} "{given}".{nearest(error.name, error.known)}'
+            ) from error
+    raise ConfigError(
+        f'torch has no {what} "{given}".{nearest(given, known)} It has: {listed(known)}. '
+        'Your own is named "package.module:Name".'
+    )
+
+
+def make(what: str, factory: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """Return ``factory(*args, **kwargs)``.
+
+    Raises:
+        ConfigError: It refuses the arguments; the message says which ones it takes.
+    """
+    try:
+        return factory(*args, **kwargs)
+    except (TypeError, ValueError) as error:
+        name = getattr(factory, "__name__", repr(factory))
+        raise ConfigError(
+            f"The {what} {name} refuses its arguments: {error}. It takes: {_taken(factory)}."
+        ) from error
+
+
+def _taken(factory: Callable[..., Any]) -> str:
+    try:
+        return ", ".join(inspect.signature(factory).parameters) or "none"
+    except ValueError:  # some callables written in C have no signature
+        return "what its documentation says"

@@ -1,0 +1,38 @@
+"""Devices: what "auto", "cuda:1" and the like mean on this machine."""
+
+from __future__ import annotations
+
+import torch
+
+from physx_core.errors import ConfigError
+
+
+def existing_devices() -> list[str]:
+    """Return the names of the devices that torch can compute on here."""
+    names = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
+    if torch.backends.mps.is_available():
+        names.append("mps")
+    return names
+
+
+def find_device(name: str) -> torch.device:
+    """Return a device that exists.
+
+    Args:
+        name: ``"cpu"``, ``"cuda"``, ``"cuda:<index>"``, ``"mps"`` or ``"auto"``: the first CUDA
+            device if there is one, otherwise the processor.
+
+    Raises:
+        ConfigError: The device does not exist on this machine.
+    """
+    existing = existing_devices()
+    if name == "auto":
+        name = "cuda:0" if "cuda:0" in existing else "cpu"
+    elif name == "cuda":
+        name = "cuda:0"
+    if name not in existing:
+        raise ConfigError(
+            f'There is no device "{name}" on this machine. Devices: {", ".join(existing)}, '
+            'or "auto".'
+        )
+    return torch.device(name)

@@ -1,0 +1,169 @@
+"""FC: layers in which every neuron is connected with every one of the next layer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import torch
+
+from physx_core import Field
+from physx_core.errors import ConfigError, FieldsMismatchError
+from physx_torch.choices import choose, classes_in, make
+from physx_torch.network import TorchNetwork
+
+
+class FC(TorchNetwork):
+    """Fully connected network.
+
+    The values of all `net_fields` of a sample are put behind one another, in that order, and go
+    through the layers; an activation follows each layer but the last. The outputs are dealt out
+    to the prediction fields in order, in the shapes of `opt_fields`.
+
+    Attributes:
+        layers: The linear layers and activations.
+        sizes: Number of inputs, of neurons of each hidden layer, and of outputs.
+    """
+
+    def __init__(
+        self,
+        layers: Sequence[int],
+        *,
+        activation: str | type[torch.nn.Module] = "PReLU",
+        biases: bool | Sequence[bool] = True,
+        output_shape: int | Sequence[int] | None = None,
+        **fields: Any,
+    ) -> None:
+        """Make the layers.
+
+        Args:
+            layers: Number of inputs, of neurons of each hidden layer, and of outputs, for example
+                ``[27, 256, 256, 9]``.
+            activation: Class of an activation, or its name in `torch.nn`. ``"PReLU"`` learns one
+                slope for each neuron.
+            biases: Whether the layers have a bias: all of them, or one truth value for each of the
+                ``len(layers) - 1`` layers.
+            output_shape: Shape of one sample's prediction; None: that of the field in
+                `opt_fields`.
+            fields: ``net_fields``, ``opt_fields`` and ``pred_fields`` as in `TorchNetwork`.
+
+        Raises:
+            ConfigError: A list has the wrong length or content, or there is no such activation.
+        """
+        super().__init__(**fields)
+        self.sizes = _sizes(layers)
+        self.layers = _stack(self.sizes, activation, _flags(biases, len(self.sizes) - 1))
+        self._shape = self._fixed_shape(output_shape)
+        self._shapes = [self._shape or (self.sizes[-1],)]
+
+    def _fixed_shape(self, given: int | Sequence[int] | None) -> tuple[int, ...] | None:
+        if given is None:
+            return None
+        shape = (given,) if isinstance(given, int) else tuple(given)
+        if len(self.pred_fields) > 1:
+            raise ConfigError("FC.output_shape is for one prediction field: leave it out.")
+        if math.prod(shape) != self.sizes[-1]:
+            raise ConfigError(
+                f"FC.output_shape {shape} has {math.prod(shape)} values, but the last of layers "
+                f"{list(self.sizes)} has {self.sizes[-1]}."
+            )
+        return shape
+
+    def bind(self, fields: Mapping[str, Field]) -> None:
+        """Learn the shapes of the fields before the first batch.
+
+        Raises:
+            FieldsMismatchError: A field is missing, its shape is unknown, or the fields do not
+                have as many values as the first and the last layer.
+        """
+        super().bind(fields)
+        self._check("first", self.sizes[0], {name: fields[name] for name in self.net_fields})
+        targets = {name: fields[name] for name in self.opt_fields}
+        self._check("last", self.sizes[-1], targets)
+        shapes = [tuple(field.shape or ()) for field in targets.values()]
+        if self._shape is not None and shapes != [self._shape]:
+            name = self.opt_fields[0]
+            text = f"shape {shapes[0]}, but output_shape is {self._shape}"
+            raise FieldsMismatchError("FC does not fit the fields", {name: text})
+        self._shapes = shapes
+
+    def _check(self, which: str, size: int, fields: Mapping[str, Field]) -> None:
+        unknown = {
+            name: "its shape is not known before its first sample"
+            for name, field in fields.items()
+            if field.shape is None
+        }
+        if unknown:
+            raise FieldsMismatchError("FC does not fit the fields", unknown)
+        counts = {name: math.prod(field.shape or ()) for name, field in fields.items()}
+        if sum(counts.values()) != size:
+            differences = {
+                name: f"shape {fields[name].shape}, {count} values"
+                for name, count in counts.items()
+            }
+            raise FieldsMismatchError(
+                f"The {which} of FC's layers {list(self.sizes)} must be {sum(counts.values())}, "
+                "the number of values of",
+                differences,
+            )
+
+    def forward(self, *inputs: torch.Tensor) -> torch.Tensor | list[torch.Tensor]:
+        """Return the predictions for the tensors of `net_fields`.
+
+        Args:
+            inputs: One tensor for each field, of shape (samples, *field shape).
+        """
+        flat = [self._flat(tensor) for tensor in inputs]
+        output = self.layers(flat[0] if len(flat) == 1 else torch.cat(flat, dim=1))
+        if len(self._shapes) == 1:
+            shape = self._shapes[0]
+            return output if len(shape) == 1 else output.view(len(output), *shape)
+        parts = output.split([math.prod(shape) for shape in self._shapes], dim=1)
+        shaped = zip(parts, self._shapes, strict=True)
+        return [part.reshape(len(output), *shape) for part, shape in shaped]
+
+    def _flat(self, tensor: torch.Tensor) -> torch.Tensor:
+        if not tensor.is_floating_point():
+            tensor = tensor.to(self.data_type)
+        if tensor.dim() == 2:
+            return tensor
+        return tensor.unsqueeze(1) if tensor.dim() == 1 else tensor.flatten(1)
+
+
+def _sizes(given: Sequence[int]) -> tuple[int, ...]:
+    sizes = () if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
+    right = all(type(size) is int and size > 0 for size in sizes)
+    if len(sizes) < 2 or not right:
+        raise ConfigError(
+            f"FC.layers is {given!r} but must list the numbers of inputs, hidden neurons and "
+            "outputs, at least two positive integers, for example [27, 256, 256, 9]."
+        )
+    return sizes
+
+
+def _flags(given: bool | Sequence[bool], number: int) -> list[bool]:
+    if isinstance(given, bool):
+        return [given] * number
+    flags = list(given) if isinstance(given, (list, tuple)) else []
+    if len(flags) != number or not all(isinstance(flag, bool) for flag in flags):
+        raise ConfigError(
+            f"FC.biases is {given!r} but must be True, False or {number} of them, one for each "
+            "layer after the inputs."
+        )
+    return flags
+
+
+def _stack(sizes: Sequence[int], activation: Any, biases: Sequence[bool]) -> torch.nn.Sequential:
+    known = classes_in(torch.nn.modules.activation, torch.nn.Module)
+    chosen = choose("activation", activation, {**known, "Identity": torch.nn.Identity})
+    modules: list[torch.nn.Module] = []
+    for (inputs, outputs), bias in zip(pairwise(sizes), biases, strict=True):
+        if modules:
+            slopes = {"num_parameters": inputs} if chosen is torch.nn.PReLU else {}
+            modules.append(make("activation", chosen, **slopes))
+        modules.append(torch.nn.Linear(inputs, outputs, bias=bias))
+    if not all(isinstance(module, torch.nn.Module) for module in modules):
+        raise ConfigError(f"FC.activation is {activation!r} but must be a torch.nn.Module class.")
+    return torch.nn.Sequential(*modules)

@@ -1,0 +1,85 @@
+"""Parameter files: a module's parameters and buffers in safetensors, which runs no code."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from safetensors import SafetensorError
+
+from physx_core.errors import CheckpointError
+
+
+def write_tensors(
+    path: Path, tensors: Mapping[str, Any], metadata: dict[str, str] | None = None
+) -> None:
+    """Write tensors to a safetensors file.
+
+    Args:
+        path: The file; an existing one is replaced.
+        tensors: Tensors by name. Those that share memory are written one by one.
+        metadata: Texts that the file holds beside them.
+
+    Raises:
+        CheckpointError: An entry is no tensor, or the file cannot be written.
+    """
+    for name, value in tensors.items():
+        if not isinstance(value, torch.Tensor):
+            raise CheckpointError(
+                f'"{name}" is a {type(value).__name__}; a checkpoint only holds tensors. '
+                "Register it as a buffer of the module, or pass it to the constructor."
+            )
+    plain = {
+        name: value.detach().clone(memory_format=torch.contiguous_format).cpu()
+        for name, value in tensors.items()
+    }
+    try:
+        safetensors.torch.save_file(plain, path, metadata)
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path} cannot be written: {error}.") from error
+
+
+def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    """Return the tensors and the texts of a safetensors file, the tensors on the processor.
+
+    Raises:
+        CheckpointError: The file is missing or damaged.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"There is no file {path}.")
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            # A copy, because the file may be replaced while its pages are mapped.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
+            return tensors, file.metadata() or {}
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path} is damaged or no safetensors file: {error}.") from error
+
+
+def check_match(path: Path, name: str, found: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+    """Check that tensors of a file are those of a network, by name and shape.
+
+    Args:
+        path: The file, for the message.
+        name: The network's name, for the message.
+        found: Tensors of the file.
+        own: Tensors of the network.
+
+    Raises:
+        CheckpointError: They differ; the message names each tensor that does.
+    """
+    lines = [f"{key}: not in the file" for key in own if key not in found]
+    lines += [f"{key}: only in the file" for key in found if key not in own]
+    lines += [
+        f"{key}: {tuple(found[key].shape)} in the file, {tuple(own[key].shape)} in the network"
+        for key in own
+        if key in found and found[key].shape != own[key].shape
+    ]
+    if lines:
+        raise CheckpointError(
+            f"{path} holds the parameters of another network than this {name}:\n  "
+            + "\n  ".join(lines)
+        )

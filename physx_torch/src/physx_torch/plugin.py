@@ -1,0 +1,26 @@
+"""The hooks of the plugin ``torch``; components are texts, so that torch is imported on use."""
+
+from __future__ import annotations
+
+from physx_core.plugins import hookimpl
+
+
+@hookimpl
+def physx_networks() -> dict[str, str]:
+    """Return the networks by name."""
+    return {
+        "fc": "physx_torch.networks.fc:FC",
+        "module": "physx_torch.module_network:ModuleNetwork",
+    }
+
+
+@hookimpl
+def physx_optimizations() -> dict[str, str]:
+    """Return the optimizations by name."""
+    return {"default": "physx_torch.optimization:TorchOptimization"}
+
+
+@hookimpl
+def physx_transformations() -> dict[str, str]:
+    """Return the transformations by name."""
+    return {"default": "physx_torch.transformation:TorchTransformation"}

@@ -1,0 +1,225 @@
+"""Environments that client processes import by the path of this file."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from physx_core import Environment, Field
+from physx_core.errors import FieldShapeError
+
+
+class Walk(Environment):
+    """A random walk: five numbers in, one out, in an open and a known shape; fields of any type."""
+
+    def __init__(self, *, size: int = 5, delay: float = 0.0, refuse: int = 0, **kwargs):
+        super().__init__(**kwargs)
+        self.size, self.delay, self.refuse = size, delay, refuse
+        self.state = np.zeros(size)
+
+    def create(self):
+        self.count = 0
+
+    def init_database(self):
+        self.define_training_fields([("state", np.ndarray), Field("mean", shape=())])
+        self.define_additional_fields([Field("flags", shape=(2,), dtype="bool"), ("count", int)])
+
+    def step(self):
+        if self.delay:
+            time.sleep(self.delay * self.rng.random())
+        self.count += 1
+        self.state = self.state + self.rng.normal(size=self.size)
+        self.set_training_data(state=self.state, mean=self.state.mean())
+        self.set_additional_data(flags=self.state[:2] > 0, count=self.count)
+
+    def check_sample(self):
+        return not self.refuse or self.count % self.refuse != 0
+
+
+class Plain(Environment):
+    """One number for each step: instance and step."""
+
+    def create(self):
+        pass
+
+    def init_database(self):
+        self.define_training_fields(Field("x", shape=(2,)))
+
+    def step(self):
+        self.act()
+        self.set_training_data(x=np.array([self.instance_id, self.step_index], float))
+
+    def act(self):
+        pass
+
+
+class Trouble(Plain):
+    """Does something bad in one method of one instance, at one step."""
+
+    def __init__(self, *, what: str, method: str = "step", at: int = 3, who: int = 1, **kwargs):
+        self.what, self.method, self.at, self.who = what, method, at, who
+        super().__init__(**kwargs)
+        self.do("__init__")
+
+    def do(self, method):
+        if method == self.method and self.instance_id == self.who:
+            getattr(self, self.what)()
+
+    def create(self):
+        self.do("create")
+
+    def init_database(self):
+        super().init_database()
+        self.do("init_database")
+
+    def act(self):
+        if self.step_index == self.at:
+            self.do("step")
+
+    def apply_prediction(self, prediction):
+        self.do("apply_prediction")
+
+    def close(self):
+        self.do("close")
+
+    def fail(self):
+        raise RuntimeError("no more beans")
+
+    def fail_known(self):
+        error = FieldShapeError("mine", field="x", instance_id=7, step=9)
+        error.add_note("a note")
+        raise error
+
+    def leave(self):
+        sys.exit(5)
+
+    def vanish(self):
+        print("last words", file=sys.stderr, flush=True)
+        os._exit(3)
+
+    def spin(self):
+        while True:
+            pass
+
+    def sleep(self):
+        time.sleep(60)
+
+    def leave_child(self):
+        child = subprocess.Popen(["sleep", "60"])
+        Path(os.environ["PHYSX_TEST_CHILD"]).write_text(str(child.pid))
+
+
+class Bad(Plain):
+    """Gives what cannot be stored at one step."""
+
+    def __init__(self, *, value, field: str = "x", at: int = 3, who: int = 1, **kwargs):
+        super().__init__(**kwargs)
+        self.value, self.field, self.at, self.who = value, field, at, who
+
+    def step(self):
+        super().step()
+        if self.step_index == self.at and self.instance_id == self.who:
+            self.set_training_data(**{self.field: self.value})
+
+
+class Shapes(Environment):
+    """Open shapes that differ between the instances."""
+
+    def create(self):
+        pass
+
+    def init_database(self):
+        self.define_training_fields([("x", np.ndarray)])
+
+    def step(self):
+        self.set_training_data(x=np.zeros(self.instance_id))
+
+
+class Asking(Plain):
+    """Asks the network in each step, after some steps without."""
+
+    def create(self):
+        self.kept = self.load_parameters()
+        self.save_parameters(instance=self.instance_id, table=np.arange(3), kept=self.kept)
+
+    def step(self):
+        x = np.array([self.instance_id, self.step_index], float)
+        predicted = self.get_prediction(x=x, number=self.step_index)
+        self.set_training_data(x=predicted["y"])
+
+
+class Stubborn(Plain):
+    """Goes on when a prediction fails; its second row is not finite."""
+
+    def step(self):
+        self.set_training_data(x=np.full(2, np.nan if self.step_index == 1 else self.step_index))
+        if self.step_index >= 2:
+            try:
+                self.get_prediction(x=1)
+            except Exception:
+                self.failed = True
+
+
+class Applied(Plain):
+    """Its rows hold what was applied."""
+
+    value = 0.0
+
+    def step(self):
+        self.set_training_data(x=np.array([self.value, self.step_index], float))
+
+    def apply_prediction(self, prediction):
+        self.value = 10 * self.value + float(prediction["y"])
+
+
+class Drawing(Plain):
+    """Draws points in each step."""
+
+    def init_visualization(self):
+        self.factory.add_points("cloud", np.arange(6.0).reshape(2, 3), color="red")
+
+    def act(self):
+        self.factory.update_points("cloud", positions=np.full((2, 3), self.step_index / 3))
+        self.update_visualization()
+
+
+class Echo(Environment):
+    """Tells in its sample whether its options arrived exactly."""
+
+    def __init__(self, *, options, **kwargs):
+        super().__init__(**kwargs)
+        self.options = options
+
+    def create(self):
+        self.save_parameters(options=self.options)
+
+    def init_database(self):
+        self.define_training_fields(("x", float))
+
+    def step(self):
+        self.set_training_data(x=0.0)
+
+
+class Surroundings(Environment):
+    """Keeps what its process looks like."""
+
+    def create(self):
+        self.save_parameters(
+            client=os.environ.get("PHYSX_CLIENT"),
+            token=os.environ.get("PHYSX_TOKEN"),
+            threads=os.environ.get("OMP_NUM_THREADS"),
+            command=Path("/proc/self/cmdline").read_bytes(),
+            modules=sorted(sys.modules),
+            directory=str(Path.cwd()),
+        )
+
+    def init_database(self):
+        self.define_training_fields(("x", float))
+
+    def step(self):
+        self.set_training_data(x=0.0)

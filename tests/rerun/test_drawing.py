@@ -1,0 +1,297 @@
+"""Every kind of object is drawn and read back from the file."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from physx_core.errors import ConfigError, VisualizerError
+from physx_core.scene import KINDS, Event, Factory
+
+SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+CELLS = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+@pytest.fixture
+def scene(opened, read):
+    """Return a factory, a function that shows what it made at a step, and one that reads back."""
+    visualizer, factory = opened(), Factory()
+
+    def show(step):
+        visualizer.events(1, step, factory.take_events())
+
+    def saved(entity, component):
+        visualizer.close()
+        return read(visualizer.file, f"/env_1/{entity}", component)
+
+    return factory, show, saved
+
+
+def test_mesh(scene):
+    factory, show, saved = scene
+    factory.add_mesh("plate", SQUARE, CELLS, color="#ff0000", alpha=0.5)
+    show(0)
+    factory.update_mesh("plate", positions=SQUARE + 1)
+    show(3)
+    assert saved("plate", "Mesh3D:triangle_indices") == [(None, CELLS.tolist())]
+    positions = saved("plate", "Mesh3D:vertex_positions")
+    assert positions == [(0, SQUARE.tolist()), (3, (SQUARE + 1).tolist())]
+    assert saved("plate", "Mesh3D:vertex_normals")[0][1] == [[0, 0, 1]] * 4
+    assert saved("plate", "Mesh3D:albedo_factor") == [(0, [0xFF000080])]
+    assert saved("plate", "CoordinateFrame:frame") == [(None, ["env_1/world"])]
+
+
+def test_mesh_with_a_scalar_field(scene):
+    factory, show, saved = scene
+    factory.add_mesh("plate", SQUARE, CELLS, scalar_field=[0, 1, 2, 3], colormap="gray")
+    show(0)
+    factory.update_mesh("plate", scalar_field=[3, 3, 3, 6])
+    show(1)
+    factory.update_mesh("plate", color="#0000ff")
+    show(2)
+    black, white, half = 0x000000FF, 0xFFFFFFFF, 0x808080FF
+    (_, first), (_, second), (_, third) = saved("plate", "Mesh3D:vertex_colors")
+    assert (first[0], first[3]) == (black, white)
+    assert second == [half, half, half, white]
+    assert third == []
+    assert saved("plate", "Mesh3D:albedo_factor")[-1] == (2, [0x0000FFFF])
+
+
+def test_mesh_as_wireframe_and_back(scene):
+    factory, show, saved = scene
+    factory.add_mesh("plate", SQUARE, CELLS, wireframe=True, color="#00ff00")
+    show(0)
+    factory.update_mesh("plate", wireframe=False)
+    show(1)
+    (_, edges), (_, none) = saved("plate/edges", "LineStrips3D:strips")
+    assert len(edges) == 5
+    assert none == []
+    assert saved("plate/edges", "LineStrips3D:colors")[0] == (0, [0x00FF00FF])
+    assert [len(v) for _, v in saved("plate", "Mesh3D:vertex_positions")] == [0, 4]
+
+
+def test_points(scene):
+    factory, show, saved = scene
+    factory.add_points("cloud", SQUARE, color=(0, 1, 0), size=0.02)
+    show(0)
+    factory.update_points("cloud", positions=SQUARE[:2], scalar_field=[0, 1])
+    show(1)
+    assert [len(v) for _, v in saved("cloud", "Points3D:positions")] == [4, 2]
+    assert saved("cloud", "Points3D:radii") == [(0, [pytest.approx(0.02)])]
+    assert saved("cloud", "Points3D:colors") == [(0, [0x00FF00FF]), (1, [0x440154FF, 0xFDE725FF])]
+
+
+def test_arrows(scene):
+    factory, show, saved = scene
+    factory.add_arrows("forces", SQUARE, SQUARE * 2, color="#112233")
+    show(0)
+    factory.update_arrows("forces", vectors=SQUARE * 3)
+    show(1)
+    assert saved("forces", "Arrows3D:origins") == [(0, SQUARE.tolist())]
+    vectors = saved("forces", "Arrows3D:vectors")
+    assert vectors == [(0, (SQUARE * 2).tolist()), (1, (SQUARE * 3).tolist())]
+
+
+def test_lines(scene):
+    factory, show, saved = scene
+    factory.add_lines("path", SQUARE[:1])
+    show(0)
+    factory.update_lines("path", positions=SQUARE)
+    show(1)
+    strips = saved("path", "LineStrips3D:strips")
+    assert strips == [(0, [SQUARE[:1].tolist()]), (1, [SQUARE.tolist()])]
+
+
+def test_box_moves(scene):
+    factory, show, saved = scene
+    factory.add_box("crate", [1, 2, 3], color="#ffffff", position=[1, 0, 0])
+    show(0)
+    factory.update_box("crate", orientation=[0, 0, 1, 0])
+    show(1)
+    factory.update_box("crate", alpha=0.2, wireframe=True)
+    show(2)
+    assert saved("crate", "Boxes3D:half_sizes") == [(None, [[1, 2, 3]])]
+    assert saved("crate", "Boxes3D:colors") == [(0, [0xFFFFFFFF]), (2, [0xFFFFFF33])]
+    assert len(saved("crate", "Boxes3D:fill_mode")) == 2
+    assert saved("crate", "CoordinateFrame:frame") == [(None, ["env_1/crate"])]
+    assert saved("tf", "Transform3D:translation") == [(0, [[1, 0, 0]]), (1, [[1, 0, 0]])]
+    assert saved("tf", "Transform3D:quaternion") == [(0, [[0, 0, 0, 1]]), (1, [[0, 0, 1, 0]])]
+    assert saved("tf", "Transform3D:parent_frame")[0] == (0, ["env_1/world"])
+
+
+def test_sphere_and_capsule(scene):
+    factory, show, saved = scene
+    factory.add_sphere("ball", 0.5, position=[0, 0, 1])
+    factory.add_capsule("pill", 0.25, 2.0)
+    show(0)
+    factory.update_sphere("ball", radius=1.0)
+    factory.update_capsule("pill", length=4.0)
+    show(1)
+    assert saved("ball", "Ellipsoids3D:half_sizes") == [(0, [[0.5] * 3]), (1, [[1.0] * 3])]
+    assert saved("pill", "Capsules3D:radii")[0] == (0, [0.25])
+    assert saved("pill", "Capsules3D:lengths") == [(0, [2.0]), (1, [4.0])]
+    # Rerun's capsule begins at the origin, the scene's is centered.
+    translations = saved("pill", "Capsules3D:translations")
+    assert translations == [(0, [[0, 0, -1]]), (1, [[0, 0, -2]])]
+
+
+def test_text(scene):
+    factory, show, saved = scene
+    factory.add_text("notes", "# one")
+    show(0)
+    factory.update_text("notes", content="# two")
+    show(1)
+    assert saved("notes", "TextDocument:text") == [(0, ["# one"]), (1, ["# two"])]
+    assert saved("notes", "TextDocument:media_type") == [(None, ["text/markdown"])]
+
+
+def test_scalars(scene):
+    factory, show, saved = scene
+    factory.add_scalars("error", ["x", "y"])
+    show(0)
+    for step in range(1, 4):
+        factory.update_scalars("error", [step, -step])
+        show(step)
+    assert saved("error", "Scalars:scalars") == [(1, [1, -1]), (2, [2, -2]), (3, [3, -3])]
+    assert saved("error", "SeriesLines:names") == [(None, ["x", "y"])]
+
+
+def test_robot(scene, arm):
+    factory, show, saved = scene
+    poses = np.array([[0, 0, 0, 0, 0, 0, 1], [0, 0, 1, 0, 0, 1, 0]], float)
+    packages = {"arm_meshes": str(arm.parent / "meshes")}
+    factory.add_robot("arm", arm, ["base", "upper"], package_dirs=packages, poses=poses)
+    show(0)
+    factory.update_robot("arm", poses=poses + 1)
+    show(1)
+    assert saved("arm/base_0", "CoordinateFrame:frame") == [(None, ["env_1/arm/base"])]
+    assert saved("arm/base_0", "Boxes3D:half_sizes")[0][1] == [pytest.approx([0.1, 0.1, 0.05])]
+    assert saved("arm/upper_0", "Cylinders3D:colors") == [(0, [0xFF8000FF])]
+    assert saved("arm/tool_0", "CoordinateFrame:frame") == [(None, ["env_1/arm/upper"])]
+    assert saved("arm/tool_0", "Asset3D:media_type") == [(None, ["model/obj"])]
+    assert saved("arm/tool_0", "InstancePoses3D:scales") == [(None, [[2, 2, 2]])]
+    assert saved("arm/tool_0", "InstancePoses3D:translations")[0][1] == [pytest.approx([0, 0, 0.3])]
+    assert saved("arm/tool_0", "Asset3D:albedo_factor") == []
+    frames = [(0, ["env_1/arm/base"]), (0, ["env_1/arm/upper"])]
+    assert saved("tf", "Transform3D:child_frame")[:2] == frames
+    assert saved("tf", "Transform3D:translation")[1:3] == [(0, [[0, 0, 1]]), (1, [[1, 1, 1]])]
+
+
+def test_ghost_of_a_robot(scene, arm):
+    factory, show, saved = scene
+    packages = {"arm_meshes": str(arm.parent / "meshes")}
+    factory.add_robot(
+        "ghost", arm, ["base", "upper"], package_dirs=packages, color="#0000ff", alpha=0.4
+    )
+    show(0)
+    factory.update_robot("ghost", alpha=1.0)
+    show(1)
+    expected = [(0, [0x0000FF66]), (1, [0x0000FFFF])]
+    assert saved("ghost/tool_0", "Asset3D:albedo_factor") == expected
+    assert saved("ghost/base_0", "Boxes3D:colors") == expected
+    # Without poses it stands with its joints at zero.
+    assert saved("tf", "Transform3D:translation")[1] == (0, [[0, 0, pytest.approx(0.05)]])
+
+
+def test_missing_meshes_are_warned_of(scene, arm):
+    factory, show, saved = scene
+    factory.add_robot("arm", arm, ["base", "upper"])
+    with pytest.warns(UserWarning, match=r"1 meshes of .*arm\.urdf.*tool\.obj.*package_dirs"):
+        show(0)
+    assert saved("arm/tool_1", "Ellipsoids3D:half_sizes")
+
+
+def test_collision_shapes_are_left_out(opened, entities, arm):
+    visualizer, factory = opened(), Factory()
+    packages = {"arm_meshes": str(arm.parent / "meshes")}
+    factory.add_robot("arm", arm, ["base", "upper"], package_dirs=packages)
+    visualizer.events(1, 0, factory.take_events())
+    visualizer.close()
+    shapes = {entity for entity in entities(visualizer.file) if entity.startswith("/env_1/arm/")}
+    names = {"base_0", "upper_0", "tool_0", "tool_1"}
+    assert shapes == {f"/env_1/arm/{name}" for name in names}
+
+
+def test_names_with_blanks_and_groups(scene):
+    factory, show, saved = scene
+    factory.add_points("left foot/contact (N)", SQUARE)
+    show(0)
+    entity = "left\\ foot/contact\\ \\(N\\)"
+    assert len(saved(entity, "Points3D:positions")) == 1
+
+
+def test_every_kind_of_the_scene_is_known(opened):
+    visualizer = opened()
+    for kind in KINDS:
+        with pytest.raises(VisualizerError, match="never added"):
+            visualizer.events(1, 0, [Event("update", kind, "nobody", {})])
+    with pytest.raises(VisualizerError, match="unknown kind"):
+        visualizer.events(1, 0, [Event("add", "smoke", "cloud", {})])
+
+
+def test_what_does_not_fit_is_named(opened, arm):
+    visualizer, factory = opened(), Factory()
+    factory.add_scalars("error", ["x", "y"], values=[1.0])
+    with pytest.raises(VisualizerError, match=r"error.*2 labels but 1 values"):
+        visualizer.events(1, 0, factory.take_events())
+    factory.add_points("cloud", SQUARE, color="gren")
+    with pytest.raises(ConfigError, match="green"):
+        visualizer.events(1, 0, factory.take_events())
+    factory.add_robot("arm", arm, ["base", "upper"], poses=np.zeros((3, 7)))
+    with (
+        pytest.warns(UserWarning),
+        pytest.raises(VisualizerError, match="2 bodies but got 3 poses"),
+    ):
+        visualizer.events(1, 0, factory.take_events())
+
+
+def test_instances_have_their_own_entities(opened, read):
+    visualizer = opened(instance_nb=2)
+    for instance in (1, 2):
+        factory = Factory()
+        factory.add_sphere("ball", 0.1, position=[instance, 0, 0])
+        factory.add_scalars("height", ["z"], values=[instance])
+        visualizer.events(instance, 0, factory.take_events())
+    visualizer.close()
+    for instance in (1, 2):
+        path = visualizer.file, f"/env_{instance}/tf", "Transform3D:translation"
+        assert read(*path) == [(0, [[instance, 0, 0]])]
+        names = read(visualizer.file, f"/env_{instance}/height", "SeriesLines:names")
+        assert names == [(None, [f"{instance}: z"])]
+
+
+def test_instances_beyond_the_limit_only_record_numbers(opened, entities):
+    visualizer = opened(instance_nb=3, max_instances=1)
+    for instance in (1, 2, 3):
+        factory = Factory()
+        factory.add_sphere("ball", 0.1)
+        factory.add_scalars("height", ["z"], values=[0.0])
+        visualizer.events(instance, 0, factory.take_events())
+        factory.update_sphere("ball", position=[0, 0, 1])
+        visualizer.events(instance, 1, factory.take_events())
+    visualizer.close()
+    drawn = entities(visualizer.file)
+    assert {"/env_1/ball", "/env_1/height", "/env_2/height", "/env_3/height"} <= drawn
+    assert not {"/env_2/ball", "/env_3/ball"} & drawn
+
+
+def test_many_steps_make_few_chunks(opened):
+    visualizer, factory = opened(), Factory()
+    for number in range(20):
+        factory.add_box(f"box {number}", [1, 1, 1])
+    factory.add_scalars("error", ["x"])
+    factory.add_points("cloud", SQUARE)
+    for step in range(500):
+        for number in range(20):
+            factory.update_box(f"box {number}", position=[step, number, 0])
+        factory.update_scalars("error", [step])
+        factory.update_points("cloud", positions=SQUARE + step)
+        visualizer.events(1, step, factory.take_events())
+    visualizer.close()
+    chunks = list(rr.chunk.RrdReader(visualizer.file).stream())
+    temporal = [chunk for chunk in chunks if "step" in chunk.to_record_batch().schema.names]
+    poses = [chunk for chunk in temporal if chunk.entity_path == "/env_1/tf"]
+    # 22 looks of new objects, and 3 chunks for each flush: of 100 steps, or of 0.2 s.
+    assert len(temporal) < 22 + 3 * 40
+    assert sum(chunk.to_record_batch().num_rows for chunk in poses) == 500 * 20 + 20

@@ -1,0 +1,98 @@
+"""Pictures that a viewer without a window draws; they need a Vulkan driver."""
+
+from __future__ import annotations
+
+import subprocess
+
+import numpy as np
+import psutil
+import pytest
+from PIL import Image
+
+from physx_core.errors import VisualizerError
+from physx_core.scene import Factory
+from physx_rerun import viewer
+from physx_rerun.headless import render_picture
+
+
+@pytest.fixture
+def recording(opened, arm):
+    """A robot that turns, beside its translucent copy and a plot."""
+    visualizer, factory = opened(), Factory()
+    bodies, packages = ["base", "upper"], {"arm_meshes": str(arm.parent / "meshes")}
+    factory.add_robot("arm", arm, bodies, package_dirs=packages)
+    factory.add_robot("goal", arm, bodies, package_dirs=packages, color="blue", alpha=0.4)
+    factory.add_scalars("error", ["angle"])
+    for step in range(20):
+        turn = [0, 0, 0.05, 0, np.sin(step / 20), 0, np.cos(step / 20)]
+        factory.update_robot("arm", poses=[[0, 0, 0, 0, 0, 0, 1], turn])
+        factory.update_scalars("error", [np.sin(step / 3)])
+        visualizer.events(1, step, factory.take_events())
+    visualizer.close()
+    return visualizer.file
+
+
+def pixels(path):
+    return np.asarray(Image.open(path).convert("RGB"))
+
+
+def children():
+    return {child.pid for child in psutil.Process().children(recursive=True)}
+
+
+@pytest.mark.usefixtures("vulkan")
+def test_picture_of_two_times(recording, tmp_path):
+    before = children()
+    path = render_picture(recording, tmp_path / "new" / "a.png", size=(640, 360), step=0)
+    first = pixels(path)
+    last = pixels(render_picture(recording, tmp_path / "b.png", size=(640, 360)))
+    assert children() == before
+    assert first.shape == (360, 640, 3)
+    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 200
+    assert (first != last).any(axis=2).mean() > 0.005
+
+
+@pytest.mark.usefixtures("vulkan")
+def test_headless_mode_leaves_a_picture(opened, tmp_path):
+    visualizer = opened(mode="headless", picture_size=(320, 200))
+    for batch in range(10):
+        visualizer.scalars({"loss/training": 1 / (batch + 1)}, batch, "batch")
+    visualizer.close()
+    assert pixels(tmp_path / "run.png").shape == (200, 320, 3)
+
+
+@pytest.mark.usefixtures("vulkan")
+def test_unknown_timeline(recording, tmp_path):
+    with pytest.raises(VisualizerError, match=r"no timeline \"epoch\".*step"):
+        render_picture(recording, tmp_path / "a.png", timeline="epoch", size=(64, 64))
+
+
+def test_without_a_driver_the_remedy_is_named(recording, tmp_path, monkeypatch):
+    before = children()
+    monkeypatch.setenv("VK_ICD_FILENAMES", str(tmp_path / "none.json"))
+    monkeypatch.setenv("VK_DRIVER_FILES", str(tmp_path / "none.json"))
+    with pytest.raises(VisualizerError, match="apt install mesa-vulkan-drivers"):
+        render_picture(recording, tmp_path / "a.png")
+    assert children() == before
+
+
+def test_no_recording(tmp_path):
+    with pytest.raises(VisualizerError, match=r"no recording .*none\.rrd"):
+        render_picture(tmp_path / "none.rrd", tmp_path / "a.png")
+
+
+def test_the_command_reports_errors(python, tmp_path):
+    command = [python, "-m", "physx_rerun", str(tmp_path / "none.rrd"), str(tmp_path / "a.png")]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("There is no recording")
+
+
+def test_the_viewer_is_only_reachable_from_this_machine(receiver):
+    listening = psutil.Process(receiver[0].process.pid).net_connections(kind="tcp")
+    addresses = {c.laddr.ip for c in listening if c.status == psutil.CONN_LISTEN}
+    assert addresses == {"127.0.0.1"}
+
+
+def test_a_port_that_is_free():
+    assert not viewer.listens(f"127.0.0.1:{viewer.free_port()}")

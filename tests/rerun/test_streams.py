@@ -1,0 +1,146 @@
+"""What viewers that die or hang, and processes that are killed, leave behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import textwrap
+import time
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from physx_core.scene import Factory
+from physx_rerun import streams
+from physx_rerun.rows import Rows
+from physx_rerun.streams import LiveWriter
+
+
+def steps_of(path, entity="/env_1/error"):
+    steps = []
+    for chunk in rr.chunk.RrdReader(path).stream().filter(content=entity):
+        batch = chunk.to_record_batch()
+        if "Scalars:scalars" in batch.schema.names:
+            steps += batch.column("step").to_pylist()
+    return sorted(steps)
+
+
+def run_steps(visualizer, count, first=0, factory=None):
+    if factory is None:
+        factory = Factory()
+        factory.add_scalars("error", ["x"])
+    for step in range(first, first + count):
+        factory.update_scalars("error", [step])
+        visualizer.events(1, step, factory.take_events())
+    return factory
+
+
+def test_a_live_viewer_gets_everything(opened, receiver):
+    viewer, path = receiver
+    visualizer = opened(mode="connect", address=viewer.address)
+    run_steps(visualizer, 350)
+    visualizer.close()
+    viewer.process.send_signal(signal.SIGINT)
+    viewer.process.wait(10)
+    assert steps_of(path) == steps_of(visualizer.file) == list(range(350))
+    live, file = (rr.chunk.RrdReader(p).recordings()[0] for p in (path, visualizer.file))
+    assert (live.application_id, live.recording_id) == (file.application_id, file.recording_id)
+
+
+def test_a_viewer_that_dies(opened, receiver):
+    viewer, _ = receiver
+    visualizer = opened(mode="connect", address=viewer.address)
+    factory = run_steps(visualizer, 200)
+    viewer.process.kill()
+    viewer.process.wait()
+    run_steps(visualizer, 200, 200, factory)
+    with pytest.warns(UserWarning, match=f"{viewer.address}"):
+        visualizer.close()
+    assert steps_of(visualizer.file) == list(range(400))
+
+
+HANGING = """
+    import sys
+    from physx_core.scene import Factory
+    from physx_rerun.visualizer import RerunVisualizer
+
+    visualizer = RerunVisualizer(mode="connect", address=sys.argv[1])
+    visualizer.open("run", sys.argv[2], 1)
+    factory = Factory()
+    factory.add_scalars("error", ["x"])
+    input()
+    for step in range(1000):
+        factory.update_scalars("error", [step])
+        visualizer.events(1, step, factory.take_events())
+    visualizer.close()
+"""
+
+
+def test_a_viewer_that_hangs_holds_up_neither_run_nor_exit(receiver, python, tmp_path):
+    viewer, _ = receiver
+    command = [python, "-c", textwrap.dedent(HANGING), viewer.address, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+        time.sleep(2.0)
+        viewer.process.send_signal(signal.SIGSTOP)
+        try:
+            _, errors = run.communicate(b"\n", timeout=60)
+        finally:
+            run.kill()
+            viewer.process.send_signal(signal.SIGCONT)
+    assert run.returncode == 0, errors.decode()
+    assert b"does not respond" in errors
+    assert steps_of(tmp_path / "run.rrd") == list(range(1000))
+
+
+def test_rows_for_a_viewer_that_hangs_are_dropped_and_counted(receiver, monkeypatch):
+    viewer, _ = receiver
+    monkeypatch.setattr(streams, "CLOSE_SECONDS", 0.2)
+    monkeypatch.setattr(rr, "unregister_shutdown", lambda: None)
+    writer = LiveWriter("test", "test", "test", viewer.address)
+    rows = Rows()
+    noise = np.random.default_rng(0).random((500_000, 3), np.float32)
+    rows.add("cloud", rr.Points3D, {"step": 0}, positions=noise)
+    (chunk,) = rows.take()
+    viewer.process.send_signal(signal.SIGSTOP)
+    try:
+        for _ in range(200):
+            writer.put(chunk)
+            time.sleep(0.02)
+        assert 0 < writer.dropped < 200
+        with pytest.warns(UserWarning) as warned:
+            writer.close()
+        texts = [str(warning.message) for warning in warned]
+        assert any(f"did not get {writer.dropped} blocks" in text for text in texts)
+    finally:
+        viewer.process.send_signal(signal.SIGCONT)
+
+
+ENDLESS = """
+    import itertools, sys, time
+    from physx_core.scene import Factory
+    from physx_rerun.visualizer import RerunVisualizer
+
+    visualizer = RerunVisualizer()
+    visualizer.open("run", sys.argv[1], 1)
+    factory = Factory()
+    factory.add_scalars("error", ["x"])
+    for step in itertools.count():
+        factory.update_scalars("error", [step])
+        visualizer.events(1, step, factory.take_events())
+        time.sleep(0.001)
+"""
+
+
+def test_a_killed_run_leaves_a_readable_file(python, tmp_path):
+    path = tmp_path / "run.rrd"
+    with subprocess.Popen([python, "-c", textwrap.dedent(ENDLESS), str(tmp_path)]) as run:
+        deadline = time.monotonic() + 30
+        while not path.exists() or len(steps_of(path)) < 500:
+            assert run.poll() is None and time.monotonic() < deadline
+            time.sleep(0.2)
+        os.kill(run.pid, signal.SIGKILL)
+    steps = steps_of(path)
+    assert len(steps) >= 500
+    assert steps == list(range(len(steps)))

@@ -1,0 +1,170 @@
+"""Options, training curves, layout and picture of the visualizer."""
+
+from __future__ import annotations
+
+import subprocess
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from physx_core import plugins
+from physx_core.errors import ConfigError, UnknownOptionError, VisualizerError
+from physx_core.scene import Factory
+from physx_rerun.viewer import free_port
+from physx_rerun.visualizer import RerunVisualizer
+
+
+def ball(visualizer, step=0, instance=1, **look):
+    factory = Factory()
+    factory.add_sphere("ball", 0.1, **look)
+    visualizer.events(instance, step, factory.take_events())
+    return factory
+
+
+def test_the_plugin_is_found_by_its_name():
+    assert plugins.resolve("visualizer", "rerun") is RerunVisualizer
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "show"}, "'save', 'spawn', 'connect', 'headless'"),
+        ({"mode": "connect"}, "HOST:PORT"),
+        ({"mode": "connect", "address": "localhost"}, "HOST:PORT"),
+        ({"address": "localhost:9876"}, 'mode "connect"'),
+        ({"picture": "run.png"}, 'mode "headless"'),
+        ({"mode": "headless", "save": False}, "save=True"),
+        ({"save": False}, "save=True"),
+        ({"max_instances": -1}, "at least 0"),
+        ({"port": "auto"}, "port"),
+        ({"picture_size": (10, 10)}, "64"),
+    ],
+)
+def test_unfit_options(options, message):
+    with pytest.raises(ConfigError, match=message):
+        RerunVisualizer(**options)
+
+
+def test_unknown_option():
+    with pytest.raises(UnknownOptionError, match='Did you mean "address"'):
+        RerunVisualizer(adress="localhost:1")
+
+
+def test_a_window_needs_a_display(monkeypatch, tmp_path):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(VisualizerError, match="no display"):
+        RerunVisualizer(mode="spawn").open("run", tmp_path, 1)
+
+
+def test_nobody_listens(tmp_path):
+    address = f"127.0.0.1:{free_port()}"
+    with pytest.raises(VisualizerError, match=f"No Rerun viewer listens at {address}"):
+        RerunVisualizer(mode="connect", address=address).open("run", tmp_path, 1)
+
+
+def test_the_file_lies_in_the_session_and_is_never_overwritten(opened, tmp_path):
+    first, second = opened(), None
+    ball(first)
+    first.close()
+    second = opened()
+    ball(second)
+    second.close()
+    assert first.file == tmp_path / "run.rrd"
+    assert second.file == tmp_path / "run_2.rrd"
+
+
+def test_the_file_where_it_is_wanted(opened, tmp_path):
+    visualizer = opened(path=str(tmp_path / "deep" / "here.rrd"))
+    ball(visualizer)
+    visualizer.close()
+    assert (tmp_path / "deep" / "here.rrd").is_file()
+
+
+def test_a_file_that_cannot_be_written(opened, tmp_path):
+    (tmp_path / "taken").write_text("")
+    visualizer = opened(path=tmp_path / "taken" / "run.rrd")
+    with pytest.raises(VisualizerError, match="cannot be written"):
+        ball(visualizer)
+
+
+def test_closing_twice_and_closing_early(opened, tmp_path):
+    RerunVisualizer().close()
+    visualizer = opened()
+    visualizer.close()
+    visualizer.close()
+    assert not visualizer.file.exists()
+    ball(visualizer)
+    assert not visualizer.file.exists()
+
+
+def test_the_file_is_whole_after_close(opened):
+    visualizer = opened()
+    ball(visualizer)
+    visualizer.close()
+    reader = rr.chunk.RrdReader(visualizer.file)
+    assert len(reader.recordings()) == len(reader.blueprints()) == 1
+    assert "/env_1/ball" in reader.store().summary()
+
+
+def test_training_curves(opened, read):
+    visualizer = opened()
+    for batch in range(4):
+        visualizer.scalars({"loss/training": 1 / (batch + 1)}, batch, "batch")
+    visualizer.scalars({"loss/validation": 0.5, "duration": 2.0}, 0, "epoch")
+    visualizer.close()
+    curve = visualizer.file, "/run/loss/training"
+    expected = [(0, [1.0]), (1, [0.5]), (2, [1 / 3]), (3, [0.25])]
+    assert read(*curve, "Scalars:scalars", "batch") == expected
+    assert read(*curve, "SeriesLines:names", "batch") == [(None, ["training"])]
+    # The epoch's numbers also lie on the batches' timeline, so that both curves show together.
+    validation = visualizer.file, "/run/loss/validation", "Scalars:scalars"
+    assert read(*validation, "batch") == [(3, [0.5])]
+    assert read(*validation, "epoch") == [(0, [0.5])]
+    assert read(visualizer.file, "/run/duration", "Scalars:scalars", "epoch") == [(0, [2.0])]
+
+
+def blueprint_texts(path):
+    """Return everything that the layout in a file says, as one text."""
+    printed = subprocess.run(
+        ["rerun", "rrd", "print", "-vvv", str(path)], capture_output=True, text=True, check=True
+    )
+    return printed.stdout
+
+
+def test_equal_scenes_share_a_layout_and_others_do_not(opened, tmp_path):
+    def application(name, instance_nb, **look):
+        visualizer = opened(instance_nb, path=tmp_path / name)
+        factory = ball(visualizer, **look)
+        if name == "other.rrd":
+            factory.add_scalars("height", ["z"])
+            visualizer.events(1, 1, factory.take_events())
+        visualizer.close()
+        return rr.chunk.RrdReader(tmp_path / name).recordings()[0].application_id
+
+    first = application("first.rrd", 1)
+    assert first == application("second.rrd", 1, color="red")
+    assert first != application("two.rrd", 2)
+
+
+def test_events_in_the_order_of_their_arrival(opened, read):
+    """Instances over TCP are not in step with each other."""
+    visualizer = opened(instance_nb=2)
+    factories = {instance: ball(visualizer, instance=instance) for instance in (2, 1)}
+    for instance, step in [(1, 1), (1, 2), (2, 1), (1, 3), (2, 2)]:
+        factories[instance].update_sphere("ball", position=[step, 0, 0])
+        visualizer.events(instance, step, factories[instance].take_events())
+    visualizer.close()
+    steps = [s for s, _ in read(visualizer.file, "/env_1/tf", "Transform3D:translation")]
+    assert steps == [0, 1, 2, 3]
+
+
+def test_big_updates_do_not_pile_up(opened):
+    visualizer = opened()
+    factory = Factory()
+    factory.add_points("cloud", np.zeros((200_000, 3)))
+    for _ in range(8):
+        factory.update_points("cloud", positions=np.zeros((200_000, 3)))
+        visualizer.events(1, 0, factory.take_events())
+        assert visualizer._rows.nbytes < 12_000_000

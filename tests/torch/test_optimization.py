@@ -1,0 +1,416 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from physx_core import Field
+from physx_core.errors import CheckpointError, ConfigError, FieldsMismatchError, UsageError
+from physx_core.statistics import Normalization
+from physx_torch import FC, TorchNetwork, TorchOptimization, TorchTransformation
+
+SHAPES = {"input": Field("input", (2,)), "ground_truth": Field("ground_truth", (1,))}
+
+
+def made(layers=(2, 8, 1), optimizer="Adam", options=None, **kwargs):
+    network = FC(list(layers))
+    network.bind(SHAPES)
+    network.set_train()
+    optimization = TorchOptimization(**(options or {}))
+    optimization.set_loss("MSELoss")
+    optimization.set_optimizer(optimizer, network, **kwargs)
+    return network, optimization
+
+
+def regression(number=128):
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1, 1, (number, 2))
+    return {"input": x, "ground_truth": 50 + 10 * (x[:, :1] ** 3 - x[:, 1:])}
+
+
+def learn(network, optimization, tensors, steps):
+    losses = []
+    for _ in range(steps):
+        loss = optimization.compute_loss(network.predict(tensors), tensors, tensors)
+        optimization.optimize(loss)
+        losses.append(optimization.transform_loss(loss, tensors)["loss"])
+    return losses
+
+
+def rate(optimization):
+    return optimization.optimizer.param_groups[0]["lr"]
+
+
+# Learning ---------------------------------------------------------------------------------------
+
+
+def test_normalized_regression_is_learned():
+    network, optimization = made([2, 16, 16, 1], lr=1e-2)
+    batch = regression()
+    transformation = TorchTransformation()
+    normalization = {
+        name: Normalization(values.mean(axis=0), values.std(axis=0))
+        for name, values in batch.items()
+    }
+    transformation.set_normalization(normalization, network)
+    data = network.numpy_to_tensor(batch)
+    losses = []
+    for _ in range(300):
+        prediction = network.predict(transformation.transform_before_prediction(data))
+        prediction, targets = transformation.transform_before_loss(prediction, data)
+        loss = optimization.compute_loss(prediction, targets, data)
+        optimization.optimize(loss)
+        losses.append(optimization.transform_loss(loss, data))
+    assert losses[0]["loss"] > 0.5
+    assert losses[-1]["loss"] < 1e-3
+    assert all(isinstance(item["loss"], float) for item in losses)
+    network.set_eval()
+    prediction = network.predict(transformation.transform_before_prediction(data))
+    physical = network.tensor_to_numpy(transformation.transform_before_apply(prediction))
+    error = np.abs(physical["prediction"] - batch["ground_truth"])
+    assert error.mean() < 0.25  # of values between 30 and 70
+
+
+def test_one_step_of_gradient_descent_by_hand():
+    network, optimization = made([2, 1], "SGD", lr=0.1)
+    weight = network.layers[0].weight.detach().clone()
+    tensors = {"input": torch.tensor([[1.0, 2.0]]), "ground_truth": torch.tensor([[0.0]])}
+    prediction = network.predict(tensors)["prediction"].item()
+    learn(network, optimization, tensors, 1)
+    expected = weight - 0.1 * 2 * prediction * tensors["input"]
+    torch.testing.assert_close(network.layers[0].weight.detach(), expected)
+
+
+def test_only_the_network_needs_gradients():
+    network, optimization = made()
+    data = network.numpy_to_tensor(regression(4))
+    learn(network, optimization, data, 1)
+    assert not any(tensor.requires_grad for tensor in data.values())
+
+
+def test_gradients_are_clipped_together():
+    network, optimization = made([2, 1], "SGD", {"gradient_clip": 0.5}, lr=1.0)
+    before = torch.cat([p.detach().flatten().clone() for p in network.parameters()])
+    tensors = {"input": torch.full((1, 2), 100.0), "ground_truth": torch.full((1, 1), -1000.0)}
+    learn(network, optimization, tensors, 1)
+    after = torch.cat([p.detach().flatten() for p in network.parameters()])
+    assert torch.linalg.vector_norm(after - before).item() == pytest.approx(0.5, rel=1e-3)
+
+
+@pytest.mark.parametrize("clip", [0, -1.0])
+def test_wrong_gradient_clip(clip):
+    with pytest.raises(ConfigError, match="gradient_clip"):
+        TorchOptimization(gradient_clip=clip)
+
+
+def test_several_fields_have_the_mean_of_their_losses():
+    network = FC([2, 4], opt_fields=["a", "b"], pred_fields=["pa", "pb"])
+    optimization = TorchOptimization()
+    optimization.set_loss("L1Loss")
+    optimization.set_optimizer("Adam", network)
+    prediction = {"pb": torch.zeros(5, 3), "pa": torch.zeros(5, 1)}
+    targets = {"a": torch.full((5, 1), 4.0), "b": torch.full((5, 3), 2.0)}
+    assert optimization.compute_loss(prediction, targets, {}).item() == 3.0
+
+
+def test_shapes_that_would_be_broadcast_are_an_error():
+    _, optimization = made()
+    with pytest.raises(FieldsMismatchError, match=r"\(4, 1\).*\(4,\)") as caught:
+        optimization.compute_loss(
+            {"prediction": torch.zeros(4, 1)}, {"ground_truth": torch.zeros(4)}, {}
+        )
+    assert set(caught.value.differences) == {"prediction"}
+
+
+def test_class_indices_as_targets():
+    network = FC([2, 3])
+    optimization = TorchOptimization(loss_kwargs={"label_smoothing": 0.0})
+    optimization.set_loss("CrossEntropyLoss")
+    optimization.set_optimizer("Adam", network)
+    target = torch.tensor([0, 2])
+    loss = optimization.compute_loss(
+        {"prediction": torch.zeros(2, 3)}, {"ground_truth": target}, {}
+    )
+    assert loss.item() == pytest.approx(np.log(3))
+
+
+# Loss -------------------------------------------------------------------------------------------
+
+
+def squares(prediction, target):
+    return ((prediction - target) ** 2).mean()
+
+
+@pytest.mark.parametrize(
+    "loss",
+    [
+        "MSELoss",
+        "torch.nn:MSELoss",
+        "torch.nn.modules.loss:MSELoss",
+        torch.nn.MSELoss,
+        torch.nn.MSELoss(),
+        "torch.nn.functional:mse_loss",
+        torch.nn.functional.mse_loss,
+        squares,
+    ],
+)
+def test_loss_in_every_form(loss):
+    _, optimization = made()
+    optimization.set_loss(loss)
+    prediction, target = torch.rand(4, 1), torch.rand(4, 1)
+    value = optimization.compute_loss({"prediction": prediction}, {"ground_truth": target}, {})
+    torch.testing.assert_close(value, squares(prediction, target))
+
+
+@pytest.mark.parametrize(
+    ("loss", "told"),
+    [
+        ("MSELos", 'Did you mean "MSELoss"'),
+        ("Linear", "It has: .*MSELoss"),
+        ("torch.nn:MSELos", 'Did you mean "MSELoss"'),
+        (None, "needs a loss"),
+        (5, "cannot be called"),
+        (torch.nn.Linear, "refuses its arguments"),
+    ],
+)
+def test_wrong_loss(loss, told):
+    with pytest.raises(ConfigError, match=told):
+        TorchOptimization().set_loss(loss)
+
+
+def test_arguments_of_the_loss():
+    _, optimization = made(options={"loss_kwargs": {"reduction": "sum"}})
+    value = optimization.compute_loss(
+        {"prediction": torch.ones(4, 1)}, {"ground_truth": torch.zeros(4, 1)}, {}
+    )
+    assert value.item() == 4
+    with pytest.raises(ConfigError, match="reduction"):
+        TorchOptimization(loss_kwargs={"reductoin": "sum"}).set_loss("MSELoss")
+    with pytest.raises(ConfigError, match="loss_kwargs"):
+        TorchOptimization(loss_kwargs={"reduction": "sum"}).set_loss(squares)
+
+
+@pytest.mark.parametrize("first", ["loss", "optimizer"])
+def test_tensors_of_the_loss_follow_the_network(first):
+    class Weighted(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.register_buffer("weight", torch.tensor([2.0]))
+
+        def forward(self, prediction, target):
+            return (self.weight * (prediction - target)).mean()
+
+    network = FC([2, 1])
+    network.set_data_type("float64")
+    optimization = TorchOptimization()
+    if first == "loss":
+        optimization.set_loss(Weighted)
+    optimization.set_optimizer("Adam", network)
+    if first == "optimizer":
+        optimization.set_loss(Weighted)
+    assert optimization.loss.weight.dtype == torch.float64
+
+
+# Optimizer --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("optimizer", ["SGD", "torch.optim:SGD", torch.optim.SGD])
+def test_optimizer_in_every_form(optimizer):
+    _, optimization = made(optimizer=optimizer, lr=0.25, momentum=0.5)
+    group = optimization.optimizer.param_groups[0]
+    assert isinstance(optimization.optimizer, torch.optim.SGD)
+    assert (group["lr"], group["momentum"]) == (0.25, 0.5)
+
+
+@pytest.mark.parametrize("name", ["Adam", "AdamW", "SGD", "RMSprop", "NAdam", "Adagrad"])
+def test_common_optimizers_learn(name):
+    network, optimization = made(optimizer=name)
+    losses = learn(network, optimization, network.numpy_to_tensor(regression(16)), 20)
+    assert losses[-1] < losses[0]
+
+
+@pytest.mark.parametrize(
+    ("optimizer", "arguments", "told"),
+    [
+        ("adam", {}, 'Did you mean "Adam"'),
+        (None, {}, "needs an optimizer"),
+        ("Adam", {"learning_rate": 1e-3}, "It takes: params, lr"),
+        ("Adam", {"lr": -1.0}, "Invalid learning rate"),
+        ("LBFGS", {}, "several times"),
+        ("lr_scheduler", {}, "no optimizer"),
+        (list, {}, "not an optimizer"),
+    ],
+)
+def test_wrong_optimizer(optimizer, arguments, told):
+    with pytest.raises(ConfigError, match=told):
+        TorchOptimization().set_optimizer(optimizer, FC([2, 1]), **arguments)
+
+
+def test_network_without_parameters():
+    class Nothing(TorchNetwork):
+        pass
+
+    with pytest.raises(ConfigError, match="empty parameter list"):
+        TorchOptimization().set_optimizer("Adam", Nothing())
+
+
+def test_network_of_another_library():
+    with pytest.raises(ConfigError, match="no TorchNetwork"):
+        TorchOptimization().set_optimizer("Adam", object())
+
+
+def test_frozen_parameters_stay():
+    network = FC([2, 4, 1])
+    network.layers[0].weight.requires_grad_(False)
+    frozen = network.layers[0].weight.clone()
+    optimization = TorchOptimization()
+    optimization.set_loss("MSELoss")
+    optimization.set_optimizer("Adam", network)
+    learn(network, optimization, network.numpy_to_tensor(regression(4)), 2)
+    assert torch.equal(network.layers[0].weight, frozen)
+
+
+def test_calls_out_of_order(tmp_path):
+    optimization = TorchOptimization()
+    with pytest.raises(UsageError, match="set_loss"):
+        optimization.compute_loss({}, {}, {})
+    with pytest.raises(UsageError, match="set_optimizer"):
+        optimization.optimize(torch.tensor(1.0))
+    with pytest.raises(UsageError, match="set_optimizer"):
+        optimization.set_scheduler("StepLR", step_size=1)
+    with pytest.raises(UsageError, match="set_optimizer"):
+        optimization.save_state(tmp_path / "s")
+    with pytest.raises(UsageError, match="set_optimizer"):
+        optimization.load_state(tmp_path / "s")
+
+
+# Scheduler --------------------------------------------------------------------------------------
+
+
+def test_scheduler_from_the_options():
+    options = {"scheduler": "CosineAnnealingLR", "scheduler_kwargs": {"T_max": 10}}
+    network, optimization = made(options=options, lr=1.0)
+    data = network.numpy_to_tensor(regression(4))
+    rates = []
+    for _ in range(10):
+        learn(network, optimization, data, 2)
+        rates.append(rate(optimization))
+        optimization.epoch_end()
+    expected = [(1 + np.cos(np.pi * epoch / 10)) / 2 for epoch in range(10)]
+    np.testing.assert_allclose(rates, expected, atol=1e-12)
+
+
+def test_no_scheduler_keeps_the_rate():
+    _, optimization = made(lr=0.125)
+    optimization.epoch_end()
+    assert rate(optimization) == 0.125
+
+
+def test_plateau_looks_at_the_mean_training_loss():
+    network, optimization = made(optimizer="SGD", lr=1e-12)
+    optimization.set_scheduler("ReduceLROnPlateau", patience=0, factor=0.5, eps=0.0)
+    data = network.numpy_to_tensor(regression(4))
+    learn(network, optimization, data, 3)
+    optimization.epoch_end()
+    assert rate(optimization) == 1e-12
+    learn(network, optimization, data, 3)
+    optimization.epoch_end()  # no better than before
+    assert rate(optimization) == 5e-13
+    optimization.epoch_end()  # an epoch without steps changes nothing
+    assert rate(optimization) == 5e-13
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"scheduler": "CosinAnnealingLR"}, 'Did you mean "CosineAnnealingLR"'),
+        ({"scheduler": "CosineAnnealingLR"}, "T_max"),
+        ({"scheduler": "StepLR", "scheduler_kwargs": {"steps": 3}}, "step_size"),
+        ({"scheduler": dict}, "refuses its arguments"),
+        ({"scheduler": id}, "not a scheduler"),
+        ({"scheduler_kwargs": {"T_max": 3}}, "without"),
+    ],
+)
+def test_wrong_scheduler(options, told):
+    with pytest.raises(ConfigError, match=told):
+        made(options=options)
+
+
+# State ------------------------------------------------------------------------------------------
+
+PLANS = {
+    "Adam": ("Adam", {}),
+    "momentum and cosine": (
+        "SGD",
+        {"scheduler": "CosineAnnealingLR", "scheduler_kwargs": {"T_max": 9}},
+    ),
+    "milestones": (
+        "AdamW",
+        {"scheduler": "MultiStepLR", "scheduler_kwargs": {"milestones": [1, 3]}},
+    ),
+    "plateau": ("Adam", {"scheduler": "ReduceLROnPlateau", "scheduler_kwargs": {"patience": 0}}),
+}
+
+
+class Forgetful(FC):
+    """Draws random numbers while it learns."""
+
+    def forward(self, x):
+        return super().forward(torch.nn.functional.dropout(x, 0.5, self.training))
+
+
+@pytest.mark.parametrize("plan", PLANS)
+def test_a_resumed_training_is_the_uninterrupted_one(tmp_path, plan):
+    optimizer, options = PLANS[plan]
+    arguments = {"lr": 1e-4, "momentum": 0.9} if optimizer == "SGD" else {"lr": 1e-2}
+
+    def start():
+        network = Forgetful([2, 4, 1])
+        optimization = TorchOptimization(**options)
+        optimization.set_loss("MSELoss")
+        optimization.set_optimizer(optimizer, network, **arguments)
+        return network, optimization
+
+    def epochs(network, optimization, number):
+        data = network.numpy_to_tensor(regression(8))
+        for _ in range(number):
+            learn(network, optimization, data, 3)
+            optimization.epoch_end()
+
+    first, optimization = start()
+    epochs(first, optimization, 2)
+    first.save_parameters(tmp_path / "p")
+    optimization.save_state(tmp_path / TorchOptimization.state_file)
+    epochs(first, optimization, 3)
+
+    second, resumed = start()
+    second.load_parameters(tmp_path / "p")
+    resumed.load_state(tmp_path / TorchOptimization.state_file)
+    epochs(second, resumed, 3)
+    assert rate(resumed) == rate(optimization)
+    for one, other in zip(first.parameters(), second.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_state_of_another_optimizer_or_network(tmp_path):
+    network, optimization = made()
+    learn(network, optimization, network.numpy_to_tensor(regression(4)), 1)
+    optimization.save_state(tmp_path / "s")
+    with pytest.raises(CheckpointError, match="of Adam, not of SGD and StepLR"):
+        options = {"scheduler": "StepLR", "scheduler_kwargs": {"step_size": 1}}
+        made(optimizer="SGD", options=options)[1].load_state(tmp_path / "s")
+    with pytest.raises(CheckpointError, match="another network"):
+        made([2, 8, 8, 1])[1].load_state(tmp_path / "s")
+    network.save_parameters(tmp_path / "p")
+    with pytest.raises(CheckpointError, match="no state"):
+        optimization.load_state(tmp_path / "p")
+    with pytest.raises(CheckpointError, match="no file"):
+        optimization.load_state(tmp_path / "nothing")
+
+
+def test_state_that_would_need_code(tmp_path):
+    _, optimization = made()
+    optimization.set_scheduler(torch.optim.lr_scheduler.LambdaLR, lr_lambda=lambda epoch: 0.5)
+    optimization.scheduler.odd = object()
+    with pytest.raises(CheckpointError, match="odd.*object"):
+        optimization.save_state(tmp_path / "s")
