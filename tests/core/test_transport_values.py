@@ -124,9 +124,12 @@ def test_endless_nesting_is_an_error():
 
 
 @settings(max_examples=300, deadline=None)
-@given(st.binary(max_size=60) | VALUES.map(encode).flatmap(
-    lambda data: st.integers(0, max(0, len(data) - 1)).map(lambda end: data[:end])
-))
+@given(
+    st.binary(max_size=60)
+    | VALUES.map(encode).flatmap(
+        lambda data: st.integers(0, max(0, len(data) - 1)).map(lambda end: data[:end])
+    )
+)
 def test_damaged_bytes_never_raise_anything_else(data):
     try:
         decode(data)

@@ -6,15 +6,18 @@ import io
 import tempfile
 import time
 from pathlib import Path
+from typing import TypeVar
 
 from PIL import Image
-from rerun.experimental import Recording, Timeline, ViewerClient, ViewerState
+from rerun.experimental import ViewerClient
 
 from physx_core.errors import VisualizerError
 from physx_rerun.viewer import Viewer
 
+T = TypeVar("T")
 _TOP_BAR = 36  # height of the viewer's own menu bar in pixels, cut off
 _QUIET_SECONDS = 0.4  # a viewer whose state stays the same for so long has loaded everything
+_PATIENCE = 5  # equal pictures in a row of a recording that does lack something
 
 
 def render_picture(
@@ -45,18 +48,15 @@ def render_picture(
     rrd_path, png_path = Path(rrd_path), Path(png_path)
     if not rrd_path.is_file():
         raise VisualizerError(f"There is no recording {rrd_path}.")
-    deadline = time.monotonic() + timeout
     with tempfile.TemporaryDirectory(prefix="physx-rerun-") as folder:
         viewer = _start(rrd_path, size, Path(folder))
         try:
             viewer.wait_until_ready(timeout)
-            client = ViewerClient.connect(f"rerun+http://{viewer.address}/proxy")
-            state = _loaded(viewer, client, deadline)
-            position = _position(state.recordings[0], timeline, step)
-            client.set_time(timeline, sequence=position, play_state="paused")
-            _settle(viewer, client, position, deadline)
-            picture = Image.open(io.BytesIO(client.take_screenshot()))
-        except (RuntimeError, OSError) as error:
+            camera = _Camera(viewer, time.monotonic() + timeout)
+            camera.wait_for_recording()
+            camera.go_to(timeline, step)
+            picture = Image.open(io.BytesIO(camera.shoot()))
+        except OSError as error:
             viewer.check(wait=2.0)
             raise VisualizerError(f"The Rerun viewer drew no picture: {error}.") from error
         finally:
@@ -73,38 +73,58 @@ def _start(rrd_path: Path, size: tuple[int, int], folder: Path) -> Viewer:
     return Viewer(0, ("--headless", "--window-size", window, str(rrd_path)), environment=places)
 
 
-def _loaded(viewer: Viewer, client: ViewerClient, deadline: float) -> ViewerState:
-    """Return the viewer's state once it holds the whole recording and shows its views."""
-    seen, since = "", time.monotonic()
-    while True:
-        state = _state(viewer, client, deadline)
-        known = repr((state.loading, [r.timelines for r in state.recordings], len(state.views)))
-        if known != seen:
-            seen, since = known, time.monotonic()
-        complete = state.recordings and state.recordings[0].timelines and state.views
-        if complete and not state.loading and time.monotonic() - since > _QUIET_SECONDS:
-            return state
-        time.sleep(0.1)
+class _Camera:
+    """Asks a viewer for its state and for pictures, with patience while it is busy drawing."""
 
+    def __init__(self, viewer: Viewer, deadline: float) -> None:
+        self._viewer, self._deadline = viewer, deadline
+        self._client = ViewerClient.connect(f"rerun+http://{viewer.address}/proxy")
 
-def _state(viewer: Viewer, client: ViewerClient, deadline: float) -> ViewerState:
-    viewer.check()
-    if time.monotonic() > deadline:
-        raise VisualizerError("The Rerun viewer took too long to draw the picture.")
-    return client.get_state()
+    def _ask(self, question: Callable[[], T]) -> T:
+        while True:
+            self._viewer.check()
+            if time.monotonic() > self._deadline:
+                raise VisualizerError("The Rerun viewer took too long to draw the picture.")
+            try:
+                return question()
+            except OSError:  # it is busy, or it ended, which the check will tell
+                time.sleep(0.1)
 
+    def wait_for_recording(self) -> None:
+        """Wait until the viewer knows the whole recording and its views."""
+        known, since = "", time.monotonic()
+        while True:
+            state = self._ask(self._client.get_state)
+            now = repr((state.loading, [r.timelines for r in state.recordings], len(state.views)))
+            if now != known:
+                known, since = now, time.monotonic()
+            complete = state.recordings and state.recordings[0].timelines and state.views
+            if complete and not state.loading and time.monotonic() - since > _QUIET_SECONDS:
+                return
+            time.sleep(0.1)
 
-def _position(recording: Recording, timeline: str, step: int | None) -> int:
-    known: dict[str, Timeline] = {line.name: line for line in recording.timelines}
-    if timeline not in known:
-        raise VisualizerError(
-            f'The recording has no timeline "{timeline}". Timelines: {", ".join(known)}.'
-        )
-    return known[timeline].end or 0 if step is None else step
+    def go_to(self, timeline: str, step: int | None) -> None:
+        """Go to a position on a timeline, or to its end."""
+        state = self._ask(self._client.get_state)
+        known = {line.name: line for line in state.recordings[0].timelines}
+        if timeline not in known:
+            raise VisualizerError(
+                f'The recording has no timeline "{timeline}". Timelines: {", ".join(known)}.'
+            )
+        position = known[timeline].end or 0 if step is None else step
+        self._ask(lambda: self._client.set_time(timeline, sequence=position, play_state="paused"))
 
+    def shoot(self) -> bytes:
+        """Return a picture once everything is drawn.
 
-def _settle(viewer: Viewer, client: ViewerClient, position: int, deadline: float) -> None:
-    """Wait until the viewer is at the position, with meshes and plots drawn at least once."""
-    while _state(viewer, client, deadline).recordings[0].current_time != position:
-        time.sleep(0.05)
-    client.take_screenshot(max_size=64)
+        Rows and meshes come in while the viewer draws already: it is ready when two pictures in
+        a row are equal and no view complains of something that it lacks.
+        """
+        picture, repeats = b"", 0
+        while True:
+            state = self._ask(self._client.get_state)
+            lacks = any(view.reports for view in state.views)
+            last, picture = picture, self._ask(self._client.take_screenshot)
+            repeats = repeats + 1 if picture == last else 0
+            if repeats > (_PATIENCE if lacks else 0):
+                return picture

@@ -86,8 +86,9 @@ class Layout:
     @property
     def timeline(self) -> str:
         """Timeline that the viewer begins with: one on which everything is visible."""
-        used = self._timelines | ({"step"} if self._scenes or self._texts else set())
-        return next(iter(used)) if len(used) == 1 else TIME
+        if self._scenes or self._texts or "step" in self._timelines:
+            return "step" if self._timelines <= {"step"} else TIME
+        return "batch" if "batch" in self._timelines else next(iter(self._timelines), TIME)
 
     def blueprint(self) -> rrb.Blueprint:
         """Return the windows: a grid of scenes, and beside it the plots and the texts."""
@@ -133,7 +134,7 @@ class Layout:
         target = (low + high) / 2
         eye = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=target + 1.2 * size * _VIEW_FROM,
+            position=target + 1.1 * size * _VIEW_FROM,
             look_target=target,
             eye_up=(0.0, 0.0, 1.0),
         )

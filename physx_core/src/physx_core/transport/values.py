@@ -58,7 +58,7 @@ def decode(payload: bytes | bytearray) -> Any:
         return _value(tree, _Blobs(payload, start))
     except (ValueError, TypeError, KeyError, struct.error, RecursionError) as error:
         raise ConnectionRefusedByPeerError(
-            f"The other side of a connection sent values that cannot be read: {error}."
+            f"What was received or stored as values is damaged: {error}."
         ) from error
 
 
@@ -129,7 +129,7 @@ _ENCODERS: dict[type[Any], Callable[[Any, str, list[bytes]], Any]] = {
     tuple: lambda value, where, blobs: {"t": _items(value, where, blobs)},
     dict: _dict_tree,
     np.ndarray: lambda value, where, blobs: {"a": _array_parts(value, where, blobs)},
-    np.str_: lambda value, where, blobs: {"u": str(value)},
+    np.str_: lambda value, where, blobs: {"u": str.__str__(value)},
     np.bytes_: lambda value, where, blobs: {"y": _blob(bytes(value), blobs)},
 }
 
