@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
+import sys
 import tomllib
 import typing
 from collections.abc import Callable, Mapping
@@ -11,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, dataclass_transform
 
-from physx_core.errors import ConfigError, ConfigFileError, UnknownOptionError
+from physx_core.errors import ConfigError, ConfigFileError, UnknownOptionError, UsageError
 
 T = TypeVar("T")
 
@@ -51,7 +53,7 @@ def _hints(cls: Any) -> dict[str, Any]:
     return typing.get_type_hints(cls)
 
 
-def _validate(instance: Any, cls: type[Any]) -> None:
+def _validate(instance: Any, cls: Any) -> None:
     import typeguard
 
     hints = _hints(cls)
@@ -184,6 +186,8 @@ def to_plain(config: Any) -> dict[str, Any]:
 
 def _plain_value(where: str, value: Any) -> Any:
     if isinstance(value, type):
+        with contextlib.suppress(UsageError):  # a class that only this process can find
+            return reference_of(value)
         return f"{value.__module__}:{value.__qualname__}"
     if dataclasses.is_dataclass(value):
         return to_plain(value)
@@ -249,3 +253,42 @@ def _configuration_in(hint: Any) -> type[Any] | None:
         if isinstance(candidate, type) and dataclasses.is_dataclass(candidate):
             return candidate
     return None
+
+
+SCRIPT_PREFIX = "_physx_script_"
+"""Beginning of the names under which scripts are imported that define a component."""
+
+
+def reference_of(component: Any) -> str:
+    """Return the text by which another process finds a component.
+
+    Args:
+        component: A reference, which is returned as it is, or a class.
+
+    Raises:
+        UsageError: The class cannot be found from outside: it was defined in a function or in an
+            interactive session.
+    """
+    if isinstance(component, str):
+        return component
+    module, name = component.__module__, component.__qualname__
+    if "<locals>" in name:
+        raise UsageError(
+            f"{name} is defined inside a function, where no other process can find it. "
+            "Define it at the top level of a module, or run with as_tcp_ip_client=False."
+        )
+    source = sys.modules.get(module)
+    file = getattr(source, "__file__", None)
+    if module.startswith(SCRIPT_PREFIX) and file:
+        return f"{file}:{name}"
+    if module != "__main__":
+        return f"{module}:{name}"
+    spec = getattr(source, "__spec__", None)
+    if spec is not None and spec.name:
+        return f"{spec.name}:{name}"
+    if not file or not Path(file).is_file():
+        raise UsageError(
+            f"{name} is defined in an interactive session, where no other process can find it. "
+            "Put it into a file, or run with as_tcp_ip_client=False."
+        )
+    return f"{Path(file).resolve()}:{name}"

@@ -49,6 +49,25 @@ class ArmEnvironment(Environment):
     ``state``; the torque that the network predicts for it acts during that period in addition to
     the controller. The first step only gives the first reference; nothing moves in it. Use
     ``simulations_per_step=1``.
+
+    Args:
+        task: ``"excite"`` or ``"track"``.
+        feedforward: What is added to the controller in the task ``"track"``: ``"network"``,
+            ``"none"``, ``"model"`` (the engine's inverse dynamics of the reference: what a
+            perfect network would give) or ``"gravity"`` (the same at rest).
+        trajectory: Number of the trajectory to track; the same number is the same trajectory
+            for any seed, instance and feed-forward.
+        period: Length of a physics step, in s.
+        steps_per_sample: Physics steps in each step: one control period.
+        episode_steps: Steps after which the task ``"excite"`` draws a new motion.
+        amplitude: Largest distance of a motion from its center, in rad.
+        frequencies: Lowest and highest frequency of the motions, in Hz.
+        excitation: Factor of the random torques in the task ``"excite"``.
+        stiffness: Controller's torque for each unit of position error, shape (9,).
+        damping: Controller's torque for each unit of velocity error, shape (9,).
+        prediction_field: Name of the network's field that holds the torque; a prediction with
+            one field only is taken whatever its name is.
+        draw_every: A viewer gets every such step.
     """
 
     backend: ClassVar[str] = "dart"
@@ -72,26 +91,6 @@ class ArmEnvironment(Environment):
         **kwargs: Any,
     ) -> None:
         """Keep the options.
-
-        Args:
-            task: ``"excite"`` or ``"track"``.
-            feedforward: What is added to the controller in the task ``"track"``: ``"network"``,
-                ``"none"``, ``"model"`` (the engine's inverse dynamics of the reference: what a
-                perfect network would give) or ``"gravity"`` (the same at rest).
-            trajectory: Number of the trajectory to track; the same number is the same trajectory
-                for any seed, instance and feed-forward.
-            period: Length of a physics step, in s.
-            steps_per_sample: Physics steps in each step: one control period.
-            episode_steps: Steps after which the task ``"excite"`` draws a new motion.
-            amplitude: Largest distance of a motion from its center, in rad.
-            frequencies: Lowest and highest frequency of the motions, in Hz.
-            excitation: Factor of the random torques in the task ``"excite"``.
-            stiffness: Controller's torque for each unit of position error, shape (9,).
-            damping: Controller's torque for each unit of velocity error, shape (9,).
-            prediction_field: Name of the network's field that holds the torque; a prediction with
-                one field only is taken whatever its name is.
-            draw_every: A viewer gets every such step.
-            kwargs: See `physx_core.Environment`.
 
         Raises:
             ConfigError: An option has a value that it cannot have.
@@ -169,7 +168,8 @@ class ArmEnvironment(Environment):
             prediction: The network's fields; one of them is the torque, shape (9,), in N m or N.
 
         Raises:
-            ConfigError: No field has the name `prediction_field`, and there are several.
+            ConfigError: No field has the name `prediction_field`, and there are several; or its
+                shape is another.
         """
         if self.task != "track" or self.feedforward != "network":
             return
@@ -180,7 +180,12 @@ class ArmEnvironment(Environment):
             raise ConfigError(
                 f'prediction_field is "{name}" but the network predicts {sorted(prediction)}.'
             )
-        self._added = np.asarray(prediction[name], np.float64).reshape(self._added.shape)
+        torque = np.asarray(prediction[name], np.float64)
+        if torque.shape != self._added.shape:
+            raise ConfigError(
+                f'The prediction "{name}" has the shape {torque.shape}, not {self._added.shape}.'
+            )
+        self._added = torque
 
     def close(self) -> None:
         """Free the simulation."""
@@ -220,9 +225,7 @@ class ArmEnvironment(Environment):
         self.set_training_data(state=np.concatenate(middle), torque=model)
         self._error = float(np.sqrt(np.mean(error**2)))
         self._reference = reference
-        self.set_additional_data(
-            tracking_error=self._error, reference=reference, position=position
-        )
+        self.set_additional_data(tracking_error=self._error, reference=reference, position=position)
 
     def _replay(self, sample: Sample) -> None:
         q, v, _ = np.split(np.asarray(sample["state"], np.float64), 3)
@@ -237,7 +240,7 @@ class ArmEnvironment(Environment):
     def _advance(self, steps: int) -> Vector:
         """Simulate physics steps under the controller; return the torques of the last one."""
         simulation, limit = self.simulation, self.simulation.layout.max_torque
-        times = self._time() + self.period * np.arange(steps)
+        times = self._time() + self.period * np.arange(steps, dtype=np.float64)
         positions, velocities, _ = self._motion.along(times)
         added = np.broadcast_to(self._added, positions.shape)
         if self.task == "excite":

@@ -139,8 +139,9 @@ class DartRobot(RobotEngine):
         v = self._ordered(self.skeleton.getVelocities())
         if self.fixed_base:
             return v
-        R = matrix_from_quaternion(quaternion_from_vector(self.skeleton.getPositions()[:3]))
-        return np.concatenate([v[3:6] @ R, v[:3] @ R, v[6:]])
+        quaternion = quaternion_from_vector(self.skeleton.getPositions()[:3])
+        rotation = matrix_from_quaternion(quaternion)
+        return np.concatenate([v[3:6] @ rotation, v[:3] @ rotation, v[6:]])
 
     def write(self, positions: Vector, velocities: Vector) -> None:
         """Set the state."""
@@ -169,45 +170,45 @@ class DartRobot(RobotEngine):
 
     def forward(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
         """Return the accelerations that torques cause, resistance included."""
-        R = self._place(self._shadow, positions, velocities)
+        rotation = self._place(self._shadow, positions, velocities)
         forces = torques - self.resistance(velocities)
-        if R is not None:
-            forces = np.concatenate([R @ forces[3:6], R @ forces[:3], forces[6:]])
+        if rotation is not None:
+            forces = np.concatenate([rotation @ forces[3:6], rotation @ forces[:3], forces[6:]])
         self._shadow.setForces(self._reordered(forces))
         self._shadow.computeForwardDynamics()
         a = self._ordered(self._shadow.getAccelerations())
-        if R is not None:
-            linear = a[3:6] @ R - np.cross(velocities[3:6], velocities[:3])
-            a = np.concatenate([linear, a[:3] @ R, a[6:]])
+        if rotation is not None:
+            linear = a[3:6] @ rotation - np.cross(velocities[3:6], velocities[:3])
+            a = np.concatenate([linear, a[:3] @ rotation, a[6:]])
         return a
 
     def inverse(self, positions: Vector, velocities: Vector, accelerations: Vector) -> Vector:
         """Return the torques that cause accelerations, resistance included."""
-        R = self._place(self._shadow, positions, velocities)
+        rotation = self._place(self._shadow, positions, velocities)
         a = accelerations
-        if R is not None:
-            linear = R @ (a[:3] + np.cross(velocities[3:6], velocities[:3]))
-            a = np.concatenate([R @ a[3:6], linear, a[6:]])
+        if rotation is not None:
+            linear = rotation @ (a[:3] + np.cross(velocities[3:6], velocities[:3]))
+            a = np.concatenate([rotation @ a[3:6], linear, a[6:]])
         self._shadow.setAccelerations(self._reordered(a))
         self._shadow.computeInverseDynamics(False, False, False)
         forces = self._ordered(self._shadow.getForces())
-        if R is not None:
-            forces = np.concatenate([forces[3:6] @ R, forces[:3] @ R, forces[6:]])
+        if rotation is not None:
+            forces = np.concatenate([forces[3:6] @ rotation, forces[:3] @ rotation, forces[6:]])
         return forces + self.resistance(velocities)
 
     def _place(self, skeleton: object, positions: Vector, velocities: Vector) -> Vector | None:
         """Set a skeleton's state; return the base's rotation matrix, None for a fixed base."""
-        R = None
+        rotation = None
         if not self.fixed_base:
             quaternion = positions[3:7] / np.linalg.norm(positions[3:7])
-            R = matrix_from_quaternion(quaternion)
-            rotation = vector_from_quaternion(quaternion)
-            positions = np.concatenate([rotation, positions[:3], positions[7:]])
+            rotation = matrix_from_quaternion(quaternion)
+            vector = vector_from_quaternion(quaternion)
+            positions = np.concatenate([vector, positions[:3], positions[7:]])
             twist = velocities
-            velocities = np.concatenate([R @ twist[3:6], R @ twist[:3], twist[6:]])
+            velocities = np.concatenate([rotation @ twist[3:6], rotation @ twist[:3], twist[6:]])
         skeleton.setPositions(self._reordered(positions))  # type: ignore[attr-defined]
         skeleton.setVelocities(self._reordered(velocities))  # type: ignore[attr-defined]
-        return R
+        return rotation
 
     def _ordered(self, native: Vector) -> Vector:
         return native if self._sorted else native[self._native]

@@ -16,8 +16,9 @@ _FASTEST_RETURN = 10.0
 class JointConstraints:
     """Limits of position and velocity, and Coulomb friction, of a robot's joints.
 
-    A joint may not leave its limits in the next step, nor move faster than its velocity limit; one
-    that is outside comes back, whatever its velocity limit. Friction stops a joint if it can within its bounds.
+    matrix joint may not leave its limits in the next step, nor move faster than its velocity limit; one
+    that is outside comes back, whatever its velocity limit. Friction stops a joint if it can within
+    its bounds.
     """
 
     def __init__(
@@ -88,7 +89,7 @@ def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vect
         least: Smallest impulses, shape (n,), may be -inf.
         most: Largest impulses, likewise.
     """
-    A = response + np.diag(_REGULARIZATION * np.diag(response))
+    matrix = response + np.diag(_REGULARIZATION * np.diag(response))
     side = np.zeros(len(change), dtype=np.int8)  # -1: at its least, 1: at its most, 0: between
     best, blocks = len(change) + 1, 3
     impulses = np.zeros(len(change))
@@ -96,9 +97,9 @@ def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vect
         free = side == 0
         impulses = np.where(side < 0, least, np.where(side > 0, most, 0.0))
         if free.any():
-            rest = change[free] - A[np.ix_(free, ~free)] @ impulses[~free]
-            impulses[free] = np.linalg.solve(A[np.ix_(free, free)], rest)
-        missing = A @ impulses - change
+            rest = change[free] - matrix[np.ix_(free, ~free)] @ impulses[~free]
+            impulses[free] = np.linalg.solve(matrix[np.ix_(free, free)], rest)
+        missing = matrix @ impulses - change
         under, over = free & (impulses < least), free & (impulses > most)
         freed = ((side < 0) & (missing < 0)) | ((side > 0) & (missing > 0))
         wrong = np.flatnonzero(under | over | freed)

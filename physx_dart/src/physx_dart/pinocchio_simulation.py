@@ -112,17 +112,17 @@ class PinocchioRobot(RobotEngine):
 
     def _step_base(self, q: Vector, v: Vector, a: Vector) -> None:
         dt = self._period
-        R = matrix_from_quaternion(q[3:7])
+        before = matrix_from_quaternion(q[3:7])
         free = v + dt * a
         # The linear velocity in the world frame changes by R (a + omega x v), as DART has it.
         free[:3] += dt * np.cross(v[3:6], v[:3])
         if self._constraints is not None:
             free = self._constrained(q, free)
-        linear, angular = R @ free[:3], R @ free[3:6]
+        linear, angular = before @ free[:3], before @ free[3:6]
         rotation = product(quaternion_from_vector(dt * angular), q[3:7])
-        R = matrix_from_quaternion(rotation)
+        after = matrix_from_quaternion(rotation)
         self._positions = np.concatenate([q[:3] + dt * linear, rotation, q[7:] + dt * free[6:]])
-        self._velocities = np.concatenate([linear @ R, angular @ R, free[6:]])
+        self._velocities = np.concatenate([linear @ after, angular @ after, free[6:]])
 
     def _constrained(self, q: Vector, v: Vector) -> Vector:
         """Return velocities (nv,) after the impulses of limits and friction."""

@@ -91,9 +91,7 @@ def mesh_path(model: Path, name: str, package_dirs: Mapping[str, str | Path]) ->
     return model.parent / name
 
 
-def _package_dir(
-    model: Path, package: str, package_dirs: Mapping[str, str | Path]
-) -> Path | None:
+def _package_dir(model: Path, package: str, package_dirs: Mapping[str, str | Path]) -> Path | None:
     if package in package_dirs:
         return Path(package_dirs[package])
     for folder in model.parents:

@@ -58,12 +58,12 @@ def poses_from_matrices(transforms: Vector) -> Vector:
     """Return rows x, y, z and quaternion, shape (n, 7), of transforms, shape (n, 4, 4)."""
     poses = np.empty((len(transforms), 7))
     poses[:, :3] = transforms[:, :3, 3]
-    # Each row of K is the quaternion times 4 times one of its parts; the largest is divided by.
+    # Each row is the quaternion times 4 times one of its parts; the largest is divided by.
     m = transforms[:, :3, :3]
     xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
     xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
     xw, yw, zw = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
-    K = np.array(
+    rows = np.array(
         [
             [1 + xx - yy - zz, xy, xz, xw],
             [xy, 1 - xx + yy - zz, yz, yw],
@@ -71,7 +71,7 @@ def poses_from_matrices(transforms: Vector) -> Vector:
             [xw, yw, zw, 1 + xx + yy + zz],
         ]
     )
-    largest = np.argmax(np.einsum("iin->in", K), axis=0)
-    quaternions = K[largest, :, np.arange(len(m))]
+    largest = np.argmax(np.einsum("iin->in", rows), axis=0)
+    quaternions = rows[largest, :, np.arange(len(m))]
     poses[:, 3:] = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
     return poses

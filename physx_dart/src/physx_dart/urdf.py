@@ -102,7 +102,7 @@ def _parse(path: Path) -> Element:
     if b"<!DOCTYPE" in text:
         raise ModelError(f"{path} has a DOCTYPE; a URDF file has none, and its entities can bomb.")
     try:
-        root = ElementTree.fromstring(text)  # noqa: S314 - without DOCTYPE there are no entities
+        root = ElementTree.fromstring(text)  # without DOCTYPE there are no entities
     except ElementTree.ParseError as error:
         raise ModelError(f"{path} is not valid XML: {error}.") from error
     if root.tag != "robot":

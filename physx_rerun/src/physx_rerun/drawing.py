@@ -218,7 +218,7 @@ class Drawing:
             drawn.edges = np.unique(pairs, axis=0)
             thin = rr.LineStrips3D.from_fields(radii=[_SCREEN_LINES / 2])
             self._rows.static(entity, rr.CoordinateFrame(self._world), thin)
-        strips = [] if positions is None else list(positions[drawn.edges])
+        strips = np.zeros((0, 2, 3)) if positions is None else positions[drawn.edges]
         self._rows.add(entity, rr.LineStrips3D, times, strips=strips)
 
     def _points(self, drawn: Drawn, changes: dict[str, Any], times: Times) -> None:

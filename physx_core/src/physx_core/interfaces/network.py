@@ -37,8 +37,8 @@ class Network(ABC):
     opt_fields: Sequence[str] = ("ground_truth",)
     pred_fields: Sequence[str] = ("prediction",)
 
-    @classmethod
-    def set_seed(cls, seed: int) -> None:  # noqa: B027
+    @classmethod  # noqa: B027
+    def set_seed(cls, seed: int) -> None:
         """Seed the random numbers from which the library draws first parameters.
 
         Args:

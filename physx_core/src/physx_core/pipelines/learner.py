@@ -222,6 +222,8 @@ def _make(kind: str, reference: Any, arguments: dict[str, Any], base: type[Any])
         raise ConfigError(f"The {kind} {reference!r} refuses its arguments: {error}.") from error
     if not isinstance(component, base):
         raise ConfigError(
-            f"{reference!r} made a {type(component).__name__}, which is no physx {kind}."
+            f"{reference!r} made a {type(component).__name__}, which is no physx {kind}. "
+            "A class of the library itself goes through its plugin, for example "
+            'network="torch/module", network_kwargs={"module": "package.module:Class"}.'
         )
     return component

@@ -10,7 +10,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from physx_core.errors import ComponentNotFoundError, PluginError, ReferenceFormError, UsageError
+from physx_core.config import SCRIPT_PREFIX
+from physx_core.errors import ComponentNotFoundError, PluginError, ReferenceFormError
 from physx_core.plugins.hookspecs import KINDS
 from physx_core.plugins.registry import load
 
@@ -87,7 +88,7 @@ def _script(kind: str, path: Path) -> ModuleType:
     if main is not None and Path(getattr(main, "__file__", None) or ".").resolve() == path:
         return main
     digest = hashlib.sha1(str(path).encode(), usedforsecurity=False).hexdigest()[:12]
-    name = f"_physx_script_{digest}"
+    name = f"{SCRIPT_PREFIX}{digest}"
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)
@@ -112,38 +113,3 @@ def _attribute(kind: str, module: ModuleType, name: str, place: str) -> Any:
             raise ComponentNotFoundError(kind, name, place, classes)
         found = getattr(found, part)
     return found
-
-
-def reference_of(component: Any) -> str:
-    """Return the text by which another process finds a component.
-
-    Args:
-        component: A reference, which is returned as it is, or a class.
-
-    Raises:
-        UsageError: The class cannot be found from outside: it was defined in a function or in an
-            interactive session.
-    """
-    if isinstance(component, str):
-        return component
-    module, name = component.__module__, component.__qualname__
-    if "<locals>" in name:
-        raise UsageError(
-            f"{name} is defined inside a function, where no other process can find it. "
-            "Define it at the top level of a module, or run with as_tcp_ip_client=False."
-        )
-    source = sys.modules.get(module)
-    file = getattr(source, "__file__", None)
-    if module.startswith("_physx_script_") and file:
-        return f"{file}:{name}"
-    if module != "__main__":
-        return f"{module}:{name}"
-    spec = getattr(source, "__spec__", None)
-    if spec is not None and spec.name:
-        return f"{spec.name.removesuffix('.__main__') if not file else spec.name}:{name}"
-    if not file or not Path(file).is_file():
-        raise UsageError(
-            f"{name} is defined in an interactive session, where no other process can find it. "
-            "Put it into a file, or run with as_tcp_ip_client=False."
-        )
-    return f"{Path(file).resolve()}:{name}"
