@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -18,10 +19,10 @@ from hypothesis import strategies as st
 
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
+    ClientError,
     ConfigError,
     ConnectionRefusedByPeerError,
     FieldShapeError,
-    PhysxError,
     UnknownOptionError,
     UsageError,
 )
@@ -199,13 +200,13 @@ def test_strangers_do_not_disturb_a_run():
 def test_a_silent_stranger_is_dropped_after_a_while(monkeypatch):
     monkeypatch.setattr("physx_core.transport.server._HANDSHAKE_TIME", 0.2)
     port = free_port()
-    with source(port=port) as clients:
-        with socket.create_connection(("127.0.0.1", port), timeout=2) as connection:
-            connection.sendall(b"\0")
-            for _ in range(30):
-                clients.batch(1)
-                time.sleep(0.02)
-            assert connection.recv(10) == b""
+    with source(port=port) as clients, socket.create_connection(("127.0.0.1", port)) as stranger:
+        stranger.settimeout(2)
+        stranger.sendall(b"\0")
+        for _ in range(30):
+            clients.batch(1)
+            time.sleep(0.02)
+        assert stranger.recv(10) == b""
 
 
 def test_many_silent_strangers_do_not_keep_clients_out():
@@ -224,29 +225,21 @@ def test_many_silent_strangers_do_not_keep_clients_out():
 
 def test_a_client_with_another_token_is_told_so():
     port = free_port()
-    done = threading.Event()
+    errors = []
 
-    def run():
-        with source(port=port) as clients:
-            while not done.is_set():
-                clients.batch(1)
-                time.sleep(0.02)
+    def join():
+        with pytest.raises(ConnectionRefusedByPeerError) as caught:
+            run_client(f"127.0.0.1:{port}", "wrong" * 10)
+        errors.append(str(caught.value))
 
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        with pytest.raises(ConnectionRefusedByPeerError, match="does not know this client's token"):
-            for _ in range(200):
-                try:
-                    run_client(f"127.0.0.1:{port}", "wrong" * 10)
-                except ConnectionRefusedByPeerError as error:
-                    if "can be reached" not in str(error):
-                        raise
-                    time.sleep(0.02)
-    finally:
-        done.set()
-        thread.join()
-        os.environ.pop("PHYSX_CLIENT", None)
+    with source(port=port) as clients:
+        thread = threading.Thread(target=join)
+        thread.start()
+        while thread.is_alive():
+            clients.batch(1)
+            time.sleep(0.011)
+    assert "does not know this client's token" in errors[0]
+    assert "PHYSX_TOKEN" in errors[0]
 
 
 def test_a_client_does_not_trust_a_server_without_the_token():
@@ -345,33 +338,58 @@ def test_stop_ends_what_ignores_a_polite_signal(tmp_path):
     assert time.monotonic() - began < 20
 
 
+HAND = """
+import os, sys, time
+from physx_core.errors import PhysxError
+from physx_core.transport.client import run_client
+for _ in range(500):
+    try:
+        status = run_client(sys.argv[1], os.environ["PHYSX_TOKEN"])
+    except PhysxError:
+        time.sleep(0.02)
+    else:
+        sys.exit(status)
+"""
+
+
+@contextlib.contextmanager
+def hands(count, port):
+    """Start clients that connect once a server listens."""
+    command = [sys.executable, "-c", HAND, f"127.0.0.1:{port}"]
+    processes = [subprocess.Popen(command) for _ in range(count)]
+    try:
+        yield processes
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
 def test_clients_started_by_hand_join_with_the_token(monkeypatch):
     monkeypatch.setenv("PHYSX_TOKEN", "a token for this test")
     port = free_port()
-    code = (
-        "import os, sys, time\n"
-        "from physx_core.errors import PhysxError\n"
-        "from physx_core.transport.client import run_client\n"
-        "for _ in range(500):\n"
-        "    try:\n"
-        f"        status = run_client('127.0.0.1:{port}', os.environ['PHYSX_TOKEN'])\n"
-        "    except PhysxError:\n"
-        "        time.sleep(0.02)\n"
-        "    else:\n"
-        "        sys.exit(status)\n"
-    )
-    hands = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(2)]
-    try:
-        config = EnvironmentConfig(ENVS + "Plain", num_clients=2, port=port, timeout=20.0)
+    config = EnvironmentConfig(ENVS + "Plain", num_clients=2, port=port, timeout=20.0)
+    with hands(2, port) as processes:
         with ClientSource(config, Services(), [0], launch=False) as clients:
             batch = clients.batch(6)
-        assert list(batch["env_id"]) == [1, 2] * 3
-        assert list(batch["step"]) == [0, 0, 1, 1, 2, 2]
-        assert [hand.wait(10) for hand in hands] == [0, 0]
-    finally:
-        for hand in hands:
-            hand.kill()
-            hand.wait()
+        assert [process.wait(10) for process in processes] == [0, 0]
+    assert list(batch["env_id"]) == [1, 2] * 3
+    assert list(batch["step"]) == [0, 0, 1, 1, 2, 2]
+
+
+def test_a_client_that_was_started_by_hand_and_ends_is_named(monkeypatch):
+    monkeypatch.setenv("PHYSX_TOKEN", "a token for this test")
+    port = free_port()
+    config = EnvironmentConfig(ENVS + "Plain", port=port, timeout=20.0)
+    with (
+        hands(1, port) as processes,
+        pytest.raises(ClientError, match="Client 1 closed the connection"),
+        ClientSource(config, Services(), [0], launch=False) as clients,
+    ):
+        clients.batch(1)
+        processes[0].kill()
+        while True:
+            clients.batch(1)
 
 
 def test_clients_started_by_hand_need_a_token(monkeypatch):
@@ -388,51 +406,21 @@ def test_a_client_without_a_place_is_told_so(monkeypatch):
     monkeypatch.setenv("PHYSX_TOKEN", "a token for this test")
     port = free_port()
     config = EnvironmentConfig(ENVS + "Plain", port=port, timeout=20.0)
-    token = os.environ["PHYSX_TOKEN"]
     errors = []
 
-    def too_many():
-        for _ in range(500):
-            try:
-                run_client(f"127.0.0.1:{port}", token, 2)
-            except PhysxError as error:
-                if "no place" in str(error):
-                    errors.append(error)
-                    return
-                time.sleep(0.02)
+    def join():
+        for wanted in (None, 1, 2):
+            with pytest.raises(ConnectionRefusedByPeerError) as caught:
+                run_client(f"127.0.0.1:{port}", "a token for this test", wanted)
+            errors.append(str(caught.value))
 
-    thread = threading.Thread(target=too_many)
-    thread.start()
-    hand = None
-    try:
-        hand = (
-            subprocess.Popen(
-                [sys.executable, "-m", "physx_core.transport", "--connect", f"127.0.0.1:{port}"]
-            )
-            if False
-            else None
-        )
-        source = ClientSource(config, Services(), [0], launch=False)
-        opener = threading.Thread(target=lambda: _open_quietly(source), daemon=True)
-        opener.start()
-        thread.join(20)
-        assert errors
-        assert run_in_process(f"127.0.0.1:{port}", token, source, opener) == 0
-    finally:
-        if hand is not None:
-            hand.kill()
-        os.environ.pop("PHYSX_CLIENT", None)
-
-
-def _open_quietly(source):
-    with source:
-        source.batch(1)
-
-
-def run_in_process(address, token, source, opener):
-    status = run_client(address, token, 1)
-    opener.join(20)
-    return status
+    with hands(1, port), ClientSource(config, Services(), [0], launch=False) as clients:
+        thread = threading.Thread(target=join)
+        thread.start()
+        while thread.is_alive():
+            clients.batch(1)
+            time.sleep(0.011)
+    assert ["no place for instance" in error for error in errors] == [True] * 3
 
 
 SERVER = """

@@ -174,7 +174,7 @@ class Applied(Plain):
         self.set_training_data(x=np.array([self.value, self.step_index], float))
 
     def apply_prediction(self, prediction):
-        self.value = 10 * self.value + float(prediction["y"])
+        self.value = 10 * self.value + prediction["y"].item()
 
 
 class Drawing(Plain):

@@ -70,6 +70,7 @@ HANGING = """
     visualizer.open("run", sys.argv[2], 1)
     factory = Factory()
     factory.add_scalars("error", ["x"])
+    print("ready", flush=True)
     input()
     for step in range(1000):
         factory.update_scalars("error", [step])
@@ -81,8 +82,9 @@ HANGING = """
 def test_a_viewer_that_hangs_holds_up_neither_run_nor_exit(receiver, python, tmp_path):
     viewer, _ = receiver
     command = [python, "-c", textwrap.dedent(HANGING), viewer.address, str(tmp_path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as run:
-        time.sleep(2.0)
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    with subprocess.Popen(command, **pipes) as run:
+        assert run.stdout.readline() == b"ready\n"
         viewer.process.send_signal(signal.SIGSTOP)
         try:
             _, errors = run.communicate(b"\n", timeout=60)

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import subprocess
+import time
 
 import numpy as np
 import pytest
 import rerun as rr
+from rerun.experimental import ViewerClient
 
 from physx_core import plugins
 from physx_core.errors import ConfigError, UnknownOptionError, VisualizerError
 from physx_core.scene import Factory
-from physx_rerun.viewer import free_port
+from physx_rerun import visualizer as visualizer_module
+from physx_rerun.viewer import Viewer, free_port
 from physx_rerun.visualizer import RerunVisualizer
 
 
@@ -56,6 +58,44 @@ def test_a_window_needs_a_display(monkeypatch, tmp_path):
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(VisualizerError, match="no display"):
         RerunVisualizer(mode="spawn").open("run", tmp_path, 1)
+
+
+def test_a_window_that_cannot_be_opened(monkeypatch, tmp_path):
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":987")
+    with pytest.raises(VisualizerError, match="viewer ended with status"):
+        RerunVisualizer(mode="spawn").open("run", tmp_path, 1)
+
+
+def test_a_port_that_is_taken(monkeypatch, tmp_path, receiver):
+    monkeypatch.setenv("DISPLAY", ":987")
+    port = int(receiver[0].address.rpartition(":")[2])
+    with pytest.raises(VisualizerError, match=f'Port {port} is taken.*"connect"'):
+        RerunVisualizer(mode="spawn", port=port).open("run", tmp_path, 1)
+
+
+@pytest.mark.usefixtures("vulkan")
+def test_a_viewer_of_its_own_outlives_the_run(monkeypatch, opened):
+    """The viewer is started without a window, for there may be no display."""
+    monkeypatch.setenv("DISPLAY", ":987")
+
+    def without_window(port, options, **more):
+        return Viewer(port, ("--headless", *options), **more)
+
+    monkeypatch.setattr(visualizer_module, "Viewer", without_window)
+    visualizer = opened(mode="spawn", save=False)
+    try:
+        ball(visualizer)
+        visualizer.scalars({"loss/training": 1.0}, 0, "batch")
+        visualizer.close()
+        client = ViewerClient.connect(f"rerun+http://{visualizer.viewer.address}/proxy")
+        deadline = time.monotonic() + 20
+        while {view.name for view in client.get_state().views} != {"environment", "loss"}:
+            assert time.monotonic() < deadline, client.get_state()
+            time.sleep(0.1)
+        assert visualizer.file is None
+    finally:
+        visualizer.viewer.end()
 
 
 def test_nobody_listens(tmp_path):
@@ -123,14 +163,6 @@ def test_training_curves(opened, read):
     assert read(*validation, "batch") == [(3, [0.5])]
     assert read(*validation, "epoch") == [(0, [0.5])]
     assert read(visualizer.file, "/run/duration", "Scalars:scalars", "epoch") == [(0, [2.0])]
-
-
-def blueprint_texts(path):
-    """Return everything that the layout in a file says, as one text."""
-    printed = subprocess.run(
-        ["rerun", "rrd", "print", "-vvv", str(path)], capture_output=True, text=True, check=True
-    )
-    return printed.stdout
 
 
 def test_equal_scenes_share_a_layout_and_others_do_not(opened, tmp_path):

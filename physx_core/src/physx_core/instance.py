@@ -172,7 +172,9 @@ class Instance:
                 self._runner = asyncio.Runner()
             self._runner.run(result)
 
-    def _call(self, method: str, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    def _call(
+        self, method: str, function: Callable[..., Any], /, *args: Any, **kwargs: Any
+    ) -> Any:
         try:
             return function(*args, **kwargs)
         except Exception as error:

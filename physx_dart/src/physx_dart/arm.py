@@ -105,6 +105,8 @@ class ArmEnvironment(Environment):
         ):
             if count < 1:
                 raise ConfigError(f"{name} is {count} but must be at least 1.")
+        if len(frequencies) != 2 or not 0 <= frequencies[0] <= frequencies[1]:
+            raise ConfigError(f"frequencies are {frequencies} but must be the lowest, the highest.")
         self.task, self.feedforward, self.trajectory = task, feedforward, trajectory
         self.period, self.steps_per_sample = period, steps_per_sample
         self.episode_steps, self.draw_every = episode_steps, draw_every

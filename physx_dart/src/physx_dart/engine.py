@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -93,18 +94,17 @@ class RobotEngine(ABC):
         """Return the torques that cause accelerations, resistance included."""
 
 
+@dataclass(frozen=True)
 class EngineState(State):
     """A snapshot that also holds each robot's state as its engine has it.
 
     Attributes:
-        native: One entry for each robot; plain and picklable.
+        engine: Name of the simulation's class.
+        native: One entry for each robot.
     """
 
+    engine: str
     native: tuple[Any, ...]
-
-    def __init__(self, state: State, native: tuple[Any, ...]) -> None:
-        super().__init__(state.positions, state.velocities, state.torques, state.frame)
-        object.__setattr__(self, "native", native)
 
 
 class RobotSimulation(Simulation):
@@ -180,15 +180,21 @@ class RobotSimulation(Simulation):
 
     def snapshot(self) -> State:
         """Return everything that `restore` needs to go on exactly from here."""
-        state = State(self.positions(), self.velocities(), self._torques.copy(), self._frame)
-        return EngineState(state, tuple(robot.native() for robot in self._robots))
+        return EngineState(
+            self.positions(),
+            self.velocities(),
+            self._torques.copy(),
+            self._frame,
+            engine=type(self).__name__,
+            native=tuple(robot.native() for robot in self._robots),
+        )
 
     def restore(self, state: State) -> None:
         """Go back to a snapshot: bit for bit to an own one, within rounding to another engine's."""
         self._check_open()
         torques = self._vector("state.torques", state.torques, len(self.layout.joints))
         self.set_state(state.positions, state.velocities)
-        if isinstance(state, EngineState) and len(state.native) == len(self._robots):
+        if isinstance(state, EngineState) and state.engine == type(self).__name__:
             for robot, native in zip(self._robots, state.native, strict=True):
                 robot.set_native(native)
         self._hold(torques)

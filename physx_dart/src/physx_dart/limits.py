@@ -16,7 +16,7 @@ _FASTEST_RETURN = 10.0
 class JointConstraints:
     """Limits of position and velocity, and Coulomb friction, of a robot's joints.
 
-    matrix joint may not leave its limits in the next step, nor move faster than its velocity limit; one
+    A joint may not leave its limits in the next step, nor move faster than its velocity limit; one
     that is outside comes back, whatever its velocity limit. Friction stops a joint if it can within
     its bounds.
     """

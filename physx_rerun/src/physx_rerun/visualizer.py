@@ -29,7 +29,7 @@ FLUSH_BYTES = 8_000_000
 
 
 @options
-@dataclass
+@dataclass(eq=False)
 class RerunVisualizer(Visualizer):
     """Draws environments and training curves in the Rerun viewer and saves them as a recording.
 
@@ -65,6 +65,9 @@ class RerunVisualizer(Visualizer):
             ConfigError: They do not.
         """
         self._check_options()
+        self._reset()
+
+    def _reset(self) -> None:
         self.viewer: Viewer | None = None
         self.file: Path | None = None
         self._run_name = "run"
@@ -98,7 +101,7 @@ class RerunVisualizer(Visualizer):
         Raises:
             VisualizerError: Nobody listens at `address`, or there is no display for a window.
         """
-        self.__post_init__()
+        self._reset()
         self._run_name, self._layout = run_name, Layout(instance_nb)
         if self.mode == "connect":
             self._address = str(self.address)
@@ -119,9 +122,15 @@ class RerunVisualizer(Visualizer):
                 'mode "spawn" opens a window, but there is no display. Use mode "headless" for a '
                 'picture, or mode "save" and open the file elsewhere with: rerun FILE.rrd'
             )
+        if self.port and listens(f"127.0.0.1:{self.port}"):
+            raise VisualizerError(
+                f"Port {self.port} is taken. If that is a Rerun viewer, use mode "
+                f'"connect" with address="127.0.0.1:{self.port}"; otherwise leave port=0.'
+            )
         options = ("--memory-limit", self.memory_limit, "--expect-data-soon")
         self.viewer = Viewer(self.port, options, lives_on=True)
         self.viewer.wait_until_ready()
+        self.viewer.check(wait=1.0)  # it listens before it knows whether it gets its window
         self._address = self.viewer.address
 
     def events(self, instance_id: int, step: int, events: list[Event]) -> None:

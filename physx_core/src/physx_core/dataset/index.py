@@ -59,6 +59,6 @@ def _add(group: Any, mode_name: str, mode: Mode, field: Field) -> None:
             source = h5py.VirtualSource(source_file, "data", source_shape, dtype)
             layout[start : start + partition.rows] = source
             start += partition.rows
-        missing = np.nan if dtype.kind in "fc" else None  # what rows of a lost partition read as
+        missing = np.nan if dtype.kind == "f" else None  # what rows of a lost partition read as
         entry = group.create_virtual_dataset(field.name, layout, fillvalue=missing)
     entry.attrs["unit"], entry.attrs["role"] = field.unit, field.role

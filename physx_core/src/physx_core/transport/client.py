@@ -35,7 +35,6 @@ def run_client(address: str, token: str, instance: int | None = None) -> int:
         ConnectionRefusedByPeerError: Nothing answers at the address, not a server with this token,
             or the server has no place for the instance.
     """
-    os.environ[CLIENT_VARIABLE] = "1"
     link = connect(address, token, instance or 0)
     try:
         return _serve(link)
@@ -52,6 +51,7 @@ def _serve(link: Link) -> int:
     if frame.kind is not Kind.SETUP:
         raise ConnectionRefusedByPeerError(f"The server began with {frame.kind.name}.")
     setup: dict[str, Any] = decode(frame.payload)
+    os.environ[CLIENT_VARIABLE] = "1"
     draw = setup.pop("draw")
     _take_place(setup.pop("path"), setup.pop("directory"))
     client = _Client(link, Instance(**setup))

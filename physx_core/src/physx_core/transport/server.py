@@ -51,7 +51,7 @@ class Server:
             token: Secret of the run; None: a random one.
         """
         self.peers: dict[int, Peer] = {}
-        self.token = token or secrets.token_hex(32)
+        self.token = secrets.token_hex(32) if token is None else token
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
         self._answers = Answers(services)
         self._setup = setup

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import pytest
+from physx_core import Robot, World, plugins
+
+BACKENDS = ("dart", "pinocchio")
+
+BAR = """
+<robot name="bar">
+  <link name="base"/>
+  <joint name="hinge" type="{kind}">
+    <parent link="base"/><child link="bar"/><axis xyz="0 1 0"/>
+    {extra}
+  </joint>
+  <link name="bar">
+    <inertial>
+      <origin xyz="0 0 -0.5"/><mass value="2"/>
+      <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>
+    </inertial>
+  </link>
+  <joint name="tip_joint" type="fixed">
+    <origin xyz="0 0 -1"/><parent link="bar"/><child link="tip"/>
+  </joint>
+  <link name="tip"/>
+</robot>
+"""
+
+BRICK = """
+<robot name="brick">
+  <link name="brick">
+    <inertial>
+      <origin xyz="0.1 0 0.05"/><mass value="2"/>
+      <inertia ixx="0.1" iyy="0.2" izz="0.25" ixy="0.01" ixz="0" iyz="0"/>
+    </inertial>
+  </link>
+</robot>
+"""
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request):
+    return plugins.resolve("backend", request.param)
+
+
+@pytest.fixture
+def dart():
+    return plugins.resolve("backend", "dart")
+
+
+@pytest.fixture
+def pinocchio():
+    return plugins.resolve("backend", "pinocchio")
+
+
+@pytest.fixture
+def write_urdf(tmp_path):
+    def write(text, name="robot.urdf"):
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+@pytest.fixture
+def bar(write_urdf):
+    """Write a pendulum with one joint: its moment of inertia is 0.6 kg m²."""
+
+    def make(extra="", kind="continuous", **options):
+        name = options.get("name", "bar")
+        path = write_urdf(BAR.format(kind=kind, extra=extra), f"{name}.urdf")
+        return Robot(path, **options)
+
+    return make
+
+
+@pytest.fixture
+def brick(write_urdf):
+    """A single floating body."""
+    return World([Robot(write_urdf(BRICK), fixed_base=False)])
+
+
+@pytest.fixture(scope="session")
+def example():
+    """Return a robot of example-robot-data by the name of its file."""
+    pytest.importorskip("importlib.metadata").distribution("example-robot-data")
+    from physx_dart.robot_files import example_robot
+
+    return example_robot
+
+
+@pytest.fixture
+def drive():
+    """Bring an environment to life as a pipeline does, step it, and return its samples."""
+    alive = []
+
+    def make(environment, **options):
+        made = environment(**{"seed": 3, **options})
+        alive.append(made)
+        made.create()
+        made.init()
+        made.init_database()
+        return made
+
+    def run(environment, steps, predict=None, **options):
+        made = make(environment, **options) if isinstance(environment, type) else environment
+        samples = []
+        for _ in range(steps):
+            made.step()
+            samples.append(made.take_sample())
+            assert made.check_sample()
+            made.step_index += 1
+            if predict is not None:
+                made.apply_prediction(predict(samples[-1]))
+        return samples
+
+    run.make = make
+    yield run
+    for made in alive:
+        made.close()
