@@ -20,6 +20,7 @@ from physx_core.errors import (
     ComponentNotFoundError,
     EnvironmentFailedError,
     FieldShapeError,
+    FieldsMismatchError,
     FieldTypeError,
     NotFiniteError,
     UnknownFieldError,
@@ -289,7 +290,6 @@ def test_an_error_of_physx_comes_back_as_itself(method):
         (np.array([1, np.nan]), "x", NotFiniteError),
         (np.array([1, -np.inf]), "x", NotFiniteError),
         (np.array([1j, 2]), "x", FieldTypeError),
-        ("text", "x", FieldTypeError),
         ([[1, 2], [3]], "x", FieldShapeError),
         (1.0, "velocity", UnknownFieldError),
     ],
@@ -338,6 +338,15 @@ def test_open_shapes_must_be_the_same_in_all_instances():
     assert type(error) is type(local) is FieldShapeError
     assert str(error) == str(local)
     assert vars(error) == vars(local)
+
+
+def test_instances_define_the_same_fields():
+    with (
+        pytest.raises(FieldsMismatchError, match="Instances 1 and 2") as caught,
+        ClientSource(config("Names", num_clients=2), Services(), SEED),
+    ):
+        pass
+    assert set(caught.value.differences) == {"x1", "x2"}
 
 
 def test_an_environment_cannot_hide_a_row_that_is_not_finite():
@@ -417,9 +426,9 @@ def pids(clients):
 @pytest.mark.parametrize("what", ["spin", "sleep", "stop"])
 def test_a_client_that_hangs_is_named_at_the_timeout(what):
     kwargs = {"what": what, "who": 2, "method": "never" if what == "stop" else "step"}
-    settings = config("Trouble", num_clients=2, env_kwargs=kwargs, timeout=1.5)
+    settings = config("Trouble", num_clients=2, env_kwargs=kwargs, timeout=1.2)
     with (
-        pytest.raises(ClientError, match=r"Client 2 sent nothing for 1\.5 s") as caught,
+        pytest.raises(ClientError, match=r"Client 2 sent nothing for 1\.2 s") as caught,
         ClientSource(settings, Services(), SEED, run_ahead=0) as clients,
     ):
         clients.batch(4)
@@ -428,11 +437,11 @@ def test_a_client_that_hangs_is_named_at_the_timeout(what):
         began = time.monotonic()
         clients.batch(8)
     assert caught.value.exit_status is None
-    assert 1.4 < time.monotonic() - began < 5
+    assert 1.1 < time.monotonic() - began < 5
 
 
 def test_a_client_that_hangs_before_it_is_ready_is_named():
-    settings = config("Trouble", env_kwargs={"what": "sleep", "method": "create"}, timeout=1.5)
+    settings = config("Trouble", env_kwargs={"what": "sleep", "method": "create"}, timeout=1.2)
     with (
         pytest.raises(ClientError, match="Client 1 sent nothing"),
         ClientSource(settings, Services(), SEED),
@@ -454,6 +463,16 @@ def test_a_client_that_cannot_start_is_noticed_at_once(monkeypatch, tmp_path):
     assert time.monotonic() - began < 5
     assert caught.value.exit_status == 1
     assert "numpy is broken today" in caught.value.stderr
+
+
+def test_a_crash_says_where_it_happened():
+    settings = config("Trouble", env_kwargs={"what": "crash"})
+    with (
+        pytest.raises(ClientError, match=r"SIGSEGV") as caught,
+        ClientSource(settings, Services(), SEED) as clients,
+    ):
+        clients.batch(9)
+    assert "in crash" in caught.value.stderr
 
 
 def test_what_an_environment_leaves_running_is_ended(tmp_path, monkeypatch):
@@ -519,6 +538,17 @@ def test_a_refused_prediction_is_the_error_of_the_services():
         ):
             source.batch(4)
         assert caught.value.__notes__ == ["in step() of instance 1"]
+
+
+def test_a_long_prediction_is_not_taken_for_silence():
+    class Slow(Services):
+        def predict(self, fields):
+            time.sleep(0.7)
+            return super().predict(fields)
+
+    settings = config("Asking", num_clients=3, timeout=1.0)
+    with ClientSource(settings, Slow(), SEED, run_ahead=0) as clients:
+        assert len(clients.batch(3)["x"]) == 3
 
 
 def test_an_exception_of_the_network_is_raised_as_it_is():

@@ -51,7 +51,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def dataset(folder):
-    with Dataset.create(folder) as dataset:
+    with Dataset.create(folder, max_file_size=0.001) as dataset:
         yield dataset
 
 

@@ -47,6 +47,11 @@ def content(folder):
     return {p.name: (p.stat().st_mtime_ns, p.read_bytes()) for p in sorted(folder.iterdir())}
 
 
+def partitions(folder):
+    plain = json.loads((folder / "dataset.json").read_text())
+    return plain["modes"]["training"]["partitions"]
+
+
 def abandoned(folder, copy):
     """Copy a dataset as it would be found if its writer were killed now."""
     shutil.copytree(folder, copy)
@@ -200,11 +205,6 @@ def test_an_open_partition_is_read_and_then_sealed(folder, tmp_path):
         assert [p["index"] for p in partitions(killed)] == [0, 1, 2, 3, 4, 5]
 
 
-def partitions(folder):
-    plain = json.loads((folder / "dataset.json").read_text())
-    return plain["modes"]["training"]["partitions"]
-
-
 def test_a_stale_manifest_hides_no_row(folder, tmp_path):
     live = write(folder, close=False)
     early = (folder / "dataset.json").read_bytes()
@@ -323,7 +323,7 @@ def test_a_changed_byte_is_found_by_verify(folder):
     write(folder)
     path = folder / "run_training_n_1.h5"
     damaged = bytearray(path.read_bytes())
-    damaged[-3] ^= 1
+    damaged[partitions(folder)[1]["offsets"]["n"] + 340 * 4 - 1] ^= 1
     path.write_bytes(damaged)
     with Dataset.open(folder) as dataset:
         assert "checksum" in dataset.verify()[0] and str(path) in dataset.verify()[0]

@@ -329,6 +329,9 @@ def test_bad_input_of_training_is_named_and_leaves_no_session():
         Training(LINEAR, other, epoch_nb=1, batch_size=1).execute()
     with pytest.raises(ConfigError, match="batch_nb"):
         Training(LINEAR, None, SPRING, epoch_nb=1, batch_size=1).execute()
+    with pytest.raises(PluginNotFoundError):
+        generate(environment_config=EnvironmentConfig("toy/spring", visualizer="nothing"))
+    assert [p.name for p in Path("sessions").iterdir()] == ["run"]
 
 
 def test_existing_sessions_of_other_fields_are_refused():

@@ -71,7 +71,7 @@ def same(a, b):
     return a == b
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(VALUES)
 def test_values_come_back_with_type_and_bits(value):
     assert same(decode(encode(value)), value)
@@ -124,7 +124,7 @@ def test_endless_nesting_is_an_error():
         encode(value)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     st.binary(max_size=60)
     | VALUES.map(encode).flatmap(

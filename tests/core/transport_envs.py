@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import subprocess
 import sys
@@ -108,6 +109,9 @@ class Trouble(Plain):
 
     def sleep(self):
         time.sleep(60)
+
+    def crash(self):
+        ctypes.string_at(0)
 
     def leave_child(self):
         child = subprocess.Popen(["sleep", "60"])
@@ -223,3 +227,16 @@ class Surroundings(Environment):
 
     def step(self):
         self.set_training_data(x=0.0)
+
+
+class Names(Environment):
+    """Fields that differ between the instances."""
+
+    def create(self):
+        pass
+
+    def init_database(self):
+        self.define_training_fields((f"x{self.instance_id}", float))
+
+    def step(self):
+        self.set_training_data(**{f"x{self.instance_id}": 1.0})

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import pytest
+
 from physx_core import Robot, World, plugins
+from physx_dart.robot_files import example_data_dir, example_robot
 
 BACKENDS = ("dart", "pinocchio")
 
@@ -64,7 +66,7 @@ def write_urdf(tmp_path):
 
 @pytest.fixture
 def bar(write_urdf):
-    """Write a pendulum with one joint: its moment of inertia is 0.6 kg m²."""
+    """Write a pendulum with one joint; its moment of inertia is 0.6 kg m², and 1e-9 of the tip."""
 
     def make(extra="", kind="continuous", **options):
         name = options.get("name", "bar")
@@ -83,9 +85,8 @@ def brick(write_urdf):
 @pytest.fixture(scope="session")
 def example():
     """Return a robot of example-robot-data by the name of its file."""
-    pytest.importorskip("importlib.metadata").distribution("example-robot-data")
-    from physx_dart.robot_files import example_robot
-
+    if example_data_dir() is None:
+        pytest.skip("example-robot-data is not installed")
     return example_robot
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import importlib.metadata
-import os
 
 import pytest
+
 from physx_core import Robot, World
 from physx_core.errors import ConfigError, MissingMeshesError, ModelError
 from physx_dart.robot_files import example_robot
@@ -81,14 +81,10 @@ def test_a_missing_file_is_named(backend, tmp_path):
         backend.build(World([Robot(tmp_path)]))
 
 
-def test_relative_paths_work(backend, bar):
+def test_relative_paths_work(backend, bar, monkeypatch):
     path = bar().urdf
-    before = os.getcwd()
-    os.chdir(path.parent)
-    try:
-        backend.build(World([Robot(path.name)])).close()
-    finally:
-        os.chdir(before)
+    monkeypatch.chdir(path.parent)
+    backend.build(World([Robot(path.name)])).close()
 
 
 def test_a_root_link_world_is_welded(backend, write_urdf, bar):

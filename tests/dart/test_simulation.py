@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+
 from physx_core import Robot, World, plugins
 from physx_core.errors import SimulationError
 from physx_dart.double_pendulum import URDF
 
 
 def test_both_plugins_are_found_without_importing_an_engine():
-    import subprocess
-    import sys
-
     code = (
         "import sys; from physx_core import plugins\n"
         "for name in ('dart', 'pinocchio'):\n"
@@ -63,7 +64,7 @@ def test_damping_is_implicit(backend, bar):
         simulation.set_state([0.0], [1.0])
         simulation.step(100)
         expected = (1 + 3 * 1e-3 / 0.6) ** -100
-        np.testing.assert_allclose(simulation.velocities(), [expected], rtol=1e-12)
+        np.testing.assert_allclose(simulation.velocities(), [expected], rtol=1e-8)
 
 
 def test_coulomb_friction_stops_and_holds(backend, bar):
@@ -71,7 +72,7 @@ def test_coulomb_friction_stops_and_holds(backend, bar):
     with backend.build(World([robot], gravity=(0, 0, 0))) as simulation:
         simulation.set_state([0.0], [1.0])
         simulation.step(50)  # 6 N m slow 0.6 kg m² down by 10 rad/s²
-        np.testing.assert_allclose(simulation.velocities(), [0.5], rtol=1e-9)
+        np.testing.assert_allclose(simulation.velocities(), [0.5], rtol=1e-8)
         simulation.step(100)
         stopped = simulation.positions()
         simulation.set_torques([5.9])
@@ -113,7 +114,7 @@ def test_torques_are_cut_at_the_effort_limit(backend, bar):
         assert simulation.layout.upper.tolist() == [np.inf]
         simulation.set_torques([-100.0])
         simulation.step(60)
-        np.testing.assert_allclose(simulation.velocities(), [-4 / 0.6 * 0.06], rtol=1e-9)
+        np.testing.assert_allclose(simulation.velocities(), [-4 / 0.6 * 0.06], rtol=1e-8)
         np.testing.assert_array_equal(simulation.snapshot().torques, [-4.0])
 
 
@@ -122,7 +123,7 @@ def test_torques_are_held_until_changed(backend, bar):
         simulation.set_torques([0.6])
         simulation.step(3)
         simulation.step(2)
-        np.testing.assert_allclose(simulation.velocities(), [0.005], rtol=1e-9)
+        np.testing.assert_allclose(simulation.velocities(), [0.005], rtol=1e-8)
 
 
 def test_a_continuous_joint_is_one_angle_that_counts_turns(backend, bar):
@@ -171,7 +172,7 @@ def test_dynamics_and_poses_leave_the_running_state_alone(backend, example):
         q = simulation.positions() + np.array([*[0] * 7, *rng.normal(size=12)])
         for one in (simulation, untouched):
             one.set_state(q, np.linspace(-1, 1, 18))
-            one.set_torques(rng.normal(size=12) * 0)
+            one.set_torques(np.linspace(-0.2, 0.2, 12))
         for _ in range(5):
             v, x = rng.normal(size=18), rng.normal(size=18)
             simulation.forward_dynamics(q, v, x)
@@ -202,7 +203,8 @@ def test_restore_goes_on_bit_for_bit(backend, example, fixed_base):
     with backend.build(world) as simulation, backend.build(world) as other:
         simulation.set_torques(rng.normal(size=12) * 0.3)
         simulation.step(137)
-        state = pickle.loads(pickle.dumps(simulation.snapshot()))
+        state = copy.deepcopy(simulation.snapshot())
+        assert len(pickle.dumps(state)) < 10_000
 
         def go_on(one):
             one.step(100)
@@ -289,15 +291,15 @@ def test_out_is_filled(backend):
     ],
 )
 def test_what_does_not_fit_is_named(backend, call, words):
-    with backend.build(World([Robot(URDF)])) as simulation:
-        with pytest.raises(SimulationError, match=words):
-            call(simulation)
+    simulation = backend.build(World([Robot(URDF)]))
+    with simulation, pytest.raises(SimulationError, match=words):
+        call(simulation)
 
 
 def test_a_quaternion_that_is_none_is_named(backend, brick):
-    with backend.build(brick) as simulation:
-        with pytest.raises(SimulationError, match="quaternion.*length 0, not 1"):
-            simulation.set_state(np.zeros(7), np.zeros(6))
+    simulation = backend.build(brick)
+    with simulation, pytest.raises(SimulationError, match="quaternion.*length 0, not 1"):
+        simulation.set_state(np.zeros(7), np.zeros(6))
 
 
 def test_a_state_that_explodes_is_an_error(backend, bar, capfd):

@@ -22,7 +22,8 @@ T = TypeVar("T")
 def configuration(cls: type[T]) -> type[T]:
     """Make a frozen dataclass whose constructor names what is wrong with its arguments.
 
-    Field metadata may hold ``minimum`` (a number) and ``choices`` (the only values allowed).
+    Field metadata may hold ``minimum`` and ``maximum`` (numbers) and ``choices`` (the only values
+    allowed).
     Attribute docstrings become the help texts of the command line.
     """
     return options(dataclass(frozen=True)(cls))
@@ -68,12 +69,19 @@ def _validate(instance: Any, cls: Any) -> None:
             raise ConfigError(f"{where} is {value!r}, of the wrong type: {error}.") from None
         if value is None:
             continue
-        minimum, choices = option.metadata.get("minimum"), option.metadata.get("choices")
-        if minimum is not None and value < minimum:
-            raise ConfigError(f"{where} is {value!r} but must be at least {minimum}.")
-        if choices is not None and value not in choices:
-            allowed = ", ".join(repr(choice) for choice in choices)
-            raise ConfigError(f"{where} is {value!r} but must be one of {allowed}.")
+        _check_range(where, value, option.metadata)
+
+
+def _check_range(where: str, value: Any, metadata: Mapping[Any, Any]) -> None:
+    minimum, maximum = metadata.get("minimum"), metadata.get("maximum")
+    choices = metadata.get("choices")
+    if minimum is not None and value < minimum:
+        raise ConfigError(f"{where} is {value!r} but must be at least {minimum}.")
+    if maximum is not None and value > maximum:
+        raise ConfigError(f"{where} is {value!r} but must be at most {maximum}.")
+    if choices is not None and value not in choices:
+        allowed = ", ".join(repr(choice) for choice in choices)
+        raise ConfigError(f"{where} is {value!r} but must be one of {allowed}.")
 
 
 def at_least(minimum: float, default: Any = dataclasses.MISSING) -> Any:
@@ -99,7 +107,7 @@ class EnvironmentConfig:
     """Number of instances. The same seed and number give the same samples, however they run."""
     ip_address: str = "127.0.0.1"
     """Address that the server listens at."""
-    port: int = at_least(0, 0)
+    port: int = field(default=0, metadata={"minimum": 0, "maximum": 65535})
     """Port that the server listens at; 0: any free one."""
     simulations_per_step: int = at_least(1, 1)
     """Calls of `step` for one sample; `compute_training_data` is False in all but the last."""
@@ -107,7 +115,7 @@ class EnvironmentConfig:
     """How many samples in a row `check_sample` may refuse before the run ends with an error."""
     always_produce: bool = False
     """Make new samples in every epoch of a training, not only in the first."""
-    visualizer: str | None = None
+    visualizer: str | type[Any] | None = None
     """Visualizer, for example "rerun"; None: the environment has no factory."""
     visualizer_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the visualizer."""

@@ -172,9 +172,7 @@ class Instance:
                 self._runner = asyncio.Runner()
             self._runner.run(result)
 
-    def _call(
-        self, method: str, function: Callable[..., Any], /, *args: Any, **kwargs: Any
-    ) -> Any:
+    def _call(self, method: str, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
         try:
             return function(*args, **kwargs)
         except Exception as error:
@@ -186,7 +184,8 @@ class Instance:
         if method not in ("step", "check_sample", "apply_prediction", "close"):
             step = -1
         if isinstance(error, PhysxError):
-            error.add_note(f"in {method}() of instance {self.instance_id}")
+            if method != "import":
+                error.add_note(f"in {method}() of instance {self.instance_id}")
             return error
         summary = "".join(traceback.format_exception_only(error)).strip()
         text = "".join(traceback.format_exception(error))

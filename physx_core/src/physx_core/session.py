@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import platform
 import re
+import shutil
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,9 +25,11 @@ class Session:
 
     Attributes:
         path: The folder: ``<session_dir>/<session_name>``, with ``_1``, ``_2`` ... for later ones.
+        is_new: Whether the folder was made for the present run.
     """
 
     path: Path
+    is_new: bool = False
 
     @property
     def name(self) -> str:
@@ -69,13 +72,12 @@ class Session:
         path = root / session_name
         try:
             root.mkdir(parents=True, exist_ok=True)
-            if not new_session:
-                path.mkdir(exist_ok=True)
+            if not new_session and path.is_dir():
                 return cls(path)
             while True:
                 try:
                     path.mkdir()
-                    return cls(path)
+                    return cls(path, is_new=True)
                 except FileExistsError:
                     path = root / f"{session_name}_{_last_number(root, session_name) + 1}"
         except OSError as error:
@@ -97,6 +99,11 @@ class Session:
                 f"{nearest(session_name, names)} There are: {listed(names)}."
             )
         return cls(path)
+
+    def discard(self) -> None:
+        """Remove the folder if it was made for the present run, which did not come to anything."""
+        if self.is_new:
+            shutil.rmtree(self.path, ignore_errors=True)
 
     def record(self, pipeline: str, plain: Mapping[str, Any], seed: int) -> None:
         """Write what a run is made from into ``config.toml`` and ``info.txt``.

@@ -18,10 +18,11 @@ _VIEW_FROM = np.array([1.0, -1.1, 0.65]) / np.linalg.norm([1.0, -1.1, 0.65])
 _BACKGROUND = (25, 28, 36)
 _GRID = (58, 63, 76)
 
+_ROW = 3  # so many scenes fit beside one another
 _COLUMN = 4  # so many plots fit one above the other
 _LEGEND = 8  # so many names fit into a plot
 
-Container = rrb.Grid | rrb.Vertical | rrb.Tabs
+Container = rrb.Grid | rrb.Vertical | rrb.Horizontal | rrb.Tabs
 Box = tuple[Array, Array]
 """Lower and upper corner, each of shape (3,)."""
 
@@ -91,26 +92,36 @@ class Layout:
         return "batch" if "batch" in self._timelines else next(iter(self._timelines), TIME)
 
     def blueprint(self) -> rrb.Blueprint:
-        """Return the windows: a grid of scenes, and beside it the plots and the texts."""
+        """Return the windows: the scenes, and beside or below them the plots and the texts.
+
+        Two or three scenes stand in a row above the rest, so that they are easily compared.
+        """
         self.changed = False
         scenes = [self._scene_view(instance_id) for instance_id in sorted(self._scenes)]
         plots = [_plot_view(name, curves) for name, curves in self._plots.items()]
         texts = [self._text_views(name, entities) for name, entities in self._texts.items()]
-        columns: list[Container] = []
+        in_a_row = 1 < len(scenes) <= _ROW
+        parts: list[Container] = []
         shares = []
         if scenes:
-            columns.append(rrb.Grid(*scenes, grid_columns=math.ceil(math.sqrt(len(scenes)))))
+            columns = len(scenes) if in_a_row else math.ceil(math.sqrt(len(scenes)))
+            parts.append(rrb.Grid(*scenes, grid_columns=columns))
             shares.append(3)
         if plots and (len(plots) > _COLUMN or not scenes):
-            columns.append(rrb.Grid(*plots, grid_columns=math.ceil(math.sqrt(len(plots)))))
+            parts.append(rrb.Grid(*plots, grid_columns=math.ceil(math.sqrt(len(plots)))))
             shares.append(3)
             plots = []
         if plots or texts:
-            rows = [*[2] * len(plots), *[1] * len(texts)]
-            columns.append(rrb.Vertical(*plots, *texts, row_shares=rows))
+            sizes = [*[2] * len(plots), *[1] * len(texts)]
+            if in_a_row:
+                parts.append(rrb.Horizontal(*plots, *texts, column_shares=sizes))
+            else:
+                parts.append(rrb.Vertical(*plots, *texts, row_shares=sizes))
             shares.append(2)
         return rrb.Blueprint(
-            rrb.Horizontal(*columns, column_shares=shares),
+            rrb.Vertical(*parts, row_shares=shares)
+            if in_a_row
+            else rrb.Horizontal(*parts, column_shares=shares),
             rrb.TimePanel(timeline=self.timeline, state="collapsed"),
             auto_layout=False,
             auto_views=False,

@@ -169,10 +169,15 @@ def open_partition(path: Path) -> io.FileIO:
             "all fields of this partition cannot be read without it."
         ) from None
     except OSError as error:
-        raise DatasetError(
-            f"The partition {path} cannot be opened: {error.strerror}. With very many partitions, "
-            "raise the limit of open files (ulimit -n)."
-        ) from error
+        raise cannot_open(path, error) from error
+
+
+def cannot_open(path: Path, error: OSError) -> DatasetError:
+    """Return the error for a partition file that the system does not open."""
+    return DatasetError(
+        f"The partition {path} cannot be opened: {error.strerror}. With very many partitions, "
+        "raise the limit of open files (ulimit -n)."
+    )
 
 
 def inspect_open(

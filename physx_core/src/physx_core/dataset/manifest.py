@@ -199,6 +199,10 @@ class Manifest:
                 f"version reads: {error!r}. Delete or rename it, and everything but the info is "
                 "rebuilt from the partition files; no row is lost."
             ) from error
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise DatasetError(f"{path} cannot be read: {error.strerror}.") from error
 
 
 def plain_info(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -84,19 +84,9 @@ class MappedColumn:
     def __init__(self, reader: Reader, mode: str, field: Field, dtype: np.dtype[Any]) -> None:
         self.shape: tuple[int, ...] = (reader.rows(mode), *(field.shape or ()))
         self.dtype = dtype
-        parts, starts = [], []
-        for segment in reader.segments(mode, field.name):
-            shape = (segment.rows, *self.shape[1:])
-            file, offset = segment.open(field.nbytes)
-            with file:
-                if field.nbytes:
-                    mapped = np.memmap(file, field.dtype, "r", offset, shape)
-                    parts.append(np.asarray(mapped))
-                else:
-                    parts.append(np.empty(shape, field.dtype))
-            starts.append(segment.start)
-        self._parts: list[Array] = parts
-        self._starts = np.array([*starts, self.shape[0]])
+        segments = reader.segments(mode, field.name)
+        self._parts = [segment.map(field) for segment in segments]
+        self._starts = np.array([*(segment.start for segment in segments), self.shape[0]])
 
     def gather(self, index: Index, out: Array) -> None:
         """Copy the rows of an index array, all in range, into `out`."""

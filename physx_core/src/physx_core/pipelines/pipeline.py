@@ -52,6 +52,8 @@ class Pipeline(ABC):
     def __enter__(self) -> Self:
         """Open the session and everything that the pipeline works with.
 
+        Where that fails, a session that was made for it is removed.
+
         Raises:
             UsageError: A script without ``if __name__ == "__main__":`` runs in a client.
             PhysxError: Something that the pipeline needs is missing or fails.
@@ -61,9 +63,15 @@ class Pipeline(ABC):
                 "A client imports the script that defines its environment, and the script started "
                 'a pipeline. Put the pipeline under  if __name__ == "__main__":'
             )
-        with contextlib.ExitStack() as resources:
-            self._open(resources)
-            self._resources = resources.pop_all()
+        self.session = None  # type: ignore[assignment]
+        try:
+            with contextlib.ExitStack() as resources:
+                self._open(resources)
+                self._resources = resources.pop_all()
+        except BaseException:
+            if self.session is not None:
+                self.session.discard()
+            raise
         return self
 
     def __exit__(

@@ -112,8 +112,8 @@ class Training(Pipeline):
         self.batch_id = 0
         self._loss_sum = 0.0
         self._epoch_batches = self.data.begin_epoch(self.epoch_id, self.learner.batch_fields)
-        task = f"epoch {self.epoch_id + 1}/{self.epoch_nb}"
-        self.observers.begin(task, self._epoch_batches, "batches")
+        if self.epoch_id == 0:
+            self.observers.begin("training", self.epoch_nb * self._epoch_batches, "batches")
 
     def batch_condition(self) -> bool:
         """Return whether there are batches left in the present epoch."""
@@ -158,12 +158,12 @@ class Training(Pipeline):
             self.validation_loss = values["loss/validation"] = self.validate()
         self.learner.epoch_end()
         self.observers.scalars(values, self.epoch_id, "epoch")
-        self.observers.end()
         if self.network_config.save_each_epoch and self.epoch_id < self.epoch_nb:
             self.save_checkpoint()
 
     def train_end(self) -> None:
         """The last epoch is over: keep the network."""
+        self.observers.end()
         self.save_checkpoint()
 
     def validate(self) -> float:

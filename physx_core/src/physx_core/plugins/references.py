@@ -93,7 +93,8 @@ def _script(kind: str, path: Path) -> ModuleType:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)
     if not path.is_file() or spec is None or spec.loader is None:
-        raise ComponentNotFoundError(kind, str(path), "The file system", [])
+        scripts = [file.name for file in path.parent.glob("*.py")]
+        raise ComponentNotFoundError(kind, path.name, f"The folder {path.parent}", scripts)
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
     sys.path.insert(0, str(path.parent))

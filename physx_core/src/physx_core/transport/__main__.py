@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import faulthandler
 import os
 import signal
 import sys
@@ -18,6 +19,7 @@ def main() -> int:
     parser.add_argument("--connect", metavar="HOST:PORT", required=True, help="the server")
     parser.add_argument("--instance", type=int, help="number of the instance; any by default")
     options = parser.parse_args()
+    faulthandler.enable()  # a crash of an engine says in which step it happened
     token = os.environ.pop(TOKEN_VARIABLE, "")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server decides when a run ends
     try:

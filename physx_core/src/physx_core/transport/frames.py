@@ -164,10 +164,10 @@ class FrameReader:
                 count = connection.recv_into(target)
             except BlockingIOError:
                 return False
-            except ConnectionError as error:
-                raise EOFError from error
+            except OSError as error:
+                raise EOFError(str(error)) from error
             if not count:
-                raise EOFError
+                raise EOFError("end of stream")
             self._socket_may_have_more = count == len(target)
             if direct:
                 self._missing = self._missing[count:]

@@ -102,7 +102,9 @@ class ClientGroup:
             self._serve(0.0)
         while waited := missing():
             self._serve(_TICK)
-            self._check_silent(waited, began)
+            if self._silent(waited, began):
+                self._serve(0.0)  # an answer may have taken long while others had their say
+                self._raise_silent(self._silent(waited, began))
 
     def _serve(self, timeout: float) -> None:
         self.server.pump(timeout)
@@ -184,13 +186,16 @@ class ClientGroup:
             stderr=process.stderr(),
         )
 
-    def _check_silent(self, waited: Sequence[int], began: float) -> None:
-        for number in waited:
-            peer, process = self.server.peers.get(number), self._processes.get(number)
-            since = began if peer is None else max(began, peer.heard)
-            if time.monotonic() - since <= self.config.timeout:
-                continue
-            what = "did not connect" if peer is None else "sent nothing"
+    def _silent(self, waited: Sequence[int], began: float) -> list[int]:
+        """Return those that let the server wait for too long."""
+        limit = time.monotonic() - self.config.timeout
+        peers = ((number, self.server.peers.get(number)) for number in waited)
+        return [number for number, p in peers if max(began, p.heard if p else 0.0) < limit]
+
+    def _raise_silent(self, silent: Sequence[int]) -> None:
+        for number in silent:
+            process = self._processes.get(number)
+            what = "sent nothing" if number in self.server.peers else "did not connect"
             raise ClientError(
                 number,
                 f"{what} for {self.config.timeout:g} s while the server waited for it. If its "

@@ -97,7 +97,7 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
         frame = reader.read(connection)
     except (EOFError, OSError) as error:
         raise ConnectionRefusedByPeerError(
-            f"The server ended the connection or did not answer ({error or 'end of stream'})."
+            f"The server ended the connection or did not answer ({error})."
         ) from error
     if frame is None or frame.kind is not Kind.CHALLENGE:
         raise ConnectionRefusedByPeerError("What answers at that address is no physx server.")

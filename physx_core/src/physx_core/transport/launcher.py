@@ -18,7 +18,8 @@ from physx_core.transport.handshake import TOKEN_VARIABLE
 CLIENT_VARIABLE = "PHYSX_CLIENT"
 """Environment variable that is set in every client process."""
 
-_TAIL = 4096
+_TAIL = 8192
+_LINES = 30
 _TERMINATE_TIME = 0.5
 
 
@@ -94,7 +95,7 @@ class ClientProcess:
         if self._reader is not None and self.exit_status() is not None:
             self._reader.join(0.2)
         lines = self._tail.decode(errors="replace").splitlines()
-        return "\n".join(lines[-20:])
+        return "\n".join(lines[-_LINES:])
 
     def signal_group(self, number: signal.Signals) -> None:
         """Send a signal to the process and those that it started."""

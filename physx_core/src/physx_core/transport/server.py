@@ -127,11 +127,11 @@ class Server:
             return
         try:
             connection, _ = self._listener.accept()
+            peer = Peer(connection, self.token)
         except OSError:  # it was gone before it was accepted
             return
         if len(self._strangers) >= _MAX_STRANGERS:
             self._drop(self._strangers[0])
-        peer = Peer(connection, self.token)
         self._strangers.append(peer)
         self._selector.register(connection, selectors.EVENT_READ, peer)
 
