@@ -29,10 +29,10 @@ from physx_core import (
     Prediction,
     Training,
 )
-from physx_dart.arm import DartArm
+from physx_dart import DartArm
 
 VARIANTS = {"PD alone": "none", "PD + network": "network", "PD + exact model": "model"}
-TRAJECTORIES = (0, 1, 2)
+TRAJECTORIES = (5, 6, 7)
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,11 @@ class ComparedArm(DartArm):
 
     def __init__(self, **kwargs) -> None:
         super().__init__(task="track", **kwargs)
-        self.feedforward = list(VARIANTS.values())[self.instance_id - 1]
+        self.variant, self.feedforward = list(VARIANTS.items())[self.instance_id - 1]
+
+    def init_visualization(self) -> None:
+        self.factory.set_view(self.variant)
+        super().init_visualization()
 
 
 class Tracking(Prediction):

@@ -74,16 +74,24 @@ def nothing_stays_behind(monkeypatch):
     mark = uuid.uuid4().hex
     monkeypatch.setenv("PHYSX_TEST_MARK", mark)
     yield
-    left = []
-    for environ in Path("/proc").glob("[0-9]*/environ"):
-        try:
-            if mark.encode() in environ.read_bytes() and int(environ.parent.name) != os.getpid():
-                left.append((environ.parent / "cmdline").read_bytes())
-        except OSError:
-            continue
+    deadline = time.monotonic() + 2  # a process that is killed takes a moment to go
+    while (left := marked(mark.encode())) and time.monotonic() < deadline:
+        time.sleep(0.05)
     assert not left
     with pytest.raises(ChildProcessError):  # nor is there one that nobody waited for
         os.waitpid(-1, os.WNOHANG)
+
+
+def marked(mark):
+    """Command lines of the other processes with a mark in their environment."""
+    found = []
+    for environ in Path("/proc").glob("[0-9]*/environ"):
+        try:
+            if mark in environ.read_bytes() and int(environ.parent.name) != os.getpid():
+                found.append((environ.parent / "cmdline").read_bytes())
+        except OSError:
+            continue
+    return found
 
 
 def same(a, b):
@@ -423,12 +431,12 @@ def pids(clients):
     return found
 
 
-@pytest.mark.parametrize("what", ["spin", "sleep", "stop"])
+@pytest.mark.parametrize("what", ["spin", "stop"])
 def test_a_client_that_hangs_is_named_at_the_timeout(what):
     kwargs = {"what": what, "who": 2, "method": "never" if what == "stop" else "step"}
-    settings = config("Trouble", num_clients=2, env_kwargs=kwargs, timeout=1.2)
+    settings = config("Trouble", num_clients=2, env_kwargs=kwargs, timeout=2.5)
     with (
-        pytest.raises(ClientError, match=r"Client 2 sent nothing for 1\.2 s") as caught,
+        pytest.raises(ClientError, match=r"Client 2 sent nothing for 2\.5 s") as caught,
         ClientSource(settings, Services(), SEED, run_ahead=0) as clients,
     ):
         clients.batch(4)
@@ -437,11 +445,11 @@ def test_a_client_that_hangs_is_named_at_the_timeout(what):
         began = time.monotonic()
         clients.batch(8)
     assert caught.value.exit_status is None
-    assert 1.1 < time.monotonic() - began < 5
+    assert 2.4 < time.monotonic() - began < 8
 
 
 def test_a_client_that_hangs_before_it_is_ready_is_named():
-    settings = config("Trouble", env_kwargs={"what": "sleep", "method": "create"}, timeout=1.2)
+    settings = config("Trouble", env_kwargs={"what": "sleep", "method": "create"}, timeout=2.5)
     with (
         pytest.raises(ClientError, match="Client 1 sent nothing"),
         ClientSource(settings, Services(), SEED),
@@ -543,10 +551,10 @@ def test_a_refused_prediction_is_the_error_of_the_services():
 def test_a_long_prediction_is_not_taken_for_silence():
     class Slow(Services):
         def predict(self, fields):
-            time.sleep(0.7)
+            time.sleep(0.9)
             return super().predict(fields)
 
-    settings = config("Asking", num_clients=3, timeout=1.0)
+    settings = config("Asking", num_clients=3, timeout=2.5)
     with ClientSource(settings, Slow(), SEED, run_ahead=0) as clients:
         assert len(clients.batch(3)["x"]) == 3
 

@@ -309,8 +309,7 @@ def test_wrong_rows_leave_the_dataset_as_it_is(dataset, folder, case):
 def test_wrong_samples_leave_the_buffer_as_it_is(dataset, case):
     kind, bad = BAD[case]
     good = {"x": np.ones(3), "n": 1}
-    row = 1 if case == "nan" else 0
-    row = 1 if case in ("too large",) else row
+    row = 1 if case in ("nan", "too large") else 0
     dataset.define_fields("training", [Field("x", (3,)), Field("n", (), "int32")])
     dataset.append_sample("training", good)
     sample = {name: values[row] for name, values in bad.items()}

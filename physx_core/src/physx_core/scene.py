@@ -43,6 +43,8 @@ ARRAYS: dict[str, tuple[tuple[int | None, ...], type]] = {
     "orientation": ((4,), np.float32),
     "poses": ((None, 7), np.float64),
     "values": ((None,), np.float64),
+    "eye": ((3,), np.float32),
+    "target": ((3,), np.float32),
 }
 """Options that are arrays: shape (None: any number) and type."""
 
@@ -59,6 +61,7 @@ KINDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "text": (("content",), (*_LOOK,)),
     "scalars": (("labels",), ("values",)),
     "robot": (("urdf", "bodies"), (*_LOOK, "package_dirs", "poses")),
+    "view": (("title",), ("eye", "target")),
 }
 """Kinds of objects: options that must be given when one is added, and those that may be."""
 
@@ -194,6 +197,16 @@ class Factory:
     def update_robot(self, name: str, **changes: Any) -> None:
         """Place a robot's links: ``poses`` (bodies, 7), x, y, z in m and quaternion x, y, z, w."""
         self._update("robot", name, changes)
+
+    def set_view(self, title: str, **camera: ArrayLike) -> None:
+        """Name the environment's window and place its camera; to be called once.
+
+        Args:
+            title: What stands above the window.
+            camera: ``eye`` (3,) and ``target`` (3,), where the camera is and what it looks at, in
+                m; without them it looks at all objects.
+        """
+        self._add("view", "view", title=title, **camera)
 
     def _add(self, kind: str, name: str, **values: Any) -> str:
         if name in self._kinds:

@@ -287,7 +287,7 @@ class ArmEnvironment(Environment):
         if self.task == "track":
             look = {"color": "green", "alpha": 0.3, "poses": poses}
             factory.add_robot("reference", urdf, bodies, package_dirs=packages, **look)
-            factory.add_scalars("tracking_error", ["error of the arm's joints (rad, RMS)"])
+            factory.add_scalars("tracking_error", ["joint error (rad)"])
             content += f", trajectory {self.trajectory}, feed-forward: {self.feedforward}"
         factory.add_text("task", content)
 

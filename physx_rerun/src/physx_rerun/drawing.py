@@ -101,12 +101,15 @@ class Drawing:
             self._frames, self._poses = [], []
 
     def _draw(self, event: Event, times: Times) -> None:
-        if event.kind not in self._ways:
+        if event.kind not in (*self._ways, "view"):
             raise VisualizerError(
                 f'Rerun cannot draw "{event.name}": it is of the unknown kind "{event.kind}". '
                 f"Kinds: {listed(self._ways)}."
             )
         if not self._in_full and event.kind not in ("scalars", "text"):
+            return
+        if event.kind == "view" and event.action == "add":
+            self._layout.set_view(self._id, **event.values)
             return
         if event.action == "add":
             entity = "/".join(rr.escape_entity_path_part(part) for part in event.name.split("/"))
@@ -282,7 +285,7 @@ class Drawing:
     def _scalars(self, drawn: Drawn, changes: dict[str, Any], times: Times) -> None:
         labels = drawn.values["labels"]
         if drawn.is_new:
-            prefix = f"{self._id}: " if self._layout.instance_nb > 1 else ""
+            prefix = f"{self._layout.title(self._id)}: " if self._layout.instance_nb > 1 else ""
             shift = (self._id - 1) * len(labels) if self._layout.instance_nb > 1 else 0
             lines = colors.curves(len(labels), shift)
             names = [prefix + label for label in labels]

@@ -43,6 +43,19 @@ class Layout:
     _plots: dict[str, dict[str, int]] = field(default_factory=dict)
     _texts: dict[str, dict[int, str]] = field(default_factory=dict)
     _timelines: set[str] = field(default_factory=set)
+    _titles: dict[int, str] = field(default_factory=dict)
+    _cameras: dict[int, dict[str, Array]] = field(default_factory=dict)
+
+    def set_view(self, instance_id: int, title: str, **camera: Array) -> None:
+        """Name the window of an instance and place its camera: see `Factory.set_view`."""
+        self._titles[instance_id] = title
+        self._cameras[instance_id] = camera
+        self._kinds.add(("view", title))
+        self.changed = True
+
+    def title(self, instance_id: int) -> str:
+        """Return what an instance is called: its number, if it did not name itself."""
+        return self._titles.get(instance_id, str(instance_id))
 
     def add_object(self, instance_id: int, kind: str, name: str) -> None:
         """Make room for a shape in the scene of an instance."""
@@ -142,16 +155,18 @@ class Layout:
     def _scene_view(self, instance_id: int) -> rrb.Spatial3DView:
         low, high = self._bounds(instance_id)
         size = max(_diagonal((low, high)), 0.2)
-        target = (low + high) / 2
+        camera = self._cameras.get(instance_id, {})
+        target = camera.get("target", (low + high) / 2)
         eye = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=target + 1.1 * size * _VIEW_FROM,
+            position=camera.get("eye", target + 1.1 * size * _VIEW_FROM),
             look_target=target,
             eye_up=(0.0, 0.0, 1.0),
         )
+        default = f"environment {instance_id}" if self.instance_nb > 1 else "environment"
         return rrb.Spatial3DView(
             origin=f"env_{instance_id}",
-            name=f"environment {instance_id}" if self.instance_nb > 1 else "environment",
+            name=self._titles.get(instance_id, default),
             background=rrb.Background(color=_BACKGROUND),
             line_grid=rrb.LineGrid3D(
                 visible=True,

@@ -17,7 +17,7 @@ from physx_core.dataset.manifest import Manifest, plain_info
 from physx_core.dataset.opening import WriterOptions, create, extend
 from physx_core.dataset.reader import Reader
 from physx_core.dataset.report import find_problems, summarize
-from physx_core.dataset.sampling import Batches, Columns
+from physx_core.dataset.sampling import Batches, ColumnCache
 from physx_core.dataset.sealing import cover
 from physx_core.dataset.views import ModeView
 from physx_core.dataset.writer import Writer
@@ -52,7 +52,7 @@ class Dataset:
         self._writer = writer
         self._lock = lock
         self._reader = Reader(directory, manifest)
-        self._columns = Columns(self._reader)
+        self._columns = ColumnCache(self._reader)
         self._appender = Appender(manifest, writer) if writer else None
         self._closed = False
 

@@ -100,7 +100,7 @@ class MappedColumn:
         self.gather(np.arange(start, stop), out)
 
 
-class Columns:
+class ColumnCache:
     """The columns of a dataset, kept from one use to the next."""
 
     def __init__(self, reader: Reader) -> None:
@@ -186,7 +186,7 @@ class Batches:
         reuse: Whether every batch is given in the same arrays.
     """
 
-    columns: Columns
+    columns: ColumnCache
     mode: str
     names: Sequence[str]
     batch_size: int

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from physx_core.dataset.reader import Reader
-from physx_core.dataset.sampling import Columns
+from physx_core.dataset.sampling import ColumnCache
 from physx_core.fields import Array, Field
 
 
@@ -19,7 +19,7 @@ class FieldView:
     Whatever is returned is a copy.
     """
 
-    def __init__(self, reader: Reader, columns: Columns, mode: str, field: Field) -> None:
+    def __init__(self, reader: Reader, columns: ColumnCache, mode: str, field: Field) -> None:
         self.field = field
         self._reader = reader
         self._columns = columns
@@ -99,7 +99,7 @@ class FieldView:
 class ModeView:
     """The fields of one mode by name; iterating gives the names."""
 
-    def __init__(self, reader: Reader, columns: Columns, mode: str) -> None:
+    def __init__(self, reader: Reader, columns: ColumnCache, mode: str) -> None:
         self._reader = reader
         self._columns = columns
         self._mode = mode

@@ -52,9 +52,14 @@ class OpenPartition:
         for name, file in self._files.items():
             file.write(first, rows[name][start : start + count])
         self._sync()
-        for file in self._files.values():
-            file.commit(last)
-        self._sync()
+        try:
+            for file in self._files.values():
+                file.commit(last)
+            self._sync()
+        except BaseException:  # an interrupt, too: the next rows go to the same place
+            for file in self._files.values():
+                file.commit(first)
+            raise
         self.partition.rows = last
 
     def close(self) -> None:
@@ -151,10 +156,9 @@ class Writer:
         if sealed:
             self._seal(mode_name)
         mode = self._manifest.modes[mode_name]
-        partition = self._begin(mode_name, mode)
+        partition = self._open[mode_name] = self._begin(mode_name, mode)
         if sealed:
             write_index(self._directory, self.session, self._manifest)
-        self._open[mode_name] = partition
         return partition
 
     def _begin(self, mode_name: str, mode: Mode) -> OpenPartition:

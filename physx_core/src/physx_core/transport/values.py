@@ -72,8 +72,8 @@ def _tree(value: Any, where: str, blobs: list[bytes]) -> Any:
     if isinstance(value, Path):
         return {"p": str(value)}
     raise UsageError(
-        f"{where} is {reprlib.repr(value)} ({type(value).__name__}), which cannot travel to another "
-        "process. Use numbers, texts, bytes, paths, NumPy arrays, and lists, tuples and "
+        f"{where} is {reprlib.repr(value)} ({type(value).__name__}), which cannot travel to "
+        "another process. Use numbers, texts, bytes, paths, NumPy arrays, and lists, tuples and "
         "dictionaries of those; or run with as_tcp_ip_client=False."
     )
 
