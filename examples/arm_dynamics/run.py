@@ -30,6 +30,7 @@ from physx_core import (
     Training,
 )
 from physx_dart import DartArm
+from physx_rerun import render_picture
 
 VARIANTS = {"PD alone": "none", "PD + network": "network", "PD + exact model": "model"}
 TRAJECTORIES = (5, 6, 7)
@@ -173,8 +174,6 @@ def print_table(errors: dict[int, np.ndarray]) -> float:
 
 def draw(recording: Path, picture: Path, step: int) -> None:
     """Draw the recording without a screen, or say what is missing for it."""
-    from physx_rerun.headless import render_picture
-
     try:
         render_picture(recording, picture, step=step)
         print(f"picture:   {picture}")
