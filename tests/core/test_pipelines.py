@@ -18,6 +18,8 @@ from physx_core import (
     Prediction,
     Training,
 )
+from physx_core.cli import main
+from physx_core.config import read_toml
 from physx_core.errors import (
     CheckpointError,
     ConfigError,
@@ -120,6 +122,16 @@ def test_same_seed_gives_the_same_rows_whatever_the_batches():
     generate(session_name="a")
     generate(session_name="b", batch_nb=10, batch_size=10)
     with Dataset.open("sessions/a") as a, Dataset.open("sessions/b") as b:
+        assert np.array_equal(a["training"]["force"][:], b["training"]["force"][:])
+
+
+def test_the_recorded_configuration_reproduces_the_run():
+    config = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)
+    generate(environment_config=config, session_name="a")
+    recorded = read_toml("sessions/a/config.toml")["data_generation"]
+    assert recorded["environment"]["seed"] is not None
+    assert main(["generate", "--config", "sessions/a/config.toml"]) == 0
+    with Dataset.open("sessions/a") as a, Dataset.open("sessions/a_1") as b:
         assert np.array_equal(a["training"]["force"][:], b["training"]["force"][:])
 
 

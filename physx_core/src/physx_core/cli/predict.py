@@ -15,9 +15,8 @@ def run(words: Sequence[str]) -> None:
     if words and not words[0].startswith("-"):
         session = Path(words.pop(0))
         words += ["--session-dir", str(session.parent), "--session-name", session.name]
-    places = ("environment.environment",)
-    with pipeline_from(Prediction, "predict", places, words) as pipeline:
-        pipeline.execute()
+    pipeline = pipeline_from(Prediction, "predict", ("environment.environment",), words)
+    pipeline.execute()
     print(f"{pipeline.step_id} steps with {pipeline.learner.config.network}")
     if pipeline.record:
         print(f"recorded: {pipeline.session.dataset_dir}")

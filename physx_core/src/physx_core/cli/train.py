@@ -11,8 +11,8 @@ from physx_core.pipelines.training import Training
 
 def run(words: Sequence[str]) -> None:
     """Train as the words say and print the last losses and where the network is."""
-    with pipeline_from(Training, "train", ("dataset.existing_dir",), words) as pipeline:
-        pipeline.execute()
+    pipeline = pipeline_from(Training, "train", ("dataset.existing_dir",), words)
+    pipeline.execute()
     print(f"training loss {pipeline.training_loss:.6g}")
     if not math.isnan(pipeline.validation_loss):
         print(f"validation loss {pipeline.validation_loss:.6g}")

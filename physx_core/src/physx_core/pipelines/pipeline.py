@@ -146,8 +146,10 @@ class Pipeline(ABC):
         return resources.enter_context(source)
 
     def _record_config(self, seed: int) -> None:
+        """Write the options into the session, with the seed that was drawn if none was given."""
         plain = {**to_plain(self), "session_name": self.session.name}
         plain = {name.removesuffix("_config"): value for name, value in plain.items()}
+        (plain if hasattr(self, "seed") else plain["environment"])["seed"] = seed
         self.session.record(self.kind, plain, seed)
 
 
