@@ -118,6 +118,15 @@ class Trouble(Plain):
         Path(os.environ["PHYSX_TEST_CHILD"]).write_text(str(child.pid))
 
 
+class AskingTrouble(Trouble):
+    """Asks the network, but for the instance that makes trouble."""
+
+    def act(self):
+        super().act()
+        if self.instance_id != self.who:
+            self.get_prediction(x=np.array([self.instance_id]))
+
+
 class Bad(Plain):
     """Gives what cannot be stored at one step."""
 
@@ -145,7 +154,11 @@ class Shapes(Environment):
 
 
 class Asking(Plain):
-    """Asks the network in each step, after some steps without."""
+    """Asks the network in each step."""
+
+    def __init__(self, *, delay: float = 0.0, **kwargs):
+        super().__init__(**kwargs)
+        self.delay = delay
 
     def create(self):
         self.kept = self.load_parameters()
@@ -153,6 +166,7 @@ class Asking(Plain):
 
     def step(self):
         x = np.array([self.instance_id, self.step_index], float)
+        time.sleep(self.delay * self.instance_id * self.rng.random())
         predicted = self.get_prediction(x=x, number=self.step_index)
         self.set_training_data(x=predicted["y"])
 

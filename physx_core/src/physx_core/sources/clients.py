@@ -27,8 +27,10 @@ class ClientSource(Source):
     """Has clients make rows, and puts each row where its instance and step say it belongs.
 
     Rows are the same as those of `LocalSource`, bit for bit. Requests of the environments are
-    answered while a batch is waited for. Predictions that several instances ask for at the same
-    moment go through the method ``predict_batch(batch) -> batch`` of the services, if they have it.
+    answered while a batch is waited for. Where the services have a method
+    ``predict_batch(batch) -> batch``, predictions are made once every instance that is at work asks
+    for one, all of them as one batch in the order of the instances: with ``run_ahead=0`` the same
+    batches in every run. Such a network may round other than for single samples.
     """
 
     def __init__(
@@ -123,9 +125,8 @@ class ClientSource(Source):
             }
             count = len(range(start, size, self.instance_nb))
             if count:
-                self._group.server.send(
-                    number, pack(Kind.APPLY, encode(rows, "the prediction"), count)
-                )
+                message = pack(Kind.APPLY, encode(rows, "the prediction"), count)
+                self._group.peer(number).send(message)
 
     def close(self) -> None:
         """Close the environments and end the clients: see `Source.close`."""

@@ -24,6 +24,9 @@ class Answers:
 
     Where the services have a method ``predict_batch(batch) -> batch``, requests of the same fields
     that wait at the same moment go through it as one batch. Otherwise each goes through `predict`.
+
+    Attributes:
+        batches: Whether requests for predictions go through the services as one batch.
     """
 
     def __init__(self, services: Services) -> None:
@@ -36,7 +39,13 @@ class Answers:
         self._predict_batch: Callable[[Batch], Batch] | None = getattr(
             services, "predict_batch", None
         )
+        self.batches = self._predict_batch is not None
         self._waiting: list[tuple[Peer, int, Sample]] = []
+
+    @property
+    def asking(self) -> set[int]:
+        """The instances that wait for a prediction."""
+        return {peer.instance_id for peer, _, _ in self._waiting}
 
     def take(self, peer: Peer, frame: Frame) -> None:
         """Answer a request, or keep it for `predict`.
@@ -59,7 +68,7 @@ class Answers:
 
     def predict(self) -> None:
         """Answer the requests for predictions that wait."""
-        waiting, self._waiting = self._waiting, []
+        waiting, self._waiting = sorted(self._waiting, key=lambda one: one[0].instance_id), []
         groups: dict[Signature | int, list[tuple[Peer, int, Sample]]] = {}
         for place, request in enumerate(waiting):
             key = place if self._predict_batch is None else _signature(request[2])

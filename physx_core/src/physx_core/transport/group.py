@@ -12,7 +12,6 @@ from physx_core.config import EnvironmentConfig
 from physx_core.errors import ClientError, ConfigError
 from physx_core.interfaces.environment import Services
 from physx_core.plugins import reference_of
-from physx_core.transport.frames import Kind, pack
 from physx_core.transport.handshake import TOKEN_VARIABLE
 from physx_core.transport.launcher import ClientProcess, ending, stop
 from physx_core.transport.peer import Peer
@@ -126,8 +125,7 @@ class ClientGroup:
         """
         patience = 0.0
         try:
-            for peer in self.server.peers.values():
-                peer.send(pack(Kind.CLOSE))
+            self.server.end()
             if orderly:
                 self.wait(self._unfinished)
                 patience = _EXIT_TIME
@@ -189,7 +187,8 @@ class ClientGroup:
     def _silent(self, waited: Sequence[int], began: float) -> list[int]:
         """Return those that let the server wait for too long."""
         limit = time.monotonic() - self.config.timeout
-        peers = ((number, self.server.peers.get(number)) for number in waited)
+        numbers = sorted(self.server.holding_up(waited))
+        peers = ((number, self.server.peers.get(number)) for number in numbers)
         return [number for number, p in peers if max(began, p.heard if p else 0.0) < limit]
 
     def _raise_silent(self, silent: Sequence[int]) -> None:

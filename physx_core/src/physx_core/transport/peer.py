@@ -58,6 +58,13 @@ class Peer:
         self._outgoing = bytearray()
 
     @property
+    def is_at_work(self) -> bool:
+        """Whether its environment comes to life or makes rows."""
+        if self.gone or self.finished or self.failure is not None:
+            return False
+        return not self.fields or self.received < self.granted
+
+    @property
     def has_outgoing(self) -> bool:
         """Whether something waits to be sent."""
         return bool(self._outgoing)

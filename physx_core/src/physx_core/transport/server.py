@@ -6,7 +6,7 @@ import secrets
 import selectors
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
@@ -55,6 +55,7 @@ class Server:
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
         self._answers = Answers(services)
         self._setup = setup
+        self._ending = False
         self._strangers: list[Peer] = []
         self._selector = selectors.DefaultSelector()
         self._listener: socket.socket | None = None
@@ -106,12 +107,20 @@ class Server:
                 key.data.flush()
             if events & selectors.EVENT_READ:
                 self._read(key.data)
-        self._answers.predict()
+        if self._answers.asking and not self._expects_more_requests():
+            self._answers.predict()
         self._watch()
 
-    def send(self, instance_id: int, message: bytes) -> None:
-        """Send a message to the client of an instance."""
-        self.peers[instance_id].send(message)
+    @property
+    def asking(self) -> set[int]:
+        """The instances that wait for a prediction."""
+        return self._answers.asking
+
+    def end(self) -> None:
+        """Tell all clients to close their environments."""
+        self._ending = True
+        for peer in self.peers.values():
+            peer.send(pack(Kind.CLOSE))
 
     def close(self) -> None:
         """Close all connections; calling it again does nothing."""
@@ -121,6 +130,29 @@ class Server:
             self._listener.close()
             self._listener = None
         self._selector.close()
+
+    def holding_up(self, waited: Iterable[int]) -> set[int]:
+        """Return those that the server waits for in the end, where it waits for some instances.
+
+        Those of them that wait for a prediction wait for the others that are at work.
+        """
+        waited = set(waited)
+        others = self._at_work() if waited & self.asking else set()
+        return (waited | others) - self.asking
+
+    def _expects_more_requests(self) -> bool:
+        """Return whether a client is at work that may yet ask for a prediction.
+
+        A batch is predicted once every client asks or has nothing to do. So which requests are in
+        a batch depends on the environments, and not on how fast each of them happens to be: the
+        rounding of a network's result may depend on the size of the batch.
+        """
+        batches = self._answers.batches and not self._ending
+        return batches and bool(self._at_work() - self.asking)
+
+    def _at_work(self) -> set[int]:
+        numbers = range(1, self._instance_nb + 1)
+        return {n for n in numbers if n not in self.peers or self.peers[n].is_at_work}
 
     def _accept(self) -> None:
         if self._listener is None:
