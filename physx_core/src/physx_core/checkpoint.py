@@ -6,10 +6,11 @@ network's own library writes the parameters beside it. Nothing in it is code.
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from physx_core.config import NetworkConfig, read_toml, to_plain, write_toml
 from physx_core.errors import CheckpointError, ConfigFileError, listed
 from physx_core.fields import Field
 from physx_core.interfaces.network import Network
+from physx_core.interfaces.optimization import Optimization
 from physx_core.statistics import Normalization
 
 FORMAT_VERSION = 1
@@ -31,6 +33,23 @@ _KEPT = (
 
 
 @dataclass(frozen=True)
+class Progress:
+    """How far a training was when its checkpoint was written.
+
+    Attributes:
+        epoch: Number of epochs that were finished.
+        batch: Number of batches of the next epoch that were finished.
+        batches_read: Number of batches that were read from the dataset, in all epochs.
+        seed: Seed of the training.
+    """
+
+    epoch: int
+    batch: int
+    batches_read: int
+    seed: int
+
+
+@dataclass(frozen=True)
 class Checkpoint:
     """What a checkpoint says of itself.
 
@@ -39,14 +58,14 @@ class Checkpoint:
         network: References and arguments of network and transformation, as in `NetworkConfig`.
         fields: The fields that the network reads and is compared with, by name.
         normalization: Their normalization, by name; empty if nothing was normalized.
-        epoch: Number of epochs that the network was trained for.
+        progress: How far the training was.
     """
 
     path: Path
     network: dict[str, Any]
     fields: dict[str, Field]
-    normalization: dict[str, Normalization] = field(default_factory=dict)
-    epoch: int = 0
+    normalization: dict[str, Normalization]
+    progress: Progress
 
 
 def numbers(network_dir: Path, name: str) -> list[int]:
@@ -62,13 +81,23 @@ def save(
     network_dir: Path,
     config: NetworkConfig,
     network: Network,
+    optimization: Optimization,
     fields: Mapping[str, Field],
     normalization: Mapping[str, Normalization],
-    epoch: int,
+    progress: Progress,
 ) -> Path:
     """Write the next checkpoint ``<network_name>_<number>`` and return its folder.
 
     It appears under its name only when it is complete.
+
+    Args:
+        network_dir: Folder of the checkpoints.
+        config: What network and transformation were made from.
+        network: Its parameters are kept.
+        optimization: Its state is kept, so that the training can be resumed.
+        fields: The dataset's fields.
+        normalization: What the transformation normalizes with.
+        progress: How far the training is.
     """
     number = max(numbers(network_dir, config.network_name), default=-1) + 1
     path = network_dir / f"{config.network_name}_{number}"
@@ -76,13 +105,15 @@ def save(
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     network.save_parameters(partial / network.parameters_file)
+    if optimization.state_file:
+        optimization.save_state(partial / optimization.state_file)
     used = [name for name in (*network.net_fields, *network.opt_fields) if name in fields]
     plain = to_plain(config)
     write_toml(
         partial / DESCRIPTION,
         {
             "format_version": FORMAT_VERSION,
-            "epoch": epoch,
+            "progress": dataclasses.asdict(progress),
             **{key: plain[key] for key in _KEPT if key in plain},
             "fields": [fields[name].to_dict() for name in dict.fromkeys(used)],
             "normalization": {
@@ -140,7 +171,7 @@ def read(path: Path) -> Checkpoint:
             network={key: plain[key] for key in _KEPT if key in plain},
             fields={item.name: item for item in fields},
             normalization={n: Normalization.from_dict(c) for n, c in normalization.items()},
-            epoch=plain["epoch"],
+            progress=Progress(**plain["progress"]),
         )
     except (ConfigFileError, KeyError, TypeError) as error:
         raise CheckpointError(f"{path} is no readable checkpoint: {error}.") from error

@@ -22,8 +22,8 @@ T = TypeVar("T")
 def configuration(cls: type[T]) -> type[T]:
     """Make a frozen dataclass whose constructor names what is wrong with its arguments.
 
-    Field metadata may hold ``minimum`` and ``maximum`` (numbers) and ``choices`` (the only values
-    allowed).
+    Field metadata may hold ``minimum`` and ``maximum`` (numbers), ``choices`` (the only values
+    allowed), and ``recorded`` (False: the option is not part of the configuration as plain data).
     Attribute docstrings become the help texts of the command line.
     """
     return options(dataclass(frozen=True)(cls))
@@ -187,9 +187,13 @@ def to_plain(config: Any) -> dict[str, Any]:
     """Return a configuration as data that TOML can hold; options that are None are left out."""
     return {
         name: _plain_value(f"{type(config).__name__}.{name}", getattr(config, name))
-        for name in (f.name for f in dataclasses.fields(config) if f.init and f.repr)
+        for name in (f.name for f in dataclasses.fields(config) if _is_recorded(f))
         if getattr(config, name) is not None
     }
+
+
+def _is_recorded(option: dataclasses.Field[Any]) -> bool:
+    return option.init and bool(option.metadata.get("recorded", True))
 
 
 def _plain_value(where: str, value: Any) -> Any:

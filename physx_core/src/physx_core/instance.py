@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import inspect
 import traceback
 from collections.abc import Callable, Sequence
@@ -61,7 +60,7 @@ class Instance:
         }
         self._sub_steps = simulations_per_step - 1
         self._max_wrong_samples = max_wrong_samples
-        self._runner: asyncio.Runner | None = None
+        self._runner: Any = None
 
     def open(self, services: Services, draw: bool) -> None:
         """Make the environment and call `create`, `init`, `init_database`, `init_visualization`.
@@ -169,6 +168,8 @@ class Instance:
         """Run a coroutine that `step` returned to its end."""
         if inspect.iscoroutine(result):
             if self._runner is None:
+                import asyncio
+
                 self._runner = asyncio.Runner()
             self._runner.run(result)
 

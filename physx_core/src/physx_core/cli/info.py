@@ -31,7 +31,7 @@ def run(words: Sequence[str]) -> None:
     for path in checkpoints:
         found = checkpoint.read(path)
         print(
-            f"checkpoint {path.name}: {found.network['network']}, {found.epoch} epochs, "
+            f"checkpoint {path.name}: {found.network['network']}, {found.progress.epoch} epochs, "
             f"fields {', '.join(found.fields)}"
         )
 

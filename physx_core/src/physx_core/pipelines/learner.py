@@ -166,28 +166,28 @@ class Learner:
         prediction = network.predict(self.transformation.transform_before_prediction(inputs))
         return network.tensor_to_numpy(self.transformation.transform_before_apply(prediction))
 
-    def save(self, network_dir: Path, epoch: int) -> Path:
+    def save(self, network_dir: Path, progress: checkpoint.Progress) -> Path:
         """Write the next checkpoint and return its folder."""
         return checkpoint.save(
             network_dir,
             self.config,
             self.network,
+            self._trainer(),
             self.fields,
             self.transformation.normalization,
-            epoch,
+            progress,
         )
 
-    def load(self, path: Path) -> checkpoint.Checkpoint:
-        """Read parameters, fields and normalization from a checkpoint's folder.
+    def resume(self, found: checkpoint.Checkpoint) -> None:
+        """Go on exactly where a checkpoint was written; the fields are bound already.
 
         Raises:
-            CheckpointError: It is damaged or of another network.
-            FieldsMismatchError: The network reads other fields.
+            CheckpointError: It is damaged, or of another network or optimization.
         """
-        found = checkpoint.read(path)
-        self.bind(found.fields, found.normalization)
-        self.network.load_parameters(path / self.network.parameters_file)
-        return found
+        self.network.load_parameters(found.path / self.network.parameters_file)
+        optimization = self._trainer()
+        if optimization.state_file:
+            optimization.load_state(found.path / optimization.state_file)
 
 
 def restored(config: NetworkConfig, path: Path) -> Learner:
@@ -199,8 +199,10 @@ def restored(config: NetworkConfig, path: Path) -> Learner:
 
     Raises:
         CheckpointError: The checkpoint is damaged or of another network.
+        FieldsMismatchError: The network reads other fields.
     """
-    kept = dict(checkpoint.read(path).network)
+    found = checkpoint.read(path)
+    kept = dict(found.network)
     if config.network is not None:
         kept |= {"network": config.network, "network_kwargs": config.network_kwargs}
     if config.transformation is not None:
@@ -209,7 +211,8 @@ def restored(config: NetworkConfig, path: Path) -> Learner:
             "transformation_kwargs": config.transformation_kwargs,
         }
     learner = Learner(dataclasses.replace(config, **kept), trains=False)
-    learner.load(path)
+    learner.bind(found.fields, found.normalization)
+    learner.network.load_parameters(path / learner.network.parameters_file)
     learner.network.set_eval()
     return learner
 

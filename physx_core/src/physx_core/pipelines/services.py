@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from physx_core.errors import UsageError
+from physx_core.errors import ConnectionRefusedByPeerError, DatasetError, UsageError
 from physx_core.fields import Batch, Sample
 from physx_core.interfaces.visualizer import Observer
 from physx_core.scene import Event
@@ -65,11 +65,18 @@ class RunServices:
         partial.replace(path)
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return what an instance kept."""
+        """Return what an instance kept.
+
+        Raises:
+            DatasetError: The file is damaged.
+        """
         path = self._parameters_file(instance_id)
         if not path.exists():
             return {}
-        values: dict[str, Any] = decode(path.read_bytes())
+        try:
+            values: dict[str, Any] = decode(path.read_bytes())
+        except ConnectionRefusedByPeerError as error:
+            raise DatasetError(f"{path} is damaged: {error}") from error
         return values
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from physx_core.config import DatasetConfig
 from physx_core.dataset import Dataset
-from physx_core.errors import ConfigError, DatasetError, listed
+from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import Batch, Field
 from physx_core.sources.source import Source
 from physx_core.statistics import Normalization
@@ -18,6 +18,7 @@ class TrainingData:
     Attributes:
         dataset: Where batches are read from, and stored if environments make them.
         source: The environments; None where the dataset alone is read.
+        batches_read: Number of batches that were read from the dataset.
     """
 
     def __init__(
@@ -53,6 +54,7 @@ class TrainingData:
                 "Training.batch_nb is missing: environments make as many batches as it says."
             )
         self.dataset, self.source = dataset, source
+        self.batches_read = 0
         self._config = config
         self._batch_size, self._batch_nb = batch_size, batch_nb
         self._seed = seed
@@ -96,8 +98,14 @@ class TrainingData:
             self.dataset.append(self._mode, batch)
             return batch
         if self._reader is None:
-            raise DatasetError("No epoch has begun.")
+            raise UsageError("next_batch() needs begin_epoch() before it.")
+        self.batches_read += 1
         return next(self._reader)
+
+    def skip(self, batches: int) -> None:
+        """Pass over batches that an earlier part of the training has read."""
+        for _ in range(batches):
+            self.next_batch()
 
     @property
     def produces(self) -> bool:

@@ -1,0 +1,97 @@
+"""A training that was interrupted goes on bit for bit."""
+
+import runpy
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physx_core import Dataset, DatasetConfig, EnvironmentConfig, NetworkConfig, Training
+from physx_core.cli import main
+from physx_core.errors import CheckpointError, ConfigError, SessionError
+
+pytest.importorskip("torch")
+
+SCRIPT = """
+from physx_core import DatasetConfig, NetworkConfig, Training
+
+def training(epochs, **more):
+    network = NetworkConfig(
+        "torch/fc", {"layers": [3, 8, 2], "net_fields": "x", "opt_fields": "y"}, loss="MSELoss",
+        optimizer="Adam", lr=1e-2, optimization_kwargs={
+            "scheduler": "CosineAnnealingLR", "scheduler_kwargs": {"T_max": 10}})
+    return Training(network, DatasetConfig(existing_dir="data", normalize=True), epoch_nb=epochs,
+                    batch_size=7, batch_nb=20, seed=3, **more)
+
+if __name__ == "__main__":
+    training(100_000, session_name="cut").execute()
+"""
+PARAMETERS = "parameters.safetensors"
+
+
+@pytest.fixture
+def training(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((100, 3))
+    with Dataset.create("data") as dataset:
+        dataset.append("training", {"x": x, "y": np.sin(x[:, :2])})
+    Path("script.py").write_text(SCRIPT)
+    return runpy.run_path("script.py", run_name="script")["training"]
+
+
+def parameters(session, number):
+    return Path(f"sessions/{session}/network/network_{number}/{PARAMETERS}").read_bytes()
+
+
+def test_two_halves_equal_the_whole(training):
+    training(6, session_name="whole").execute()
+    training(3, session_name="halves").execute()
+    training(6, session_name="halves", resume=True).execute()
+    assert parameters("whole", 0) == parameters("halves", 1)
+    assert parameters("halves", 0) != parameters("halves", 1)
+    assert [p.name for p in Path("sessions").iterdir() if p.name.startswith("halves")] == ["halves"]
+
+
+def test_ctrl_c_within_an_epoch_and_resume(training):
+    process = subprocess.Popen([sys.executable, "script.py"], stderr=subprocess.PIPE, text=True)
+    stats, deadline = Path("sessions/cut/stats/scalars.csv"), time.monotonic() + 60
+    while not (stats.exists() and stats.stat().st_size > 5000) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, text = process.communicate(timeout=30)
+    assert "KeyboardInterrupt" in text
+    reached = int(stats.read_text().splitlines()[-1].split(",")[1]) // 20 + 2
+    words = [
+        "train",
+        "--config",
+        "sessions/cut/config.toml",
+        "--resume",
+        "--epoch-nb",
+        f"{reached}",
+    ]
+    assert main(words) == 0
+    training(reached, session_name="whole").execute()
+    assert parameters("whole", 0) == parameters("cut", 1)
+
+
+def test_what_cannot_be_resumed(training):
+    with pytest.raises(SessionError, match="no session"):
+        training(1, session_name="none", resume=True).execute()
+    Path("sessions/empty").mkdir(parents=True)
+    with pytest.raises(CheckpointError, match="no checkpoint"):
+        training(1, session_name="empty", resume=True).execute()
+    spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, always_produce=True)
+    options = {"epoch_nb": 1, "batch_nb": 1, "batch_size": 5, "session_name": "online"}
+    Training(NetworkConfig("toy/linear"), None, spring, **options).execute()
+    with pytest.raises(ConfigError, match="cannot be resumed"):
+        Training(NetworkConfig("toy/linear"), None, spring, resume=True, **options).execute()
+    other = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "y"})
+    training(1, session_name="run").execute()
+    data = DatasetConfig(existing_dir="data")
+    with pytest.raises(CheckpointError, match="parameters.npz"):
+        Training(other, data, session_name="run", resume=True, epoch_nb=2, batch_size=5).execute()
