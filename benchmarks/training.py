@@ -84,9 +84,10 @@ def main() -> None:
                         training.optimize()
                         training.batch_count()
                         training.batch_end()
+                    trained = training.batch_id
                     training.epoch_count()
                     training.epoch_end()
-                    return training.batch_id
+                    return trained
 
                 candidates = {"plain torch loop": plain_loop(layers, x, y, batches), "physx": epoch}
                 measured = rates(candidates, ROUNDS)
