@@ -58,11 +58,6 @@ def abandoned(folder, copy):
     return copy
 
 
-@pytest.fixture
-def folder(tmp_path):
-    return tmp_path / "data"
-
-
 # The format -----------------------------------------------------------------------------------
 
 

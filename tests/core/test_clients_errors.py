@@ -1,0 +1,135 @@
+"""ClientSource: errors of an environment are those of LocalSource."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from physx_core.errors import (
+    EnvironmentFailedError,
+    FieldShapeError,
+    FieldsMismatchError,
+    FieldTypeError,
+    NotFiniteError,
+    UnknownFieldError,
+    UnknownOptionError,
+    WrongSamplesError,
+)
+
+
+@pytest.fixture
+def errors_of(local, clients):
+    """Return the errors of both sources, and how many rows each gave before."""
+
+    def run(make, environment, sizes, options):
+        rows = 0
+        with pytest.raises(Exception) as caught, make(environment, **options) as source:
+            for size in sizes:
+                rows += len(source.batch(size)["step"])
+        return caught.value, rows
+
+    def errors(environment, sizes, **options):
+        return [run(make, environment, sizes, options) for make in (local, clients)]
+
+    return errors
+
+
+@pytest.mark.parametrize("method", ["__init__", "create", "init_database", "step", "close"])
+def test_an_exception_comes_back_with_place_and_traceback(errors_of, method):
+    kwargs = {"what": "fail", "method": method, "who": 2}
+    (local, rows), (error, client_rows) = errors_of(
+        "Trouble", [4, 4], num_clients=2, env_kwargs=kwargs
+    )
+    assert type(error) is type(local) is EnvironmentFailedError
+    assert str(error) == str(local)
+    assert (error.instance_id, error.method) == (2, method)
+    assert error.step == local.step
+    assert 'raise RuntimeError("no more beans")' in error.remote_traceback
+    assert rows == client_rows
+
+
+@pytest.mark.parametrize("method", ["__init__", "create", "step"])
+def test_an_error_of_physx_comes_back_as_itself(errors_of, method):
+    kwargs = {"what": "fail_known", "method": method}
+    (local, _), (error, _) = errors_of("Trouble", [8], env_kwargs=kwargs)
+    assert type(error) is type(local) is FieldShapeError
+    assert str(error) == str(local)
+    assert vars(error) == vars(local)
+    assert error.__notes__ == ["a note", f"in {method}() of instance 1"]
+
+
+@pytest.mark.parametrize(
+    ("value", "field", "expected"),
+    [
+        (np.zeros(3), "x", FieldShapeError),
+        (np.array([1, np.nan]), "x", NotFiniteError),
+        (np.array([1, -np.inf]), "x", NotFiniteError),
+        (np.array([1j, 2]), "x", FieldTypeError),
+        ([[1, 2], [3]], "x", FieldShapeError),
+        (1.0, "velocity", UnknownFieldError),
+    ],
+)
+def test_data_that_cannot_be_stored_is_refused_as_in_process(errors_of, value, field, expected):
+    kwargs = {"value": value, "field": field, "at": 7, "who": 2}
+    (local, rows), (error, client_rows) = errors_of(
+        "Bad", [5, 5, 5, 5], num_clients=2, env_kwargs=kwargs
+    )
+    assert type(error) is type(local) is expected
+    assert str(error) == str(local)
+    assert (error.field, error.instance_id, error.step) == (field, 2, 7)
+    assert rows == client_rows == 15
+
+
+def test_rows_before_a_bad_one_arrive_though_they_were_made_together(clients):
+    kwargs = {"value": np.full(2, np.nan), "at": 50}
+    with clients("Bad", run_ahead=1000, env_kwargs=kwargs) as source:
+        assert source.batch(49)["step"][-1] == 48
+        assert source.batch(1)["step"] == [49]
+        with pytest.raises(NotFiniteError, match="Instance 1, step 50"):
+            source.batch(1)
+
+
+def test_an_error_in_a_row_that_nobody_asked_for_is_no_error(clients):
+    kwargs = {"value": np.full(2, np.nan), "at": 5}
+    with clients("Bad", run_ahead=1000, env_kwargs=kwargs) as source:
+        assert len(source.batch(5)["x"]) == 5
+        time.sleep(0.1)
+
+
+def test_a_missing_field_and_wrong_samples_are_as_in_process(errors_of):
+    (local, _), (error, _) = errors_of(
+        "Walk", [3], env_kwargs={"refuse": 1}, max_wrong_samples_per_step=4
+    )
+    assert type(error) is WrongSamplesError
+    assert str(error) == str(local)
+    (local, _), (error, _) = errors_of("Walk", [3], env_kwargs={"speed": 1})
+    assert type(error) is type(local) is UnknownOptionError
+    assert str(error) == str(local)
+    assert vars(error) == vars(local)
+
+
+def test_open_shapes_must_be_the_same_in_all_instances(errors_of):
+    (local, _), (error, _) = errors_of("Shapes", [1, 1], num_clients=2)
+    assert type(error) is type(local) is FieldShapeError
+    assert str(error) == str(local)
+    assert vars(error) == vars(local)
+
+
+def test_instances_define_the_same_fields(clients):
+    with (
+        pytest.raises(FieldsMismatchError, match="Instances 1 and 2") as caught,
+        clients("Names", num_clients=2),
+    ):
+        pass
+    assert set(caught.value.differences) == {"x1", "x2"}
+
+
+def test_an_environment_cannot_hide_a_row_that_is_not_finite(clients):
+    with (
+        pytest.raises(NotFiniteError, match="Instance 1, step 1"),
+        clients("Stubborn") as source,
+    ):
+        source.batch(1)
+        source.batch(9)

@@ -1,0 +1,197 @@
+"""ClientSource: what environments ask for, and predictions that are applied to them."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from physx_core.errors import ClientError, EnvironmentFailedError, UsageError
+
+
+@pytest.fixture
+def batch_services(services):
+    """The services, predicting several samples at once; `asked` tells the instances."""
+
+    def predict(fields):
+        services.asked.append(str(int(fields["x"][0])))
+        return {"y": 2 * fields["x"]}
+
+    def predict_batch(batch):
+        services.asked.append(" ".join(str(int(one)) for one in batch["x"][:, 0]))
+        return {"y": 2 * batch["x"]}
+
+    services.predict, services.predict_batch = predict, predict_batch
+    return services
+
+
+# What environments ask for ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["services", "batch_services"])
+def test_predictions_are_answered(clients, kind, request):
+    services = request.getfixturevalue(kind)
+    with clients("Asking", num_clients=3, run_ahead=0) as source:
+        rows = source.batch(30)["x"]
+    expected = [[2 * (row % 3 + 1), 2 * (row // 3)] for row in range(30)]
+    assert rows.tolist() == expected
+    assert "".join(map(str, services.asked)).count("1") >= 10
+
+
+def test_requests_of_all_instances_are_one_batch_whatever_their_speed(clients, batch_services):
+    with clients("Asking", num_clients=3, env_kwargs={"delay": 0.01}, run_ahead=0) as source:
+        for size in (1, 30, 2):
+            source.batch(size)
+    assert batch_services.asked == ["1"] + 10 * ["1 2 3"] + ["2 3"]
+
+
+def test_who_keeps_a_batch_of_requests_waiting_is_named(clients, batch_services):
+    kwargs = {"what": "sleep", "who": 2, "at": 1}
+    settings = {"num_clients": 2, "env_kwargs": kwargs, "timeout": 2.5}
+    with (
+        pytest.raises(ClientError, match="Client 2 sent nothing"),
+        clients("AskingTrouble", run_ahead=10, **settings) as source,
+    ):
+        source.batch(1)
+        source.batch(2)
+
+
+def test_a_refused_prediction_is_the_error_of_the_services(local, clients, services):
+    def predict(fields):
+        raise UsageError("there is no network")
+
+    services.predict = predict
+    for make in (local, clients):
+        with (
+            pytest.raises(UsageError, match="there is no network") as caught,
+            make("Asking", num_clients=2) as source,
+        ):
+            source.batch(4)
+        assert caught.value.__notes__ == ["in step() of instance 1"]
+
+
+def test_a_long_prediction_is_not_taken_for_silence(clients, services):
+    quick = services.predict
+
+    def predict(fields):
+        time.sleep(0.9)
+        return quick(fields)
+
+    services.predict = predict
+    with clients("Asking", num_clients=3, timeout=2.5, run_ahead=0) as source:
+        assert len(source.batch(3)["x"]) == 3
+
+
+def test_an_exception_of_the_network_is_raised_as_it_is(clients, services):
+    def predict(fields):
+        raise ZeroDivisionError("in the network")
+
+    services.predict = predict
+    with (
+        pytest.raises(ZeroDivisionError, match="in the network"),
+        clients("Asking", num_clients=2) as source,
+    ):
+        source.batch(4)
+
+
+def test_parameters_are_kept_and_given_back(clients, services):
+    for _ in range(2):
+        with clients("Asking", num_clients=2):
+            pass
+    assert set(services.kept) == {1, 2}
+    for number in (1, 2):
+        kept = services.kept[number]
+        assert kept["instance"] == kept["kept"]["instance"] == number
+        assert kept["table"].tolist() == [0, 1, 2]
+        assert kept["kept"]["kept"] == {}
+
+
+def test_drawing_events_arrive_exactly(local, clients, services):
+    shown = []
+    for make in (local, clients):
+        services.shown.clear()
+        with make("Drawing", num_clients=2, visualizer="any") as source:
+            source.batch(6)
+        shown.append(
+            [one for number in (1, 2) for one in services.shown if one[0] == number and one[1] < 3]
+        )
+    assert len(shown[0]) == len(shown[1]) == 8
+    for ours, theirs in zip(*shown, strict=True):
+        assert ours[:2] == theirs[:2]
+        for a, b in zip(ours[2], theirs[2], strict=True):
+            assert (a.action, a.kind, a.name) == (b.action, b.kind, b.name)
+            assert a.values.keys() == b.values.keys()
+            same_arrays(a.values, b.values)
+
+
+def same_arrays(a, b):
+    for name, value in a.items():
+        if isinstance(value, np.ndarray):
+            assert value.dtype == b[name].dtype
+            assert value.tobytes() == b[name].tobytes()
+        else:
+            assert value == b[name]
+
+
+def test_options_arrive_exactly(clients, services):
+    options = {
+        "numbers": [0.1, 1e300, 2**70, -1, True, None],
+        "pair": (1, (2.5, "x")),
+        3: {"array": np.arange(1_000_000, dtype=np.float32).reshape(1000, 1000)},
+        "scalar": np.int16(7),
+        "bytes": bytes(range(256)),
+    }
+    with clients("Echo", env_kwargs={"options": options}):
+        pass
+    back = services.kept[1]["options"]
+    assert back[3]["array"].dtype == np.float32
+    assert np.array_equal(back[3].pop("array"), options[3].pop("array"))
+    assert back == options
+    assert [type(value) for value in back["numbers"]] == [float, float, int, int, bool, type(None)]
+    assert type(back["pair"]) is tuple
+    assert type(back["scalar"]) is np.int16
+
+
+def test_options_that_cannot_travel_are_named_before_anything_starts(clients):
+    message = r"env_kwargs'\]\['options'\]\['deep'\].*cannot travel"
+    kwargs = {"options": {"deep": object()}}
+    with pytest.raises(UsageError, match=message), clients("Echo", env_kwargs=kwargs):
+        pass
+
+
+# Predictions that are applied -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("instances", [1, 2, 3])
+def test_predictions_are_applied_to_the_instance_and_row_they_belong_to(local, clients, instances):
+    results = []
+    for make, options in ((local, {}), (clients, {"run_ahead": 0})):
+        rows, count = [], 0
+        with make("Applied", num_clients=instances, **options) as source:
+            for size in (1, 2, 1, 5, 4):
+                rows.append(source.batch(size)["x"].copy())
+                source.apply({"y": np.arange(count, count + size, dtype=float)[:, None]})
+                count += size
+            rows.append(source.batch(2 * instances)["x"].copy())
+        results.append(np.concatenate(rows))
+    assert np.array_equal(*results)
+
+
+def test_an_error_while_a_prediction_is_applied_comes_back(clients):
+    kwargs = {"what": "fail", "method": "apply_prediction"}
+    for go_on in (True, False):
+        with (
+            pytest.raises(EnvironmentFailedError, match=r"apply_prediction\(\) at step 1"),
+            clients("Trouble", env_kwargs=kwargs, run_ahead=0) as source,
+        ):
+            source.batch(1)
+            source.apply({"y": np.zeros(1)})
+            if go_on:
+                source.batch(1)
+
+
+def test_predictions_cannot_be_applied_to_clients_that_run_ahead(clients):
+    with clients("Applied") as source, pytest.raises(UsageError, match="run_ahead=0"):
+        source.batch(1)
+        source.apply({"y": np.zeros(1)})

@@ -1,0 +1,103 @@
+"""Creating, opening and closing: folders, locks, options, and what is kept about a dataset."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from physx_core import Dataset, Field
+from physx_core.errors import (
+    ConfigError,
+    DatasetError,
+    DatasetLockedError,
+    DatasetNotFoundError,
+    UsageError,
+)
+
+ROWS = {"x": np.ones((2, 3)), "n": np.array([1, 2], "int32")}
+
+
+def test_there_is_a_dataset_already(dataset, folder):
+    dataset.close()
+    with pytest.raises(DatasetError, match="already"):
+        Dataset.create(folder)
+
+
+def test_a_session_folder_will_do(tmp_path):
+    Dataset.create(tmp_path / "session" / "dataset").close()
+    Dataset.open(tmp_path / "session").close()
+
+
+def test_not_found_says_what_is_there(tmp_path):
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(DatasetNotFoundError, match=r"notes\.txt"):
+        Dataset.open(tmp_path)
+    with pytest.raises(DatasetNotFoundError, match=r"does not exist.*notes\.txt"):
+        Dataset.open(tmp_path / "missing")
+
+
+def test_two_writers_are_refused_and_readers_are_not(dataset, folder):
+    dataset.append("training", {"x": np.arange(3.0)})
+    with pytest.raises(DatasetLockedError, match=f"Process {os.getpid()}"):
+        Dataset.open(folder, writable=True)
+    with Dataset.open(folder) as reader:
+        assert_array_equal(reader["training"]["x"][:], np.arange(3.0))
+        dataset.append("training", {"x": np.arange(3.0, 9.0)})
+        assert reader.num_samples("training") == 3
+        reader.refresh()
+        assert_array_equal(reader["training"]["x"][:], np.arange(9.0))
+        dataset.close()
+        assert_array_equal(reader["training"]["x"][:], np.arange(9.0))
+    Dataset.open(folder, writable=True).close()
+
+
+def test_a_reader_cannot_write_and_a_closed_one_does_nothing(dataset, folder):
+    dataset.append("training", ROWS)
+    dataset.close()
+    dataset.close()
+    assert not dataset.writable
+    with pytest.raises(UsageError, match="closed"):
+        dataset.append("training", ROWS)
+    with pytest.raises(UsageError, match="closed"):
+        dataset["training"]
+    with Dataset.open(folder) as reader:
+        for write in (
+            lambda: reader.append("training", ROWS),
+            lambda: reader.append_sample("training", ROWS),
+            lambda: reader.define_fields("training", [Field("x", (3,))]),
+            lambda: reader.update_info(a=1),
+            reader.flush,
+        ):
+            with pytest.raises(UsageError, match="writable=True"):
+                write()
+
+
+@pytest.mark.parametrize("options", [{"session": "a/b"}, {"session": ""}, {"max_file_size": 0}])
+def test_options_are_checked(folder, options):
+    with pytest.raises(ConfigError):
+        Dataset.create(folder, **options)
+    assert not folder.exists()
+
+
+def test_a_folder_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(DatasetError, match="cannot be stored"):
+        Dataset.create(tmp_path / "file" / "data")
+
+
+def test_info_is_kept(folder):
+    with Dataset.create(folder, info={"seed": 3}) as dataset:
+        dataset.update_info(
+            environment=Dataset, kwargs={"a": (1, 2.5), "b": np.arange(2), "p": Path("x")}
+        )
+        with pytest.raises(ConfigError):
+            dataset.update_info(bad=object())
+    with Dataset.open(folder) as dataset:
+        assert dataset.info == {
+            "seed": 3,
+            "environment": "physx_core.dataset.dataset:Dataset",
+            "kwargs": {"a": [1, 2.5], "b": [0, 1], "p": "x"},
+        }
+        assert set(dataset.versions) == {"python", "physx-core", "numpy", "h5py"}

@@ -1,0 +1,99 @@
+"""Frames that are cut anywhere, and errors that travel in them."""
+
+from __future__ import annotations
+
+import socket
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from physx_core.errors import (
+    ConfigError,
+    ConnectionRefusedByPeerError,
+    FieldShapeError,
+    UnknownOptionError,
+)
+from physx_core.transport.failures import decode_error, encode_error
+from physx_core.transport.frames import HEADER, FrameReader, Kind, pack
+
+# Frames -----------------------------------------------------------------------------------------
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.lists(st.tuples(st.sampled_from(Kind), st.binary(max_size=300), st.integers(0, 2**64 - 1))),
+    st.lists(st.integers(1, 200), min_size=1),
+)
+def test_frames_arrive_whole_however_they_are_cut(frames, cuts):
+    here, there = socket.socketpair()
+    with here, there:
+        there.setblocking(False)
+        reader, received = FrameReader(300), []
+        data = b"".join(pack(*frame) for frame in frames)
+        turn = 0
+        while data:
+            size = cuts[turn % len(cuts)]
+            here.sendall(data[:size])
+            data, turn = data[size:], turn + 1
+            while (frame := reader.read(there)) is not None:
+                received.append((frame.kind, bytes(frame.payload), frame.number))
+        assert received == frames
+        here.close()
+        with pytest.raises(EOFError):
+            reader.read(there)
+
+
+def test_large_frames_arrive_between_small_ones():
+    here, there = socket.socketpair()
+    with here, there:
+        large = np.arange(300_000).tobytes()
+        data = [b"a", large, b"", large[:40_000], b"z"]
+        sender = threading.Thread(
+            target=lambda: [here.sendall(pack(Kind.ROWS, part)) for part in data]
+        )
+        sender.start()
+        reader = FrameReader(1 << 30)
+        assert [bytes(reader.read(there).payload) for _ in data] == data
+        sender.join()
+        assert not reader.may_have_more
+
+
+@pytest.mark.parametrize("header", [(11, 1, 0, 0), (5, 99, 0, 0), (5, 1, 1, 0)])
+def test_a_bad_header_is_refused_before_anything_is_allocated(header):
+    here, there = socket.socketpair()
+    with here, there:
+        here.sendall(HEADER.pack(*header))
+        with pytest.raises(ConnectionRefusedByPeerError, match="no message of physx"):
+            FrameReader(10).read(there)
+
+
+# Errors -----------------------------------------------------------------------------------------
+
+
+def test_errors_come_back_as_what_they_were():
+    error = FieldShapeError("wrong", field="x", instance_id=2, step=5)
+    error.add_note("here")
+    back = decode_error(encode_error(error))
+    assert type(back) is FieldShapeError
+    assert str(back) == str(error) == "Instance 2, step 5: wrong"
+    assert vars(back) == vars(error)
+    assert "FieldShapeError" in str(back.__cause__)
+    back = decode_error(encode_error(UnknownOptionError("Thing", ["colour"], ["color"])))
+    assert type(back) is UnknownOptionError
+    assert (back.owner, back.unknown, back.known) == ("Thing", ["colour"], ["color"])
+
+
+class PluginsOwnError(ConfigError):
+    """Unknown where the server runs."""
+
+
+def test_an_error_class_of_a_plugin_comes_back_as_its_base():
+    error = PluginsOwnError("mine")
+    error.thing = object()
+    back = decode_error(encode_error(error))
+    assert type(back) is ConfigError
+    assert str(back) == "mine"
+    assert vars(back) == {}

@@ -1,0 +1,226 @@
+"""Client processes: what they see, started by hand, and how they and their server end."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from physx_core.errors import ClientError, ConfigError, ConnectionRefusedByPeerError
+from physx_core.transport.client import run_client
+from physx_core.transport.launcher import ClientProcess, stop
+
+ENVS = Path(__file__).with_name("transport_envs.py")
+
+
+def test_what_a_client_process_sees(clients, services, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    with clients("Surroundings"):
+        pass
+    seen = services.kept[1]
+    assert seen["client"] == "1"
+    assert seen["token"] is None
+    assert seen["threads"] == "1"
+    assert seen["directory"] == str(Path.cwd())
+    assert b"--instance\x001" in seen["command"]
+    assert not [name for name in seen["modules"] if name.startswith(("physx_core.cli", "h5py"))]
+    assert "physx_core.pipelines" not in seen["modules"]
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    with clients("Surroundings"):
+        assert services.kept[1]["threads"] == "2"
+
+
+def test_the_token_is_not_on_the_command_line():
+    process = ClientProcess(1, "127.0.0.1:1", "very secret token")
+    process.start()
+    try:
+        command = Path(f"/proc/{process.pid}/cmdline").read_bytes()
+    finally:
+        stop([process], 5.0)
+    assert b"secret" not in command
+
+
+def test_stop_ends_what_ignores_a_polite_signal(clients, services, tmp_path):
+    script = tmp_path / "stubborn.py"
+    script.write_text(
+        "import signal, time\n"
+        "from physx_core import Environment\n"
+        "class Stubborn(Environment):\n"
+        "    def create(self):\n"
+        "        signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+        "        self.save_parameters(ready=True)\n"
+        "        time.sleep(60)\n"
+    )
+    began = time.monotonic()
+    services.save_parameters = lambda *args: (_ for _ in ()).throw(KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt), clients(f"{script}:Stubborn"):
+        pass
+    assert time.monotonic() - began < 20
+
+
+HAND = """
+import os, sys, time
+from physx_core.errors import PhysxError
+from physx_core.transport.client import run_client
+for _ in range(500):
+    try:
+        status = run_client(sys.argv[1], os.environ["PHYSX_TOKEN"])
+    except PhysxError:
+        time.sleep(0.02)
+    else:
+        sys.exit(status)
+"""
+
+
+@contextlib.contextmanager
+def hands(count, port):
+    """Start clients that connect once a server listens."""
+    command = [sys.executable, "-c", HAND, f"127.0.0.1:{port}"]
+    processes = [subprocess.Popen(command) for _ in range(count)]
+    try:
+        yield processes
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def by_hand(clients, monkeypatch, port):
+    """Return a source that waits at the port for clients with the token."""
+    monkeypatch.setenv("PHYSX_TOKEN", "a token for this test")
+    return functools.partial(clients, "Plain", launch=False, port=port, timeout=20.0)
+
+
+def test_clients_started_by_hand_join_with_the_token(by_hand, port):
+    with hands(2, port) as processes:
+        with by_hand(num_clients=2) as source:
+            batch = source.batch(6)
+        assert [process.wait(10) for process in processes] == [0, 0]
+    assert list(batch["env_id"]) == [1, 2] * 3
+    assert list(batch["step"]) == [0, 0, 1, 1, 2, 2]
+
+
+def test_a_client_that_was_started_by_hand_and_ends_is_named(by_hand, port):
+    with (
+        hands(1, port) as processes,
+        pytest.raises(ClientError, match="Client 1 closed the connection"),
+        by_hand() as source,
+    ):
+        source.batch(1)
+        processes[0].kill()
+        while True:
+            source.batch(1)
+
+
+def test_clients_started_by_hand_need_a_token(clients, monkeypatch):
+    monkeypatch.delenv("PHYSX_TOKEN", raising=False)
+    with pytest.raises(ConfigError, match="PHYSX_TOKEN"), clients("Plain", launch=False):
+        pass
+
+
+def test_a_client_without_a_place_is_told_so(by_hand, port):
+    errors = []
+
+    def join():
+        for wanted in (None, 1, 2):
+            with pytest.raises(ConnectionRefusedByPeerError) as caught:
+                run_client(f"127.0.0.1:{port}", "a token for this test", wanted)
+            errors.append(str(caught.value))
+
+    with hands(1, port), by_hand() as source:
+        thread = threading.Thread(target=join)
+        thread.start()
+        while thread.is_alive():
+            source.batch(1)
+            time.sleep(0.011)
+    assert ["no place for instance" in error for error in errors] == [True] * 3
+
+
+SERVER = """
+import sys, time
+from pathlib import Path
+from physx_core.config import EnvironmentConfig
+from physx_core.sources.clients import ClientSource
+
+class Services:
+    def predict(self, fields): return fields
+    def save_parameters(self, instance_id, values): pass
+    def load_parameters(self, instance_id): return {{}}
+    def show(self, instance_id, step, events): pass
+
+config = EnvironmentConfig({environment!r}, env_kwargs={kwargs!r}, num_clients=2)
+with ClientSource(config, Services(), [0]) as source:
+    Path("ready").write_text(source.batch(2) and "yes")
+    while True:
+        source.batch(2)
+"""
+
+
+def start_server(name, **kwargs):
+    Path("server.py").write_text(SERVER.format(environment=f"{ENVS}:{name}", kwargs=kwargs))
+    server = subprocess.Popen(
+        [sys.executable, "server.py"], stderr=subprocess.PIPE, start_new_session=True
+    )
+    deadline = time.monotonic() + 20
+    while not Path("ready").exists():
+        assert server.poll() is None, server.stderr.read().decode()
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    return server
+
+
+def children_of(parent):
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            text = stat.read_text()
+        except OSError:
+            continue
+        if int(text.rpartition(")")[2].split()[1]) == parent:
+            found.append(int(stat.parent.name))
+    return found
+
+
+def alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def gone_after(pids, seconds):
+    deadline = time.monotonic() + seconds
+    while any(map(alive, pids)) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return not any(map(alive, pids))
+
+
+def test_ctrl_c_ends_server_and_clients():
+    server = start_server("Walk", delay=0.01)
+    clients = children_of(server.pid)
+    assert len(clients) == 2
+    os.killpg(server.pid, signal.SIGINT)
+    error = server.communicate(timeout=10)[1].decode()
+    assert error.strip().endswith("KeyboardInterrupt")
+    assert gone_after(clients, 0.1)
+
+
+@pytest.mark.parametrize("name", ["Walk", "Trouble"])
+def test_clients_end_when_their_server_is_killed(name):
+    # Trouble: within a step that takes a minute
+    kwargs = {"what": "sleep", "at": 2} if name == "Trouble" else {}
+    server = start_server(name, **kwargs)
+    clients = children_of(server.pid)
+    assert len(clients) == 2
+    server.kill()
+    server.communicate()
+    assert gone_after(clients, 2.5)
