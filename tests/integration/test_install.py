@@ -28,7 +28,7 @@ def empty(tmp_path, run, wheels, root):
 
     def install(*names):
         files = [next(wheels.glob(f"{name}-*.whl")) for name in names]
-        constraints = ("-c", root / "constraints.txt", "--find-links", wheels)
+        constraints = ("-c", root / "constraints.txt")
         quiet = ("--quiet", "--disable-pip-version-check")
         run("-m", "pip", "install", *quiet, *constraints, *files, python=python)
         return python
