@@ -48,7 +48,7 @@ class Spring(Environment):
         super().__init__(**kwargs)
         self.mass, self.stiffness, self.damping = mass, stiffness, damping
         self.period = period
-        self.predicted = np.zeros(2)
+        self.predicted: Array | None = None
 
     def create(self) -> None:
         """Put the mass at a random place."""
@@ -65,11 +65,12 @@ class Spring(Environment):
         )
 
     def init_visualization(self) -> None:
-        """Draw the mass, the spring and the predicted mass."""
+        """Draw the mass and the spring."""
         if self.factory is not None:
-            self.factory.add_sphere("mass", 0.1, color="orange")
-            self.factory.add_sphere("prediction", 0.1, color="blue", alpha=0.4)
-            self.factory.add_lines("spring", [[-3, 0, 0], [0, 0, 0]], color="gray")
+            title = f"spring {self.instance_id}"
+            self.factory.set_view(title, eye=[-1.5, -6, 1.5], target=[-1.5, 0, 0])
+            self.factory.add_sphere("mass", 0.2, color="orange")
+            self.factory.add_lines("spring", [[-3, 0, 0], [0, 0, 0]], color="gray", size=0.02)
 
     def step(self) -> None:
         """Move the mass by one period."""
@@ -84,12 +85,16 @@ class Spring(Environment):
             self._draw(self.factory, following[0])
 
     def apply_prediction(self, prediction: Batch) -> None:
-        """Remember the predicted state, which is drawn beside the real one."""
-        self.predicted = next(iter(prediction.values()))
+        """Draw the predicted mass, translucent, with the next step."""
+        if self.factory is not None:
+            if self.predicted is None:
+                self.factory.add_sphere("prediction", 0.2, color="blue", alpha=0.4)
+            self.predicted = next(iter(prediction.values()))
 
     def _draw(self, factory: Factory, position: float) -> None:
         factory.update_sphere("mass", position=[position, 0, 0])
-        factory.update_sphere("prediction", position=[self.predicted[0], 0, 0])
+        if self.predicted is not None:
+            factory.update_sphere("prediction", position=[self.predicted[0], 0, 0])
         factory.update_lines("spring", positions=[[-3, 0, 0], [position, 0, 0]])
         self.update_visualization()
 
