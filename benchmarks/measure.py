@@ -5,25 +5,41 @@ from __future__ import annotations
 import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 
-def rates(candidates: Mapping[str, Callable[[], int]], rounds: int) -> dict[str, list[float]]:
+def rates(
+    candidates: Mapping[str, Callable[[], int | Iterator[int]]], rounds: int
+) -> dict[str, list[float]]:
     """Return units per second of each candidate in each round.
 
     Args:
-        candidates: Name to a function that does some units of work and returns how many.
+        candidates: Name to a function that does some units of work and returns how many. A
+            generator function prepares the work until its first ``yield``, does it until the
+            second one, which yields the units, and cleans up after that.
         rounds: How many times each runs; one more round before is not counted.
     """
     measured: dict[str, list[float]] = {name: [] for name in candidates}
     for count in range(rounds + 1):
         for name, work in candidates.items():
-            begin = time.perf_counter()
-            units = work()
-            rate = units / (time.perf_counter() - begin)
+            units, seconds = _timed(work)
             if count:
-                measured[name].append(rate)
+                measured[name].append(units / seconds)
     return measured
+
+
+def _timed(work: Callable[[], int | Iterator[int]]) -> tuple[int, float]:
+    begin = time.perf_counter()
+    units = work()
+    if isinstance(units, int):
+        return units, time.perf_counter() - begin
+    steps = units
+    next(steps)
+    begin = time.perf_counter()
+    done = next(steps)
+    seconds = time.perf_counter() - begin
+    next(steps, None)
+    return done, seconds
 
 
 def report(
@@ -32,7 +48,7 @@ def report(
     measured: Mapping[str, list[float]],
     baseline: str,
     target: float,
-    of: str,
+    *of: str,
 ) -> bool:
     """Print the medians and their ratios to the baseline; return whether the target is met.
 
@@ -41,8 +57,8 @@ def report(
         unit: What was counted.
         measured: What `rates` returned.
         baseline: Name of the candidate that the others are compared with.
-        target: Least ratio of the candidate `of`.
-        of: Name of the candidate that the claim is about.
+        target: Least ratio of the candidates `of`.
+        of: Names of the candidates that the claim is about.
     """
     print(title)
     ratios = {
@@ -57,8 +73,19 @@ def report(
             f"  {name:28} {middle:12,.0f} {unit}/s  [{low:,.0f} .. {high:,.0f}]"
             f"  ratio {ratios[name]:.2f}"
         )
-    met = ratios[of] >= target
-    print(f"  {of}: {ratios[of]:.2f}, target {target}: {'met' if met else 'MISSED'}\n")
+    met = [claim(name, ratios[name], at_least=target) for name in of]
+    return all(met)
+
+
+def claim(
+    what: str, value: float, *, at_least: float | None = None, at_most: float | None = None
+) -> bool:
+    """Print whether a value meets its target, and return it."""
+    if at_least is not None:
+        met, target = value >= at_least, f"at least {at_least:g}"
+    else:
+        met, target = at_most is not None and value <= at_most, f"at most {at_most:g}"
+    print(f"  {what}: {value:.4g}, target {target}: {'met' if met else 'MISSED'}\n")
     return met
 
 

@@ -17,11 +17,11 @@ FIELDS = [Field("x", (2,)), Field("n", (), "int32")]
 def test_rows_are_copies_with_instance_and_step():
     columns = Columns(FIELDS, 4)
     x = np.array([1.0, 2.0])
-    columns.put(0, {"x": x, "n": 3}, 2, 7)
+    columns.put(0, {"x": x, "n": 3}, 2, 5, 7)
     x[:] = 0
-    rows = columns.rows(1)
+    rows, names = columns.rows(1), ("n", "env_id", "episode", "step")
     assert rows["x"].tolist() == [[1, 2]]
-    assert [rows[name].tolist() for name in ("n", "env_id", "step")] == [[3], [2], [7]]
+    assert [rows[name].tolist() for name in names] == [[3], [2], [5], [7]]
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def test_rows_are_copies_with_instance_and_step():
 )
 def test_what_does_not_fit_is_named(sample, error, field):
     with pytest.raises(error, match=f'Instance 3, step 5: field "{field}"') as caught:
-        Columns(FIELDS, 1).put(0, sample, 3, 5)
+        Columns(FIELDS, 1).put(0, sample, 3, 0, 5)
     assert (caught.value.field, caught.value.instance_id, caught.value.step) == (field, 3, 5)
 
 
@@ -49,7 +49,7 @@ def test_what_does_not_fit_is_named(sample, error, field):
 def test_the_first_row_that_is_not_finite_is_named(bad):
     columns = Columns(FIELDS, 3)
     for row in range(3):
-        columns.put(row, {"x": np.array([0, bad if row else 1.0]), "n": 0}, row + 1, 10 + row)
+        columns.put(row, {"x": np.array([0, bad if row else 1.0]), "n": 0}, row + 1, 0, 10 + row)
     assert len(columns.rows(1)["x"]) == 1
     with pytest.raises(NotFiniteError, match='Instance 2, step 11: field "x"'):
         columns.rows(3)

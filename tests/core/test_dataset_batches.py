@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from physx_core import Dataset
-from physx_core.dataset import sampling
+from physx_core.dataset import memory
 from physx_core.errors import ConfigError, DatasetError
 
 N = 1003
@@ -15,7 +15,7 @@ N = 1003
 def dataset(request, tmp_path, monkeypatch):
     """Rows whose x, y and id tell their number, in many partitions."""
     if request.param == "mapped":
-        monkeypatch.setattr(sampling, "available_memory", lambda: 0)
+        monkeypatch.setattr(memory, "available_memory", lambda: 0)
     ids = np.arange(N)
     with Dataset.create(tmp_path, max_file_size=2e-5) as dataset:
         dataset.append("training", {"x": ids[:, None] + [0.0, 0.5], "y": ids * 2.0, "id": ids})
@@ -113,4 +113,4 @@ def test_nothing_to_read(dataset):
 
 
 def test_memory_is_known():
-    assert sampling.available_memory() > 2**20
+    assert memory.available_memory() > 2**20

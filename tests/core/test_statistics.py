@@ -1,4 +1,5 @@
 import json
+import zlib
 
 import numpy as np
 import pytest
@@ -6,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from physx_core import Dataset
 from physx_core.statistics import Normalization, RunningStatistics
 
 
@@ -96,3 +98,66 @@ def test_normalization_as_plain_data():
     back = Normalization.from_dict(json.loads(json.dumps(normalization.to_dict())))
     assert np.array_equal(back.mean, normalization.mean)
     assert np.array_equal(back.std, normalization.std)
+
+
+# Minimum and maximum ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (3,), (2, 3), (700,), (0,)])
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64"])
+@pytest.mark.parametrize("parts", [1, 7])
+def test_minimum_and_maximum_are_exact(shape, dtype, parts):
+    rows = np.random.default_rng(1).normal(size=(1000, *shape)).astype(dtype)
+    statistics = statistics_of(*np.array_split(rows, parts))
+    assert (statistics.minimum == rows.min(axis=0)).all()
+    assert (statistics.maximum == rows.max(axis=0)).all()
+    assert statistics.minimum.dtype == statistics.maximum.dtype == np.float64
+    assert statistics.minimum.shape == statistics.maximum.shape == shape
+
+
+@pytest.mark.parametrize("first", [0, 1, 400, 1000])
+def test_merged_extremes_are_those_of_all_rows(first):
+    rows = np.random.default_rng(2).normal(size=(1000, 4))
+    merged = statistics_of(rows[:first])
+    merged.merge(statistics_of(rows[first:]))
+    merged.merge(RunningStatistics())
+    assert (merged.minimum == rows.min(axis=0)).all()
+    assert (merged.maximum == rows.max(axis=0)).all()
+
+
+def test_extremes_survive_the_way_through_json():
+    statistics = statistics_of(np.random.default_rng(3).normal(size=(10, 2)))
+    again = RunningStatistics.from_dict(json.loads(json.dumps(statistics.to_dict())))
+    again.update(np.array([[100.0, 0.0]]))
+    assert (again.minimum == statistics.minimum).all()
+    assert again.maximum.tolist() == [100, statistics.maximum[1]]
+    normalization = again.normalization()
+    back = Normalization.from_dict(json.loads(json.dumps(normalization.to_dict())))
+    for name in ("mean", "std", "minimum", "maximum"):
+        assert (getattr(back, name) == getattr(normalization, name)).all()
+
+
+def test_what_was_written_without_extremes_is_read():
+    plain = {"mean": [1.0, 2.0], "std": [0.1, 0.2]}
+    normalization = Normalization.from_dict(plain)
+    assert normalization.minimum is None and normalization.to_dict() == plain
+    assert RunningStatistics.from_dict({"count": 7, **plain}).count == 0
+
+
+def test_a_dataset_without_extremes_gets_them_when_asked(tmp_path):
+    rows = np.random.default_rng(4).normal(size=(500, 3))
+    with Dataset.create(tmp_path / "data", max_file_size=2e-5) as dataset:
+        dataset.append("training", {"x": rows})
+    path = tmp_path / "data" / "dataset.json"
+    plain = json.loads(path.read_text())
+    for statistics in plain["modes"]["training"]["normalization"].values():
+        del statistics["minimum"], statistics["maximum"]
+    del plain["crc32"]
+    body = json.dumps(plain, indent=1).encode()[:-2]
+    path.write_bytes(body + f',\n "crc32": "{zlib.crc32(body):08x}"\n}}'.encode())
+    for writable in (False, True):
+        with Dataset.open(tmp_path / "data", writable=writable) as dataset:
+            found = dataset.normalization["x"]
+            assert_allclose(found.mean, rows.mean(axis=0), rtol=1e-12)
+            assert (found.minimum == rows.min(axis=0)).all()
+            assert (found.maximum == rows.max(axis=0)).all()

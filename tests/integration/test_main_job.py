@@ -56,7 +56,7 @@ def test_the_same_rows_in_process_and_with_clients(number, script, run, tmp_path
         assert processes(f"PHYSX_TEST_MARK={mark}") == []
     local = rows_of(tmp_path / f"sessions/local{number}")
     clients = rows_of(tmp_path / f"sessions/tcp{number}")
-    assert local.keys() == clients.keys() == {"x", "dx", "env_id", "step"}
+    assert local.keys() == clients.keys() == {"x", "dx", "env_id", "episode", "step"}
     assert all(np.array_equal(local[name], clients[name]) for name in local)
     assert len(local["x"]) == 505
 
@@ -93,7 +93,7 @@ def test_kill_9_loses_no_committed_row(where, script, run, tmp_path, processes):
     x, dx = rows["x"][first], rows["dx"][first]
     assert np.array_equal(x[1:], (x + dx)[:-1])
     text = run("-m", "physx_core", "info", tmp_path / "sessions/run").stdout
-    assert str(len(rows["x"])) in text
+    assert f"{len(rows['x']):,}" in text
     deadline = time.monotonic() + 5
     while processes(f"PHYSX_TEST_MARK={tmp_path}") and time.monotonic() < deadline:
         time.sleep(0.1)

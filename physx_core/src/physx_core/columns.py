@@ -22,9 +22,10 @@ from physx_core.fields import Array, Batch, Field
 
 ROW_FIELDS = (
     Field("env_id", shape=(), dtype="int32", role="additional"),
+    Field("episode", shape=(), dtype="int64", role="additional"),
     Field("step", shape=(), dtype="int64", role="additional"),
 )
-"""What physx adds to each row: the instance that made it, and the instance's step."""
+"""What physx adds to each row: the instance that made it, the instance's trajectory and step."""
 
 
 def shaped_by(fields: Iterable[Field], sample: Mapping[str, Any]) -> list[Field]:
@@ -67,14 +68,18 @@ class Columns:
         ]
         self._floating = [slot[0] for slot in self._slots if slot[3].kind in "fc"]
         self._env_id, self._step = self.arrays["env_id"], self.arrays["step"]
+        self._episode = self.arrays["episode"]
 
-    def put(self, row: int, sample: Mapping[str, Any], instance_id: int, step: int) -> None:
+    def put(
+        self, row: int, sample: Mapping[str, Any], instance_id: int, episode: int, step: int
+    ) -> None:
         """Copy one sample into a row.
 
         Args:
             row: Row to fill, below `capacity`.
             sample: Field name to value; exactly the environment's fields.
             instance_id: Instance that made the sample.
+            episode: The instance's trajectory that the sample belongs to.
             step: The instance's step that made it.
 
         Raises:
@@ -91,6 +96,7 @@ class Columns:
                 value = _converted(name, value, shape, dtype, instance_id, step)
             array[row] = value
         self._env_id[row] = instance_id
+        self._episode[row] = episode
         self._step[row] = step
 
     def rows(self, count: int) -> Batch:

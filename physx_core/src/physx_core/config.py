@@ -137,6 +137,11 @@ class DatasetConfig:
     """Size in GB at which a partition is full and the next one begins."""
     shuffle: bool = True
     """Read each epoch in a new random order; otherwise in the order of writing."""
+    validation_split: float = field(default=0.0, metadata={"minimum": 0.0, "maximum": 0.99})
+    """Share of the samples that a training holds back for validation, where the dataset has no
+    mode "validation"; the same samples in every training. Normalization comes from the others."""
+    split_by: str = field(default="row", metadata={"choices": ("row", "episode")})
+    """Hold back single samples, or whole trajectories: "row" or "episode"."""
     normalize: bool = False
     """Give networks each component with mean 0 and standard deviation 1."""
     recompute_normalization: bool = False

@@ -212,6 +212,26 @@ class DatasetLockedError(DatasetError):
     """Another process writes to this dataset."""
 
 
+class ExchangeError(DatasetError):
+    """Rows cannot be written to, or taken from, a file of another format."""
+
+
+class MissingLibraryError(PhysxError):
+    """A library that is only needed for this is not installed.
+
+    Attributes:
+        library: Name of the package.
+        extra: Extra of physx-core that brings it.
+    """
+
+    def __init__(self, purpose: str, library: str, extra: str) -> None:
+        self.library, self.extra = library, extra
+        super().__init__(
+            f'{purpose} needs the package "{library}", which is not installed. '
+            f'To install it: pip install "physx-core[{extra}]"'
+        )
+
+
 class FieldsMismatchError(DatasetError):
     """Fields of two things that must fit together differ.
 

@@ -18,8 +18,8 @@ Batch: TypeAlias = dict[str, Array]
 """Several steps: field name to array of shape (samples, *field shape)."""
 Role: TypeAlias = Literal["training", "additional"]
 
-RESERVED = ("env_id", "step")
-"""Fields that physx adds to each row: number of the instance, and the instance's step."""
+RESERVED = ("env_id", "episode", "step")
+"""Fields that physx adds to each row: number of the instance, its trajectory, and its step."""
 
 _KINDS = "biufc"
 

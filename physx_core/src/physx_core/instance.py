@@ -23,6 +23,7 @@ class Instance:
         fields: The environment's fields; shapes that it leaves open become known with the first
             sample.
         last_step: Number of the step that made the last sample, counted from 0.
+        last_episode: Number of the trajectory that the last sample belongs to, counted from 0.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class Instance:
         self.environment: Environment | None = None
         self.fields: list[Field] = []
         self.last_step = -1
+        self.last_episode = 0
         self._reference = environment
         self._arguments: dict[str, Any] = {
             **env_kwargs,
@@ -110,6 +112,7 @@ class Instance:
         while True:
             sample = self._simulate(environment)
             self.last_step = environment.step_index
+            self.last_episode = environment.sample_episode
             environment.step_index += 1
             if sample is not None:
                 return sample

@@ -1,7 +1,8 @@
-"""Mean and standard deviation per component, accumulated block by block."""
+"""Mean, standard deviation, minimum and maximum per component, accumulated block by block."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
@@ -12,33 +13,42 @@ from numpy.typing import NDArray
 from physx_core.fields import Array
 
 Doubles = NDArray[np.float64]
+_WIDTH = 512
 
 
 @dataclass(frozen=True)
 class Normalization:
-    """Mean and standard deviation of each component of a field.
+    """What is known of each component of a field; mean and deviation normalize it.
 
     Attributes:
         mean: Mean, of the field's shape, float64, in the field's unit.
         std: Standard deviation, of the field's shape, float64, in the field's unit; 1 for a
             component that never changes, so that normalizing only shifts it to 0.
+        minimum: Smallest value, of the field's shape, float64, in the field's unit; None where
+            nobody noted it, as in checkpoints of the first version.
+        maximum: Largest value, like `minimum`.
     """
 
     mean: Array
     std: Array
+    minimum: Array | None = None
+    maximum: Array | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON or TOML."""
-        return {"mean": self.mean.tolist(), "std": self.std.tolist()}
+        known = ((name, getattr(self, name)) for name in ("mean", "std", "minimum", "maximum"))
+        return {name: values.tolist() for name, values in known if values is not None}
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Normalization:
         """Make what `to_dict` described."""
-        return cls(np.asarray(plain["mean"], np.float64), np.asarray(plain["std"], np.float64))
+        names = ("mean", "std", "minimum", "maximum")
+        known = {name: np.asarray(plain[name], np.float64) for name in names if name in plain}
+        return cls(**known)
 
 
 class RunningStatistics:
-    """Mean and standard deviation of the rows given so far, in float64.
+    """Mean, standard deviation, minimum and maximum of the rows given so far, in float64.
 
     Blocks are combined by the update of Chan, Golub and LeVeque (1979), "Updating formulae and a
     pairwise algorithm for computing sample variances". Values are taken relative to the first row,
@@ -53,6 +63,8 @@ class RunningStatistics:
         self._origin: Doubles = np.zeros(())
         self._mean: Doubles = np.zeros(())  # relative to the origin
         self._squares: Doubles = np.zeros(())  # sum of squared deviations from the mean
+        self._minimum: Doubles = np.zeros(())
+        self._maximum: Doubles = np.zeros(())
 
     @property
     def mean(self) -> Doubles:
@@ -63,6 +75,16 @@ class RunningStatistics:
     def std(self) -> Doubles:
         """Standard deviation (of the population) of each component, in the field's unit."""
         return np.asarray(np.sqrt(self._squares / max(self.count, 1)))
+
+    @property
+    def minimum(self) -> Doubles:
+        """Smallest value of each component, in the field's unit."""
+        return self._minimum
+
+    @property
+    def maximum(self) -> Doubles:
+        """Largest value of each component, in the field's unit."""
+        return self._maximum
 
     def update(self, block: Array) -> None:
         """Add rows.
@@ -75,12 +97,12 @@ class RunningStatistics:
             return
         if not self.count:
             self._start_at(np.array(block[0], np.float64))
+        self._widen(_over_rows(np.minimum, block), _over_rows(np.maximum, block))
         deviations = np.subtract(block, self._origin, dtype=np.float64)
-        mean = deviations.mean(axis=0)
+        mean = _over_rows(np.add, deviations) / count
         deviations -= mean
-        flat = deviations.reshape(count, -1)
-        squares = np.einsum("ij,ij->j", flat, flat).reshape(self._mean.shape)
-        self._combine(count, np.asarray(mean), squares)
+        squares = _over_rows(np.add, np.square(deviations, out=deviations))
+        self._combine(count, mean, squares)
 
     def merge(self, other: RunningStatistics) -> None:
         """Add the rows that `other` has seen."""
@@ -88,24 +110,41 @@ class RunningStatistics:
             return
         if not self.count:
             self._start_at(other._origin)
+            self._minimum, self._maximum = other._minimum, other._maximum
+        self._widen(other._minimum, other._maximum)
         mean = (other._origin - self._origin) + other._mean
         self._combine(other.count, np.asarray(mean), other._squares)
 
     def normalization(self) -> Normalization:
-        """Return mean and deviation; 1 for components that differ by rounding errors at most."""
+        """Return what normalizes; deviation 1 where values differ by rounding errors at most."""
         mean, std = self.mean, self.std
         resolution = 4 * np.finfo(np.float64).eps * np.abs(mean)
-        return Normalization(mean, np.where(std > resolution, std, 1.0))
+        std = np.where(std > resolution, std, 1.0)
+        return Normalization(mean, std, self._minimum, self._maximum)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        return {"count": self.count, "mean": self.mean.tolist(), "std": self.std.tolist()}
+        values = {
+            "mean": self.mean,
+            "std": self.std,
+            "minimum": self._minimum,
+            "maximum": self._maximum,
+        }
+        return {"count": self.count} | {name: array.tolist() for name, array in values.items()}
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:
-        """Make what `to_dict` described."""
+        """Make what `to_dict` described.
+
+        Without minimum and maximum, as physx once wrote it, nothing counts as seen: the rows are
+        gone through again when somebody asks.
+        """
         statistics = cls()
+        if "minimum" not in plain or "maximum" not in plain:
+            return statistics
         statistics._start_at(np.asarray(plain["mean"], np.float64))
+        statistics._minimum = np.asarray(plain["minimum"], np.float64)
+        statistics._maximum = np.asarray(plain["maximum"], np.float64)
         statistics.count = int(plain["count"])
         statistics._squares = np.asarray(plain["std"], np.float64) ** 2 * statistics.count
         return statistics
@@ -113,6 +152,11 @@ class RunningStatistics:
     def _start_at(self, origin: Doubles) -> None:
         self._origin = origin
         self._mean, self._squares = np.zeros(origin.shape), np.zeros(origin.shape)
+        self._minimum = self._maximum = origin
+
+    def _widen(self, minimum: Array, maximum: Array) -> None:
+        self._minimum = np.minimum(self._minimum, minimum, dtype=np.float64)
+        self._maximum = np.maximum(self._maximum, maximum, dtype=np.float64)
 
     def _combine(self, count: int, mean: Doubles, squares: Doubles) -> None:
         total = self.count + count
@@ -120,3 +164,15 @@ class RunningStatistics:
         self._squares = self._squares + squares + difference**2 * (self.count * count / total)
         self._mean = self._mean + difference * (count / total)
         self.count = total
+
+
+def _over_rows(function: np.ufunc, rows: Array) -> Array:
+    """Reduce an array along its rows; narrow rows lie side by side for it, which is faster."""
+    count, shape = len(rows), rows.shape[1:]
+    width = math.prod(shape)
+    fold = max(1, min(_WIDTH // max(width, 1), count))
+    whole = count // fold * fold
+    wide = rows[:whole].reshape(whole // fold, fold * width)
+    found: Array = function.reduce(wide, axis=0).reshape(fold, *shape)
+    found = np.concatenate([found, rows[whole:]]) if whole < count else found
+    return np.asarray(function.reduce(found, axis=0))

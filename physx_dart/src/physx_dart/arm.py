@@ -198,6 +198,8 @@ class ArmEnvironment(Environment):
 
     def _excite(self) -> None:
         if self._steps % self.episode_steps == 0:
+            if self._steps:
+                self.new_episode()
             self._motion = self._draw(self.rng, 0.0)
             limit = np.array([8.0, 8.0, 4.0, 4.0, 0.5, 0.5, 0.05, 0.1, 0.1]) * self.excitation
             nothing = np.zeros(len(limit))

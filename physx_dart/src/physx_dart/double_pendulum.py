@@ -97,6 +97,8 @@ class DoublePendulumEnvironment(Environment):
     def _simulate(self) -> None:
         simulation = self.simulation
         if self._steps % self.episode_steps == 0:
+            if self._steps:
+                self.new_episode()
             simulation.set_state(self.rng.uniform(-np.pi, np.pi, 2), self.rng.uniform(-3, 3, 2))
             limit = np.full(2, self.torque_amplitude)
             self._torques = SmoothTrajectory.draw(self.rng, np.zeros(2), limit, (0.2, 2.0))

@@ -10,6 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from physx_torch.data import StoredDataset
     from physx_torch.module_network import ModuleNetwork
     from physx_torch.network import TorchNetwork
     from physx_torch.networks.fc import FC
@@ -21,12 +22,20 @@ __version__ = "0.1.0"
 _HOMES = {
     "FC": "networks.fc",
     "ModuleNetwork": "module_network",
+    "StoredDataset": "data",
     "TorchNetwork": "network",
     "TorchOptimization": "optimization",
     "TorchTransformation": "transformation",
 }
 
-__all__ = ["FC", "ModuleNetwork", "TorchNetwork", "TorchOptimization", "TorchTransformation"]
+__all__ = [
+    "FC",
+    "ModuleNetwork",
+    "StoredDataset",
+    "TorchNetwork",
+    "TorchOptimization",
+    "TorchTransformation",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import keyword
 import os
 import sys
 import traceback
@@ -12,9 +13,12 @@ from physx_core.errors import PhysxError, UsageError, nearest
 
 VERBS = {
     "plugins": "list the installed plugins, what they bring, and those that are broken",
-    "info": "show a session or dataset: modes, fields, shapes, units, samples, sizes",
+    "info": "show a session or dataset: fields, units, samples, normalization, integrity",
     "generate": "make samples with an environment and store them in a session",
     "train": "train a network on a dataset, or on what an environment makes",
+    "verify": "check the files of a dataset, and repair them",
+    "export": "write a dataset as npz, parquet, minari, zarr or one HDF5 file",
+    "import": "make a dataset of an npz or HDF5 file",
     "predict": "put a session's network into a running environment",
 }
 
@@ -50,7 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(verb: str, words: list[str]) -> int:
     if verb not in VERBS:
         raise UsageError(f'There is no command "{verb}".{nearest(verb, VERBS)} See physx --help.')
-    module = importlib.import_module(f"physx_core.cli.{verb}")
+    name = f"{verb}_" if keyword.iskeyword(verb) else verb
+    module = importlib.import_module(f"physx_core.cli.{name}")
     try:
         module.run(words)
     except SystemExit as end:  # how the parser ends after --help or a mistake in the options

@@ -3,28 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from physx_core import checkpoint
-from physx_core.errors import DatasetNotFoundError, UsageError
+from physx_core.cli.dataset_report import print_dataset
+from physx_core.errors import DatasetNotFoundError
+
+
+@dataclass
+class Info:
+    """Show what a session or dataset holds."""
+
+    directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
+    """The one folder to look into: a session's or a dataset's."""
+    verify: bool = False
+    """Read every byte to check that nothing was changed, not only what the files say of
+    themselves."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Print the dataset's table and the checkpoints of a folder.
+    """Print the dataset and the checkpoints of a folder.
 
     Raises:
-        UsageError: Not just one folder was named.
         DatasetNotFoundError: The folder holds neither a dataset nor checkpoints.
+        DatasetError: The dataset's manifest cannot be read.
     """
-    if words and words[0] in ("-h", "--help"):
-        print("usage: physx info DIR\n\nDIR is a session's or a dataset's folder.")
-        return
-    if len(words) != 1:
-        raise UsageError("physx info takes one folder: physx info DIR")
-    place = Path(words[0])
+    options = tyro.cli(Info, args=words, prog="physx info")
+    place = Path(options.directory)
     checkpoints = [p.parent for p in sorted(place.glob(f"network/*/{checkpoint.DESCRIPTION}"))]
     try:
-        _print_dataset(place)
+        print_dataset(place, verify=options.verify)
     except DatasetNotFoundError:
         if not checkpoints:
             raise
@@ -34,28 +46,3 @@ def run(words: Sequence[str]) -> None:
             f"checkpoint {path.name}: {found.network['network']}, {found.progress.epoch} epochs, "
             f"fields {', '.join(found.fields)}"
         )
-
-
-def _print_dataset(place: Path) -> None:
-    from physx_core.dataset import Dataset
-
-    with Dataset.open(place) as dataset:
-        rows = dataset.describe()
-        info = dataset.info
-    print(f"dataset {place}")
-    for key in ("environment", "env_kwargs", "num_clients", "seed"):
-        if info.get(key) not in (None, {}):
-            print(f"  {key}: {info[key]}")
-    _print_table(rows)
-
-
-def _print_table(rows: Sequence[dict[str, object]]) -> None:
-    if not rows:
-        print("  no samples")
-        return
-    names = list(rows[0])
-    cells = [names, *([str(row[name]) for name in names] for row in rows)]
-    widths = [max(len(line[column]) for line in cells) for column in range(len(names))]
-    for line in cells:
-        parts = (f"{cell:{width}}" for cell, width in zip(line, widths, strict=True))
-        print("  " + "  ".join(parts).rstrip())

@@ -6,5 +6,7 @@ The format is described in `physx_core.dataset.layout` and `physx_core.dataset.m
 from __future__ import annotations
 
 from physx_core.dataset.dataset import Dataset
+from physx_core.dataset.episodes import Episode
+from physx_core.dataset.splits import Subset
 
-__all__ = ["Dataset"]
+__all__ = ["Dataset", "Episode", "Subset"]

@@ -5,35 +5,39 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from physx_core.dataset import files
 from physx_core.dataset.checks import RowBuffer, check_rows, infer_fields
 from physx_core.dataset.definitions import compare_fields, complete_shapes, shapes_of_rows
-from physx_core.dataset.manifest import Manifest, Mode
+from physx_core.dataset.manifest import Mode
 from physx_core.dataset.writer import Writer
 from physx_core.errors import ConfigError
 from physx_core.fields import Batch, Field
 
 
 class Appender:
-    """Brings what users give into the form that the writer stores; see `Dataset` for the calls."""
+    """Brings what users give into the form that the writer stores; see `Dataset` for the calls.
 
-    def __init__(self, manifest: Manifest, writer: Writer) -> None:
-        self._manifest = manifest
-        self._writer = writer
+    Attributes:
+        writer: Stores the rows.
+    """
+
+    def __init__(self, writer: Writer) -> None:
+        self._ledger, self._manifest = writer.ledger, writer.ledger.manifest
+        self.writer = writer
         self._buffers: dict[str, RowBuffer] = {}
 
     def define_fields(self, mode: str, fields: Iterable[Field]) -> None:
         """Define the fields of a mode: see `Dataset.define_fields`."""
         given = {field.name: field for field in fields}
+        if not mode.isidentifier() or not given:
+            names = sorted(given) or "no fields"
+            raise ConfigError(f"A mode needs an identifier and fields, not {mode!r} with {names}.")
         known = self._manifest.modes.get(mode)
-        if known is None:
-            self._add_mode(mode, given)
-        else:
-            compare_fields(f'Mode "{mode}" of the dataset', known.fields, given)
-            completed = complete_shapes(known.fields, given)
-            if completed == known.fields:
-                return
-            known.fields = completed
-        self._writer.save()
+        if known is not None and _completed(mode, known, given) == known.fields:
+            return
+        with files.storing(f"The fields of mode {mode!r}"), self._ledger.changing() as manifest:
+            known = manifest.modes.setdefault(mode, Mode(given))
+            known.fields = _completed(mode, known, given)
 
     def append(self, mode: str, rows: Mapping[str, Any]) -> None:
         """Store and commit rows: see `Dataset.append`."""
@@ -42,7 +46,7 @@ class Appender:
         checked, count = check_rows(fields, rows)
         self._flush(mode)
         self._settle(mode, fields, checked)
-        self._writer.append(mode, checked, count)
+        self.writer.append(mode, checked, count)
 
     def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
         """Store one sample, soon: see `Dataset.append_sample`."""
@@ -72,18 +76,15 @@ class Appender:
         buffer = self._buffers.get(mode)
         if buffer is not None and buffer.count:
             count = buffer.count
-            self._writer.append(mode, buffer.take(), count)
+            self.writer.append(mode, buffer.take(), count)
 
     def _settle(self, mode: str, fields: Mapping[str, Field], rows: Batch) -> None:
         """Add the mode, if it is new, and complete shapes that the first rows tell."""
-        if mode not in self._manifest.modes:
-            self._add_mode(mode, dict(fields))
-        known = self._manifest.modes[mode]
-        if any(field.shape is None for field in known.fields.values()):
-            known.fields = shapes_of_rows(known.fields, rows)
+        known = self._manifest.modes.get(mode)
+        if known is None or any(field.shape is None for field in known.fields.values()):
+            self.define_fields(mode, shapes_of_rows(fields, rows).values())
 
-    def _add_mode(self, mode: str, fields: dict[str, Field]) -> None:
-        if not mode.isidentifier() or not fields:
-            names = sorted(fields) or "no fields"
-            raise ConfigError(f"A mode needs an identifier and fields, not {mode!r} with {names}.")
-        self._manifest.modes[mode] = Mode(fields)
+
+def _completed(mode: str, known: Mode, given: Mapping[str, Field]) -> dict[str, Field]:
+    compare_fields(f'Mode "{mode}" of the dataset', known.fields, given)
+    return complete_shapes(known.fields, given)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -11,16 +11,21 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import DTypeLike
 
+from physx_core.dataset import policy as policies
 from physx_core.dataset import recovery
 from physx_core.dataset.appender import Appender
-from physx_core.dataset.manifest import Manifest, plain_info
+from physx_core.dataset.cache import ColumnCache
+from physx_core.dataset.coverage import statistics_of
+from physx_core.dataset.episodes import Episode, find_episodes
+from physx_core.dataset.manifest import Manifest
 from physx_core.dataset.opening import WriterOptions, create, extend
 from physx_core.dataset.reader import Reader
 from physx_core.dataset.report import find_problems, summarize
-from physx_core.dataset.sampling import Batches, ColumnCache
-from physx_core.dataset.sealing import cover
+from physx_core.dataset.sampling import Batches
+from physx_core.dataset.splits import Source, Subset, split
 from physx_core.dataset.views import ModeView
 from physx_core.dataset.writer import Writer
+from physx_core.dataset.writing import Changes
 from physx_core.errors import UsageError
 from physx_core.fields import Batch, Field
 from physx_core.statistics import Normalization
@@ -28,7 +33,7 @@ from physx_core.statistics import Normalization
 MAX_FILE_SIZE = 0.25
 
 
-class Dataset:
+class Dataset(Changes):
     """A folder of partition files with its manifest; make one with `create` or `open`.
 
     A context manager. One process at a time may write; any number may read, also meanwhile. What
@@ -53,7 +58,7 @@ class Dataset:
         self._lock = lock
         self._reader = Reader(directory, manifest)
         self._columns = ColumnCache(self._reader)
-        self._appender = Appender(manifest, writer) if writer else None
+        self._appender = Appender(writer) if writer else None
         self._closed = False
 
     # Opening and closing --------------------------------------------------------------------
@@ -66,6 +71,7 @@ class Dataset:
         *,
         max_file_size: float = MAX_FILE_SIZE,
         durable: bool = False,
+        shared: bool = False,
         info: Mapping[str, Any] | None = None,
     ) -> Self:
         """Make a new dataset and open it for writing.
@@ -75,6 +81,8 @@ class Dataset:
             session: Name that its files begin with.
             max_file_size: Size in GB at which a partition is full and the next one begins.
             durable: Whether every append waits for the disk, to survive a power cut too.
+                Otherwise the disk gets what is written about once a second.
+            shared: Whether other processes may write to it at the same time: see `open`.
             info: Where the data come from: see `update_info`.
 
         Raises:
@@ -83,8 +91,9 @@ class Dataset:
             ConfigError: The session's name or the size is not valid.
         """
         folder = Path(directory)
-        options = WriterOptions(session, max_file_size, durable)
-        return cls(folder, *create(folder, options, info or {}))
+        options = WriterOptions(session, max_file_size, durable, shared)
+        writer, lock = create(folder, options, info or {})
+        return cls(folder, writer.ledger.manifest, writer, lock)
 
     @classmethod
     def open(
@@ -95,6 +104,7 @@ class Dataset:
         session: str | None = None,
         max_file_size: float = MAX_FILE_SIZE,
         durable: bool = False,
+        shared: bool = False,
     ) -> Self:
         """Open a dataset that exists.
 
@@ -104,6 +114,9 @@ class Dataset:
             session: Name of the new files when writing; None: that of the last session.
             max_file_size: Size in GB at which a new partition is full.
             durable: Whether every append waits for the disk, to survive a power cut too.
+            shared: Whether other processes may write to it at the same time, each with
+                ``shared=True``. Each writes partitions of its own; the partitions follow each
+                other in the order in which they were begun.
 
         Raises:
             DatasetNotFoundError: There is no dataset.
@@ -115,7 +128,9 @@ class Dataset:
         folder = recovery.locate(directory)
         if not writable:
             return cls(folder, recovery.load(folder))
-        return cls(folder, *extend(folder, WriterOptions(session, max_file_size, durable)))
+        options = WriterOptions(session, max_file_size, durable, shared)
+        writer, lock = extend(folder, options)
+        return cls(folder, writer.ledger.manifest, writer, lock)
 
     @property
     def writable(self) -> bool:
@@ -152,75 +167,6 @@ class Dataset:
         trace: TracebackType | None,
     ) -> None:
         self.close()
-
-    # Writing --------------------------------------------------------------------------------
-
-    def define_fields(self, mode: str, fields: Iterable[Field]) -> None:
-        """Define the fields of a mode, with their units and roles, before its first rows.
-
-        Args:
-            mode: Name of the mode.
-            fields: The fields; a shape of None is taken from the first rows.
-
-        Raises:
-            FieldsMismatchError: The mode has other fields already.
-            ConfigError: The mode's name is no identifier, or there is no field.
-            UsageError: The dataset is closed or only read.
-        """
-        self._writing().define_fields(mode, fields)
-
-    def append(self, mode: str, rows: Mapping[str, Any]) -> None:
-        """Store rows; they are committed when this returns.
-
-        Args:
-            mode: Name of the mode. If it has no fields yet, they are taken from the rows.
-            rows: Field name to array of shape (n, *field shape), all fields of the mode.
-
-        Raises:
-            SampleError: A field is missing, unknown, of another shape, type or length, or holds
-                NaN or an infinite number. Nothing of the rows is stored.
-            DatasetError: The disk is full or fails; says how many of the rows are stored.
-            UsageError: The dataset is closed or only read.
-        """
-        self._writing().append(mode, rows)
-
-    def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
-        """Store one sample; it is committed with some others, or by `flush`.
-
-        Args:
-            mode: Name of the mode. If it has no fields yet, they are taken from the sample.
-            sample: Field name to value of the field's shape, all fields of the mode.
-
-        Raises:
-            SampleError: The sample cannot be stored, as in `append`.
-            DatasetError: The samples that waited cannot be stored: the disk is full or fails.
-            UsageError: The dataset is closed or only read.
-        """
-        self._writing().append_sample(mode, sample)
-
-    def flush(self) -> None:
-        """Commit the samples that wait.
-
-        Raises:
-            DatasetError: The disk is full or fails; says how many of them are stored. The others
-                are forgotten.
-        """
-        self._writing().flush()
-
-    def update_info(self, **values: Any) -> None:
-        """Set entries of `info` and store them.
-
-        Args:
-            values: Numbers, texts, lists, dictionaries; tuples and arrays become lists, classes
-                and paths become texts.
-
-        Raises:
-            ConfigError: A value is nothing that JSON can hold.
-            UsageError: The dataset is closed or only read.
-        """
-        self._writing()
-        self._manifest.info |= plain_info(values)
-        self._save()
 
     # Reading --------------------------------------------------------------------------------
 
@@ -272,9 +218,11 @@ class Dataset:
         """
         self._reading()
         if self._writer is None:
-            now = recovery.load(self.directory)
-            self._manifest.modes, self._manifest.info = now.modes, now.info
-            self._manifest.problems = now.problems
+            moved = recovery.refresh(self.directory, self._manifest)
+        else:
+            moved = self._writer.refresh()
+        if moved:
+            self._columns.clear()
 
     def batches(
         self,
@@ -287,41 +235,95 @@ class Dataset:
         fields: Sequence[str] | None = None,
         dtype: DTypeLike | None = None,
         reuse: bool = False,
+        normalize: bool | Mapping[str, Normalization] = False,
+        policy: policies.Choice = "auto",
     ) -> Iterator[Batch]:
         """Go through the samples of a mode in batches.
 
         Args:
             mode: Name of the mode.
             batch_size: Samples of a batch; only the last one of an epoch may have fewer.
-            shuffle: Whether each epoch is a new random permutation of all samples.
-            seed: Seed of the permutations; None: a different one each time.
+            shuffle: Whether each epoch is a new random order of all samples.
+            seed: Seed of the orders; None: a different one each time.
             epochs: How often to go through all samples; None: without end. An epoch begins with
                 the samples that are committed by then.
             fields: Names of the fields to give; None: all of them.
             dtype: Type that floating fields are given in; None: their own.
             reuse: Whether every batch is given in the same arrays, which is faster; each batch is
                 then valid until the next.
+            normalize: Whether floating fields are normalized, in place, by the mean and deviation
+                of all samples of the mode; or the normalization to use.
+            policy: How samples are read, see `physx_core.dataset.policy`; ``auto``: as suits the
+                fields' sizes and the free memory.
 
         Returns:
             An iterator over batches: field name to array of shape (samples, *field shape).
 
         Raises:
             DatasetError: There is no such mode or field, or the mode has no samples.
-            ConfigError: `batch_size` or `epochs` is out of range.
+            ConfigError: `batch_size` or `epochs` is out of range, or there is no such policy.
         """
         self._reading()
+        if isinstance(normalize, bool):
+            normalize = self.normalization_of(mode) if normalize else {}
         return iter(
             Batches(
                 self._columns,
                 mode,
-                list(self._reader.mode(mode).fields if fields is None else fields),
+                list(dict.fromkeys(self._reader.mode(mode).fields if fields is None else fields)),
                 batch_size,
                 epochs,
                 np.random.default_rng(seed) if shuffle else None,
                 None if dtype is None else np.dtype(dtype),
                 reuse,
+                policies.check(policy),
+                normalize,
             )
         )
+
+    def reading_policy(self, mode: str, fields: Sequence[str] | None = None) -> policies.Policy:
+        """Return how `batches` reads by itself: ``memory``, ``disk exact`` or ``disk windowed``.
+
+        Args:
+            mode: Name of the mode.
+            fields: Names of the fields that are read together; None: all of them.
+
+        Raises:
+            DatasetError: There is no such mode or field.
+        """
+        self._reading()
+        names = list(self._reader.mode(mode).fields if fields is None else fields)
+        return self._columns.policy(mode, names, None)
+
+    def episodes(self, mode: str) -> list[Episode]:
+        """Return the trajectories of a mode, each with the numbers of its rows in order of time.
+
+        A trajectory ends where an environment calls `Environment.new_episode`, where
+        `check_sample` refuses a sample, and where another run begins.
+
+        Raises:
+            DatasetError: There is no such mode, or its rows do not say where trajectories begin.
+        """
+        return find_episodes(self[mode], self.num_samples(mode))
+
+    def split(
+        self, mode: str, shares: Mapping[str, float], *, by: str = "row", seed: int = 0
+    ) -> dict[str, Subset]:
+        """Split the samples that a mode has now into parts, without copying any.
+
+        Args:
+            mode: Name of the mode.
+            shares: Name of each part to its share; together 1 at most, what is left is in none.
+            by: ``row``: rows are drawn at random; ``episode``: whole trajectories are, so that
+                none has rows in two parts.
+            seed: Seed of the draw; the same rows and seed give the same parts.
+
+        Raises:
+            DatasetError: There is no such mode, or trajectories are not known.
+            ConfigError: The shares are unfit, or a part would be empty.
+        """
+        source = Source(self[mode], self._columns, mode, self.num_samples(mode))
+        return split(source, shares, by, seed)
 
     @property
     def normalization(self) -> dict[str, Normalization]:
@@ -335,8 +337,7 @@ class Dataset:
             DatasetError: There is no such mode, or a partition is missing or damaged.
         """
         self._reading()
-        cover(self._reader, mode)
-        statistics = self._reader.mode(mode).statistics
+        statistics = statistics_of(self._reader, mode)
         return {name: s.normalization() for name, s in statistics.items() if s.count}
 
     def recompute_normalization(self, mode: str = "training") -> dict[str, Normalization]:
@@ -346,9 +347,9 @@ class Dataset:
             DatasetError: There is no such mode, or a partition is missing or damaged.
         """
         self._reading()
-        self._reader.mode(mode).statistics.clear()
+        self._reader.mode(mode).forget_statistics()
         found = self.normalization_of(mode)
-        self._save()
+        self._keep_statistics()
         return found
 
     def describe(self) -> list[dict[str, Any]]:
@@ -361,33 +362,23 @@ class Dataset:
         self._reading()
         return summarize(self._manifest)
 
-    def verify(self) -> list[str]:
+    def verify(self, *, content: bool = True) -> list[str]:
         """Check all partition files: there, whole, of the right rows, and unchanged.
+
+        Args:
+            content: Whether to read every byte; otherwise only headers and sizes are checked.
 
         Returns:
             One text for each problem; empty for a sound dataset.
         """
         self._reading()
-        return find_problems(self.directory, self._manifest)
+        return find_problems(self.directory, self._manifest, content)
 
     # Within ---------------------------------------------------------------------------------
-
-    def _writing(self) -> Appender:
-        if self._closed:
-            raise UsageError(f"The dataset in {self.directory} is closed.")
-        if self._appender is None:
-            raise UsageError(
-                f"The dataset in {self.directory} was opened for reading. To change it, use "
-                "Dataset.open(directory, writable=True)."
-            )
-        return self._appender
 
     def _reading(self) -> None:
         if self._closed:
             raise UsageError(f"The dataset in {self.directory} is closed.")
         if self._appender is not None:
             self._appender.flush()
-
-    def _save(self) -> None:
-        if self._writer is not None:
-            self._writer.save()
+            self._forget_moved()

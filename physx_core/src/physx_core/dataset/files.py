@@ -1,10 +1,16 @@
-"""What the dataset asks of the file system: whole writes, atomic replacement, the writer's lock."""
+"""What the dataset asks of the file system: whole writes, atomic replacement, the writers' locks.
+
+No link is ever followed, and nothing but regular files is opened: a dataset may come from a
+stranger.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,8 +18,11 @@ from physx_core.errors import DatasetError, DatasetLockedError
 from physx_core.fields import Array
 
 LOCK = "dataset.lock"
+TURN = "dataset.json.lock"
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers that say: nothing more can be stored here."""
+
+_SAFELY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 @contextlib.contextmanager
@@ -27,6 +36,43 @@ def storing(what: str) -> Iterator[None]:
         raise DatasetError(
             f"{what} cannot be stored: {reason}. All rows committed before are intact.{advice}"
         ) from error
+
+
+def open_regular(path: Path | str, flags: int = os.O_RDONLY) -> int:
+    """Open a file and return its descriptor.
+
+    Raises:
+        OSError: It cannot be opened, or is a link, a folder, a pipe or a device.
+    """
+    try:
+        descriptor = os.open(path, flags | _SAFELY, 0o666)
+    except OSError as error:
+        if error.errno in (errno.ELOOP, errno.ENXIO):
+            error.strerror = "it is a link or no regular file"
+        raise
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "it is a link or no regular file", str(path))
+    return descriptor
+
+
+def create_new(path: Path) -> int:
+    """Make an empty file, instead of whatever has its name, and return its descriptor."""
+    path.unlink(missing_ok=True)
+    return open_regular(path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
+
+
+def content(path: Path, limit: int) -> bytes:
+    """Return the bytes of a file.
+
+    Raises:
+        OSError: It cannot be read, or is larger than `limit` bytes.
+    """
+    with os.fdopen(open_regular(path), "rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > limit:
+            raise OSError(errno.EFBIG, f"it has {size} bytes, more than {limit}", str(path))
+        return file.read(limit)
 
 
 def write_at(descriptor: int, content: bytes | memoryview, offset: int) -> None:
@@ -61,7 +107,7 @@ def replace(path: Path, content: bytes) -> None:
     """Write a file that is either the old or the new one, whole, whenever the process dies."""
     draft = temporary(path)
     try:
-        descriptor = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+        descriptor = create_new(draft)
         try:
             write_at(descriptor, content, 0)
             os.fsync(descriptor)
@@ -69,7 +115,8 @@ def replace(path: Path, content: bytes) -> None:
             os.close(descriptor)
         draft.replace(path)
     except OSError:
-        draft.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            draft.unlink(missing_ok=True)
         raise
     sync_folder(path.parent)
 
@@ -84,26 +131,74 @@ def sync_folder(folder: Path) -> None:
 
 
 def lock(directory: Path) -> int:
-    """Take the writer's lock of a dataset and return its descriptor; closing that releases it.
+    """Take a dataset's lock for one writer alone; closing the descriptor releases it.
 
     Raises:
-        DatasetLockedError: Another writer has it.
+        DatasetLockedError: There is another writer.
     """
-    import fcntl
-
-    descriptor = os.open(directory / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+    descriptor = open_regular(directory / LOCK, os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         os.ftruncate(descriptor, 0)
         write_at(descriptor, str(os.getpid()).encode(), 0)
     except BlockingIOError:
-        owner = os.pread(descriptor, 20, 0).decode(errors="replace") or "unknown"
+        error = _locked(directory, descriptor)
         os.close(descriptor)
-        raise DatasetLockedError(
-            f"Process {owner} writes to the dataset in {directory}. Wait until it has closed the "
-            "dataset, or open it for reading only."
-        ) from None
+        raise error from None
     except BaseException:
         os.close(descriptor)
         raise
     return descriptor
+
+
+def lock_shared(directory: Path) -> tuple[int, bool]:
+    """Take a dataset's lock for one of several writers.
+
+    Returns:
+        The descriptor, whose closing releases the lock, and whether there is no other writer: the
+        lock is then this one's alone, until `share` lets others in.
+
+    Raises:
+        DatasetLockedError: There is a writer that shares the dataset with nobody.
+    """
+    with contextlib.suppress(DatasetLockedError):
+        return lock(directory), True
+    descriptor = open_regular(directory / LOCK, os.O_RDWR | os.O_CREAT)
+    try:
+        share(directory, descriptor)
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor, False
+
+
+def share(directory: Path, descriptor: int) -> None:
+    """Let others share the lock.
+
+    Raises:
+        DatasetLockedError: A writer that shares with nobody was quicker.
+    """
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise _locked(directory, descriptor) from None
+
+
+@contextlib.contextmanager
+def turn(directory: Path) -> Iterator[None]:
+    """Wait for one's turn to change the manifest, among writers that share a dataset."""
+    descriptor = open_regular(directory / TURN, os.O_RDWR | os.O_CREAT)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _locked(directory: Path, descriptor: int) -> DatasetLockedError:
+    owner = os.pread(descriptor, 20, 0).decode(errors="replace") or "unknown"
+    return DatasetLockedError(
+        f"Process {owner} writes to the dataset in {directory}. Wait until it has closed the "
+        "dataset, or open it for reading only. For several writers at the same time, each opens "
+        "it with writable=True, shared=True."
+    )

@@ -8,6 +8,7 @@ samples arrive and the file can be opened with h5py at any moment.
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 from dataclasses import dataclass
@@ -16,11 +17,14 @@ from typing import Any
 
 import numpy as np
 
+from physx_core.dataset import files
 from physx_core.errors import DatasetError, PhysxError
 from physx_core.fields import Field
 
 FORMAT = "physx partition"
 VERSION = 1
+READABLE = (1,)
+"""Versions of the partition file that this physx reads."""
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _PAGE = 4096
 _END_OF_FILE = 40  # place of the file's size in an HDF5 superblock of version 0
@@ -159,10 +163,10 @@ def open_partition(path: Path) -> io.FileIO:
     """Open a partition file for reading.
 
     Raises:
-        DatasetError: It is missing, or cannot be opened.
+        DatasetError: It is missing, or cannot be opened, or is no regular file.
     """
     try:
-        return io.FileIO(path)
+        return io.FileIO(str(path), opener=files.open_regular)
     except FileNotFoundError:
         raise DatasetError(
             f"The partition {path.name} is missing from {path.parent}. Put it back: the rows of "
@@ -174,10 +178,9 @@ def open_partition(path: Path) -> io.FileIO:
 
 def cannot_open(path: Path, error: OSError) -> DatasetError:
     """Return the error for a partition file that the system does not open."""
-    return DatasetError(
-        f"The partition {path} cannot be opened: {error.strerror}. With very many partitions, "
-        "raise the limit of open files (ulimit -n)."
-    )
+    full = error.errno in (errno.EMFILE, errno.ENFILE)
+    advice = " Raise the limit of open files (ulimit -n)." if full else ""
+    return DatasetError(f"The partition {path} cannot be opened: {error.strerror}.{advice}")
 
 
 def inspect_open(
@@ -189,9 +192,14 @@ def inspect_open(
     _check_superblock(file, path, offset, row_nbytes)
     try:
         with h5py.File(file, "r") as content:
-            return _inspection(content)
+            found = _inspection(content)
     except (OSError, RuntimeError, KeyError, TypeError, ValueError, PhysxError) as error:
         raise DatasetError(f"{path} is no partition of a dataset, or damaged: {error}.") from error
+    size, field = os.fstat(file.fileno()).st_size, found.identity.field
+    expected = found.data_offset + found.capacity * field.nbytes
+    if size < expected:
+        raise truncated(path, size, expected, found.data_offset, field.nbytes)
+    return found
 
 
 def truncated(path: Path, actual: int, expected: int, offset: int, row_nbytes: int) -> DatasetError:
@@ -219,12 +227,23 @@ def _inspection(content: Any) -> Inspection:
     if attributes["format"] != FORMAT:
         raise ValueError(f"its format is {attributes['format']!r}, not {FORMAT!r}")
     version = int(attributes["format_version"])
-    if version > VERSION:
-        raise ValueError(f"its format has version {version}; this physx reads up to {VERSION}")
-    data, counter = content["data"], content["rows"]
+    if version not in READABLE:
+        raise ValueError(f"its format has version {version}; this physx reads {list(READABLE)}")
+    data, counter = _plain_dataset(content, "data"), _plain_dataset(content, "rows")
+    if counter.shape != () or counter.dtype != np.dtype("<u8") or not data.shape:
+        raise ValueError("its datasets have other shapes or types than a partition's")
     field = Field(
-        str(attributes["field"]), data.shape[1:], data.dtype, attributes["unit"], attributes["role"]
+        str(attributes["field"]),
+        data.shape[1:],
+        data.dtype,
+        str(attributes["unit"]),
+        str(attributes["role"]),  # type: ignore[arg-type]
     )
+    if np.dtype(field.dtype) != data.dtype or field.role not in ("training", "additional"):
+        raise ValueError(f"{data.dtype} and {field.role!r} are no type and role of a field")
+    rows_offset, data_offset = counter.id.get_offset(), data.id.get_offset()
+    if rows_offset is None or (data_offset is None and data.size * field.nbytes):
+        raise ValueError("it has no space for rows")
     identity = Identity(
         str(attributes["session"]),
         str(attributes["mode"]),
@@ -236,6 +255,19 @@ def _inspection(content: Any) -> Inspection:
         identity,
         capacity=data.shape[0],
         rows=min(int(counter[()]), data.shape[0]),
-        rows_offset=counter.id.get_offset(),
-        data_offset=data.id.get_offset() or 0,
+        rows_offset=rows_offset,
+        data_offset=data_offset or 0,
     )
+
+
+def _plain_dataset(content: Any, name: str) -> Any:
+    """Return a dataset whose bytes lie side by side in this very file."""
+    import h5py
+
+    if not isinstance(content.get(name, getlink=True), h5py.HardLink):
+        raise ValueError(f"{name!r} is a link to somewhere else")
+    dataset = content[name]
+    layout = dataset.id.get_create_plist()
+    if layout.get_layout() != h5py.h5d.CONTIGUOUS or layout.get_external_count():
+        raise ValueError(f"{name!r} is not stored as plain rows in this file")
+    return dataset

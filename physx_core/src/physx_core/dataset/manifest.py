@@ -1,26 +1,24 @@
-"""The manifest ``dataset.json``: fields, partitions, normalization and what the data came from."""
+"""What a dataset knows besides its rows: modes, fields, partitions, statistics, and its origin.
+
+`physx_core.dataset.manifest_file` stores it as ``dataset.json``.
+"""
 
 from __future__ import annotations
 
 import json
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from physx_core.dataset import files
 from physx_core.dataset.layout import Identity, partition_file
 from physx_core.errors import ConfigError, DatasetError
-from physx_core.fields import Field
+from physx_core.fields import RESERVED, Field
 from physx_core.statistics import RunningStatistics
-
-FILE = "dataset.json"
-FORMAT = "physx dataset"
-VERSION = 1
 
 
 @dataclass
@@ -30,12 +28,15 @@ class Partition:
     Attributes:
         session: Session that wrote it.
         index: Its number in the session and mode, counted from 0.
-        first_row: Row of the mode that is its first.
+        first_row: Row of the mode that was its first when it was begun; it orders the partitions.
         rows: Committed rows, the same in all fields.
-        sealed: Whether it is complete: every file has exactly these rows and never changes again.
+        sealed: Whether it is complete: every file has exactly these rows.
         offsets: Place of the first row in the file, by field.
-        checksums: CRC-32 of the rows, by field; empty until it is sealed.
+        checksums: CRC-32 of the rows, by field; empty until it is sealed, and while rows are
+            updated in place.
+        counted: Whether the mode's statistics hold its rows.
         writing: Whether this process writes it, so that `offsets` are right though not sealed.
+        running: Statistics of its first rows while it is not counted, by field; not stored.
     """
 
     session: str
@@ -45,7 +46,14 @@ class Partition:
     sealed: bool = False
     offsets: dict[str, int] = field(default_factory=dict)
     checksums: dict[str, int] = field(default_factory=dict)
+    counted: bool = False
     writing: bool = False
+    running: dict[str, RunningStatistics] = field(default_factory=dict, compare=False)
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """What tells it from the other partitions of its mode."""
+        return self.session, self.index
 
     def file_name(self, mode: str, name: str) -> str:
         """Return the name of a field's file."""
@@ -66,21 +74,8 @@ class Partition:
         }
         if self.sealed:
             crc32 = {name: f"{value:08x}" for name, value in self.checksums.items()}
-            plain |= {"rows": self.rows, "crc32": crc32}
+            plain |= {"rows": self.rows, "crc32": crc32, "counted": self.counted}
         return plain
-
-    @classmethod
-    def from_dict(cls, plain: Mapping[str, Any]) -> Partition:
-        """Make what `to_dict` described."""
-        return cls(
-            session=str(plain["session"]),
-            index=int(plain["index"]),
-            first_row=int(plain["first_row"]),
-            rows=int(plain.get("rows", 0)),
-            sealed=bool(plain["sealed"]),
-            offsets={name: int(offset) for name, offset in plain["offsets"].items()},
-            checksums={name: int(crc, 16) for name, crc in plain.get("crc32", {}).items()},
-        )
 
 
 @dataclass
@@ -90,37 +85,85 @@ class Mode:
     Attributes:
         fields: The fields by name; shapes are None until the first rows tell them.
         partitions: In the order of the rows.
-        statistics: Mean and deviation of floating fields; each covers the first rows of the mode,
-            as many as its count says.
+        statistics: Statistics of floating fields, over the rows of all counted partitions.
+        dropped: Partitions that are no part of the mode though their files may be there: they are
+            being removed, or copied from another dataset.
     """
 
     fields: dict[str, Field]
     partitions: list[Partition] = field(default_factory=list)
     statistics: dict[str, RunningStatistics] = field(default_factory=dict)
+    dropped: list[Partition] = field(default_factory=list)
 
     @property
     def rows(self) -> int:
         """Committed rows."""
         return sum(partition.rows for partition in self.partitions)
 
+    @property
+    def next_row(self) -> int:
+        """First row of the next partition, larger than that of any before."""
+        before = (p.first_row + max(1, p.rows) for p in (*self.partitions, *self.dropped))
+        return max(self.rows, *before, 0)
+
+    @property
+    def counted_fields(self) -> dict[str, Field]:
+        """The fields that have statistics."""
+        return {name: of for name, of in self.fields.items() if has_statistics(of)}
+
+    def place(self, partition: Partition) -> int:
+        """Return where in the order a partition is, whatever became of it meanwhile."""
+        return [p.key for p in self.partitions].index(partition.key)
+
+    def start(self, partition: Partition) -> int:
+        """Return the row of the mode that is a partition's first now."""
+        return sum(before.rows for before in self.partitions[: self.place(partition)])
+
+    def swap(self, partition: Partition) -> None:
+        """Put a partition in the place of its earlier state."""
+        self.partitions[self.place(partition)] = partition
+
+    def forget_statistics(self) -> None:
+        """Let the statistics be computed anew from all rows."""
+        self.statistics = {}
+        for place, partition in enumerate(self.partitions):
+            partition.running = {}
+            if partition.counted:
+                self.partitions[place] = replace(partition, counted=False)
+
+    def continues(self, earlier: Mode) -> bool:
+        """Return whether all rows of an earlier state are still here, at the same places."""
+        before = [p for p in earlier.partitions if p.rows]
+        now = [p for p in self.partitions if p.rows]
+        grown = all(
+            old.key == new.key
+            and (old.rows == new.rows or old is before[-1])
+            and (old.checksums == new.checksums or not old.sealed)
+            for old, new in zip(before, now, strict=False)
+        )
+        return grown and len(now) >= len(before) and self.rows >= earlier.rows
+
+    def copy(self) -> Mode:
+        """Return a mode that can be changed while this one stays; partitions are shared."""
+        return Mode(
+            dict(self.fields), list(self.partitions), dict(self.statistics), list(self.dropped)
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        return {
+        plain: dict[str, Any] = {
             "fields": [of.to_dict() for of in self.fields.values()],
             "partitions": [partition.to_dict() for partition in self.partitions],
             "normalization": {name: s.to_dict() for name, s in self.statistics.items() if s.count},
         }
+        if self.dropped:
+            plain["dropped"] = [partition.to_dict() for partition in self.dropped]
+        return plain
 
-    @classmethod
-    def from_dict(cls, plain: Mapping[str, Any]) -> Mode:
-        """Make what `to_dict` described."""
-        fields = [Field.from_dict(of) for of in plain["fields"]]
-        statistics = plain.get("normalization", {})
-        return cls(
-            {of.name: of for of in fields},
-            [Partition.from_dict(partition) for partition in plain["partitions"]],
-            {name: RunningStatistics.from_dict(values) for name, values in statistics.items()},
-        )
+
+def has_statistics(of: Field) -> bool:
+    """Return whether statistics of a field are kept: of floating ones that users define."""
+    return of.name not in RESERVED and np.dtype(of.dtype).kind == "f"
 
 
 def versions() -> dict[str, str]:
@@ -155,54 +198,29 @@ class Manifest:
 
     @property
     def file_names(self) -> set[str]:
-        """Names of all partition files."""
+        """Names of all partition files, also of dropped ones."""
         return {
             partition.file_name(name, of)
             for name, mode in self.modes.items()
-            for partition in mode.partitions
+            for partition in (*mode.partitions, *mode.dropped)
             for of in mode.fields
         }
 
-    def save(self, directory: Path) -> None:
-        """Write the file; a reader finds the old or the new one, whole.
+    def copy(self) -> Manifest:
+        """Return a manifest that can be changed while this one stays; partitions are shared."""
+        modes = {name: mode.copy() for name, mode in self.modes.items()}
+        return Manifest(modes, dict(self.info), dict(self.versions), dict(self.problems))
 
-        Raises:
-            OSError: It cannot be written; the old one is still there.
-        """
-        plain = {
-            "format": FORMAT,
-            "format_version": VERSION,
-            "versions": self.versions,
-            "info": self.info,
-            "modes": {name: mode.to_dict() for name, mode in self.modes.items()},
-        }
-        files.replace(directory / FILE, json.dumps(plain, indent=1).encode())
-
-    @classmethod
-    def load(cls, directory: Path) -> Manifest:
-        """Read the file.
-
-        Raises:
-            FileNotFoundError: There is none.
-            DatasetError: It is not the manifest of a dataset.
-        """
-        path = directory / FILE
-        try:
-            plain = json.loads(path.read_text(encoding="utf-8"))
-            if plain["format"] != FORMAT or plain["format_version"] > VERSION:
-                raise ValueError(f"{plain['format']!r} version {plain['format_version']!r}")
-            modes = {name: Mode.from_dict(mode) for name, mode in plain["modes"].items()}
-            return cls(modes, dict(plain["info"]), dict(plain["versions"]))
-        except (ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
-            raise DatasetError(
-                f"{path} ({path.stat().st_size} bytes) is not the manifest of a dataset that this "
-                f"version reads: {error!r}. Delete or rename it, and everything but the info is "
-                "rebuilt from the partition files; no row is lost."
-            ) from error
-        except FileNotFoundError:
-            raise
-        except OSError as error:
-            raise DatasetError(f"{path} cannot be read: {error.strerror}.") from error
+    def take(self, other: Manifest) -> bool:
+        """Become what `other` is; return whether rows known before are now at other places."""
+        moved = any(
+            name not in other.modes or not other.modes[name].continues(mode)
+            for name, mode in self.modes.items()
+            if name not in self.problems
+        )
+        self.modes, self.info = other.modes, other.info
+        self.versions, self.problems = other.versions, other.problems
+        return moved
 
 
 def plain_info(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import zlib
 from pathlib import Path
 
 from physx_core.dataset import files
@@ -95,6 +96,11 @@ class PartitionFile:
         """Make the first `rows` rows part of the dataset."""
         files.write_at(self._descriptor, rows.to_bytes(8, "little"), self._rows_offset)
 
+    @property
+    def descriptor(self) -> int:
+        """The open file."""
+        return self._descriptor
+
     def sync(self) -> None:
         """Wait until everything written is on the disk."""
         os.fdatasync(self._descriptor)
@@ -102,8 +108,12 @@ class PartitionFile:
     def close(self) -> None:
         """Close the file; calling it again does nothing."""
         if self._descriptor >= 0:
-            os.close(self._descriptor)
-            self._descriptor = -1
+            os.close(self.hand_over())
+
+    def hand_over(self) -> int:
+        """Return the open file to somebody else, who closes it."""
+        descriptor, self._descriptor = self._descriptor, -1
+        return descriptor
 
     def _allocate(self, end: int) -> None:
         os.posix_fallocate(self._descriptor, self._reserved, end - self._reserved)
@@ -125,12 +135,34 @@ def rewrite(path: Path, identity: Identity, rows: int, data_offset: int) -> int:
     Raises:
         OSError: The new file cannot be written; the present one is left as it is.
     """
+    return copy(path, data_offset, path, identity, rows)[0]
+
+
+def copy(
+    source: Path, source_offset: int, path: Path, identity: Identity, rows: int
+) -> tuple[int, int]:
+    """Make a partition file of the rows of another; it has its name when it is complete.
+
+    Args:
+        source: The other file.
+        source_offset: Where its rows begin.
+        path: The file to make; one of this name is replaced.
+        identity: What it is part of.
+        rows: How many rows it gets.
+
+    Returns:
+        Where they begin in the file, and their CRC-32.
+
+    Raises:
+        OSError: The file cannot be written; nothing was changed.
+    """
     header = make_header(identity, rows, rows)
     draft = files.temporary(path)
     descriptor = _write_header(draft, header)
     try:
         try:
-            _copy(path, data_offset, descriptor, header.data_offset, rows * identity.field.nbytes)
+            count = rows * identity.field.nbytes
+            crc = _copy(source, source_offset, descriptor, header.data_offset, count)
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
@@ -138,11 +170,11 @@ def rewrite(path: Path, identity: Identity, rows: int, data_offset: int) -> int:
     except OSError:
         draft.unlink(missing_ok=True)
         raise
-    return header.data_offset
+    return header.data_offset, crc
 
 
 def _write_header(path: Path, header: Header) -> int:
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o666)
+    descriptor = files.create_new(path)
     try:
         os.ftruncate(descriptor, header.size)
         files.write_at(descriptor, header.content, 0)
@@ -153,13 +185,16 @@ def _write_header(path: Path, header: Header) -> int:
     return descriptor
 
 
-def _copy(source: Path, source_offset: int, target: int, target_offset: int, count: int) -> None:
-    buffer = memoryview(bytearray(min(count, _COPY)))
-    with source.open("rb", buffering=0) as file:
-        done = 0
+def _copy(source: Path, source_offset: int, target: int, target_offset: int, count: int) -> int:
+    buffer, done, crc = memoryview(bytearray(min(count, _COPY))), 0, 0
+    origin = files.open_regular(source)
+    try:
         while done < count:
             part = buffer[: count - done]
-            if not files.read_at(file.fileno(), part, source_offset + done):
+            if not files.read_at(origin, part, source_offset + done):
                 raise OSError(errno.EIO, f"{source} became shorter while it was read")
             files.write_at(target, part, target_offset + done)
-            done += len(part)
+            crc, done = zlib.crc32(part, crc), done + len(part)
+    finally:
+        os.close(origin)
+    return crc

@@ -13,7 +13,6 @@ import numpy as np
 from physx_core.dataset import files
 from physx_core.dataset.layout import (
     SIGNATURE,
-    cannot_open,
     inspect_open,
     open_partition,
     truncated,
@@ -68,22 +67,6 @@ class Segment:
             file.close()
             raise
         return file, offset
-
-    def map(self, field: Field) -> Array:
-        """Return the rows as an array that the system reads from the file as they are used.
-
-        Raises:
-            DatasetError: The file is missing, truncated or damaged, or too many files are open.
-        """
-        shape = (self.rows, *(field.shape or ()))
-        file, offset = self.open(field.nbytes)
-        with file:
-            if not field.nbytes:
-                return np.empty(shape, field.dtype)
-            try:
-                return np.asarray(np.memmap(file, field.dtype, "r", offset, shape))
-            except OSError as error:
-                raise cannot_open(self.path, error) from error
 
 
 class Reader:

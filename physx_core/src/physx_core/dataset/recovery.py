@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
-from physx_core.dataset import manifest as manifests
-from physx_core.dataset.layout import FORMAT, Inspection, inspect
+from physx_core.dataset import manifest_file
+from physx_core.dataset.definitions import compare_fields
+from physx_core.dataset.layout import FORMAT, Inspection, inspect, open_partition
 from physx_core.dataset.manifest import Manifest, Mode, Partition
-from physx_core.dataset.sealing import remove_files, seal
-from physx_core.errors import DatasetError, DatasetNotFoundError, listed
+from physx_core.dataset.sealing import remove_files, scanned, seal, sync_files
+from physx_core.errors import DatasetError, DatasetNotFoundError, FieldsMismatchError, listed
+from physx_core.fields import Field
+
+_ATTEMPTS = 20
+_NAME = re.compile(r".+_\w+_\w+_\d+\.h5")
 
 Group = dict[str, Inspection]
 
@@ -35,77 +43,185 @@ def locate(directory: str | Path) -> Path:
 
 def holds_dataset(folder: Path) -> bool:
     """Return whether a folder holds a manifest or partition files."""
-    if (folder / manifests.FILE).is_file():
+    if (folder / manifest_file.FILE).is_file():
         return True
-    return folder.is_dir() and any(_is_partition(path) for path in folder.glob("*.h5"))
+    return folder.is_dir() and any(is_partition(path) for path in folder.glob("*.h5"))
 
 
-def load(directory: Path) -> Manifest:
+def load(directory: Path, *, edited: bool = False) -> Manifest:
     """Read the manifest, or rebuild it from the partition files, and count what is committed.
 
     Nothing on the disk is changed. Modes whose rows cannot be counted are noted as problems.
 
+    Args:
+        directory: The dataset's folder.
+        edited: Whether to take a manifest that was edited by hand.
+
     Raises:
         DatasetError: The manifest is not valid, or is missing and a partition is damaged.
     """
-    try:
-        manifest = Manifest.load(directory)
-        strict = False
-    except FileNotFoundError:
-        manifest, strict = Manifest(), True
-    _adopt(directory, manifest, strict)
-    for name, mode in manifest.modes.items():
-        try:
-            _count(directory, name, mode)
-        except DatasetError as error:
-            manifest.problems[name] = error
+    for _ in range(_ATTEMPTS):
+        before = _state(directory)
+        manifest = _load(directory, edited)
+        if _state(directory) == before:  # otherwise a writer has replaced it meanwhile
+            break
     return manifest
 
 
-def repair(directory: Path, manifest: Manifest) -> bool:
+def load_from_files(directory: Path) -> Manifest:
+    """Make a manifest of the partition files alone; nothing on the disk is changed.
+
+    Raises:
+        DatasetError: A partition is damaged.
+    """
+    manifest = Manifest()
+    _adopt(directory, manifest, strict=True)
+    _count_all(directory, manifest)
+    return manifest
+
+
+def damaged_files(directory: Path) -> Iterator[tuple[Path, DatasetError]]:
+    """Yield the partition files that cannot be opened, and why."""
+    for path in sorted(directory.glob("*.h5")):
+        try:
+            inspect(path)
+        except DatasetError as error:
+            if not _is_foreign(path):
+                yield path, error
+
+
+def refresh(directory: Path, manifest: Manifest) -> bool:
+    """See what other processes have committed; return whether rows known before have moved.
+
+    Raises:
+        DatasetError: The manifest is not valid any more.
+    """
+    return manifest.take(load(directory))
+
+
+def repair(directory: Path, manifest: Manifest) -> list[str]:
     """Seal what a killed writer left open and remove what it left half made.
 
     Returns:
-        Whether anything was sealed or removed from the manifest.
+        What was sealed, completed or removed from the manifest, as texts.
 
     Raises:
         DatasetError: A partition is missing or damaged.
         OSError: A partition cannot be rewritten; nothing is lost.
     """
-    changed = False
     if manifest.problems:
         raise next(iter(manifest.problems.values()))
-    for draft in chain(directory.glob("*.h5.tmp"), directory.glob(manifests.FILE + ".tmp")):
+    done = []
+    for draft in chain(directory.glob("*.h5.tmp"), directory.glob(manifest_file.FILE + ".tmp")):
         draft.unlink()
     for name, mode in manifest.modes.items():
         for partition in [p for p in mode.partitions if not p.sealed]:
-            changed = True
             if partition.rows:
-                seal(directory, name, mode, partition)
+                mode.swap(seal(directory, name, mode.fields, partition))
+                what = f"of {partition.rows} rows was left open and is sealed now."
             else:
                 mode.partitions.remove(partition)
-                remove_files(directory, name, mode, partition)
+                mode.dropped.append(partition)
+                what = "had no committed row and is removed."
+            done.append(f"{_label(name, partition)} {what}")
+    if complete_checksums(directory, manifest):
+        done.append("Rows were being updated in place: their checksums are computed anew.")
+    if any(mode.dropped for mode in manifest.modes.values()):
+        manifest_file.save(directory, manifest)  # now nothing refers to the files any more
+        clear_dropped(directory, manifest)
+        done = done or ["What was left of removed partitions is gone now."]
     for path in _unlisted(directory, manifest):
-        if _is_partition(path) and not inspect(path).rows:
+        if is_partition(path) and not inspect(path).rows:
             path.unlink()
+    return done
+
+
+def clear_dropped(directory: Path, manifest: Manifest) -> None:
+    """Remove the files of dropped partitions, and forget them.
+
+    Raises:
+        OSError: A file cannot be removed.
+    """
+    for name, mode in manifest.modes.items():
+        for partition in mode.dropped:
+            remove_files(directory, name, mode, partition)
+        mode.dropped.clear()
+
+
+def complete_checksums(directory: Path, manifest: Manifest) -> bool:
+    """Compute the checksums that updates in place have made void; return whether there were any.
+
+    Raises:
+        DatasetError: A partition is missing or damaged.
+        OSError: The rows cannot be brought to the disk.
+    """
+    changed = False
+    for name, mode in manifest.modes.items():
+        for partition in [p for p in mode.partitions if p.sealed and not p.checksums]:
+            changed = True
+            sync_files(directory, name, mode, partition)
+            found = scanned(directory, name, mode.fields, partition)
+            if partition.counted:
+                found = replace(found, counted=True, running={})
+            mode.swap(found)
     return changed
 
 
+def is_partition(path: Path) -> bool:
+    """Return whether a file calls itself a partition, as far as its first bytes tell."""
+    try:
+        with open_partition(path) as file:
+            return FORMAT.encode() in (file.read(2**14) or b"")
+    except DatasetError:  # a link, a pipe, or no right to read it
+        return False
+
+
+def _load(directory: Path, edited: bool) -> Manifest:
+    try:
+        manifest = manifest_file.load(directory, edited=edited)
+    except FileNotFoundError:
+        return load_from_files(directory)
+    _adopt(directory, manifest, strict=False)
+    _count_all(directory, manifest)
+    return manifest
+
+
+def _state(directory: Path) -> tuple[int, int] | None:
+    """Return what changes whenever the manifest is replaced."""
+    try:
+        now = (directory / manifest_file.FILE).stat()
+    except OSError:
+        return None
+    return now.st_ino, now.st_mtime_ns
+
+
+def _count_all(directory: Path, manifest: Manifest) -> None:
+    for name, mode in manifest.modes.items():
+        try:
+            _count(directory, name, mode)
+        except DatasetError as error:
+            manifest.problems[name] = error
+
+
 def _count(directory: Path, mode_name: str, mode: Mode) -> None:
-    """Ask the files of unsealed partitions for their rows, and number the partitions' rows."""
-    first_row = 0
+    """Ask the files of unsealed partitions for their rows."""
     for partition in mode.partitions:
-        if not partition.sealed:
-            partition.rows = min(
-                inspect(
-                    directory / partition.file_name(mode_name, name),
-                    partition.offsets.get(name),
-                    field.nbytes,
-                ).rows
-                for name, field in mode.fields.items()
+        if partition.sealed:
+            continue
+        found = {
+            name: inspect(
+                directory / partition.file_name(mode_name, name),
+                partition.offsets.get(name),
+                field.nbytes,
             )
-        partition.first_row = first_row
-        first_row += partition.rows
+            for name, field in mode.fields.items()
+        }
+        for name, field in mode.fields.items():
+            if found[name].identity.field != field and field.shape is not None:
+                path = directory / partition.file_name(mode_name, name)
+                have = found[name].identity.field
+                raise DatasetError(f"{path} holds {have}, but the dataset says {field}.")
+        partition.rows = min(inspection.rows for inspection in found.values())
 
 
 def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
@@ -126,6 +242,9 @@ def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
         if not all(found.rows for found in group.values()):
             continue  # the writer was killed before the partition's first commit
         fields = {name: found.identity.field for name, found in sorted(group.items(), key=_role)}
+        mode = manifest.modes.get(mode_name)
+        if mode is not None and not strict and not _fits(mode, fields):
+            continue  # a part of what was being removed, or nothing of this dataset
         mode = manifest.modes.setdefault(mode_name, Mode(fields))
         first_row = next(iter(group.values())).identity.first_row
         mode.partitions.append(Partition(session, index, first_row))
@@ -134,6 +253,18 @@ def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
             for name, field in fields.items()
             if name not in mode.fields or mode.fields[name].shape is None
         }
+
+
+def _fits(mode: Mode, fields: Mapping[str, Field]) -> bool:
+    try:
+        compare_fields("", mode.fields, fields)
+    except FieldsMismatchError:
+        return False
+    return True
+
+
+def _label(mode_name: str, partition: Partition) -> str:
+    return f"Partition {partition.index} of session {partition.session!r} and mode {mode_name!r}"
 
 
 def _order(item: tuple[tuple[str, str, int], Group]) -> tuple[str, int, str, int]:
@@ -151,18 +282,14 @@ def _unlisted(directory: Path, manifest: Manifest) -> list[Path]:
     return [path for path in sorted(directory.glob("*.h5")) if path.name not in known]
 
 
-def _is_partition(path: Path) -> bool:
-    """Return whether a file calls itself a partition, as far as its first bytes tell."""
-    with path.open("rb") as file:
-        return FORMAT.encode() in file.read(2**14)
-
-
 def _is_foreign(path: Path) -> bool:
-    """Return whether a file is sound HDF5, but no partition."""
+    """Return whether a file is no partition: by its name, or because it is other, sound HDF5."""
     import h5py
 
+    if not _NAME.fullmatch(path.name):
+        return True
     try:
-        with path.open("rb") as raw, h5py.File(raw, "r") as file:
+        with open_partition(path) as raw, h5py.File(raw, "r") as file:
             return bool(file.attrs.get("format") != FORMAT)
-    except (OSError, RuntimeError):
+    except (DatasetError, OSError, RuntimeError):
         return False

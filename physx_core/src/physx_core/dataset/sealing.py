@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import os
 import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from physx_core.dataset import files
 from physx_core.dataset.layout import inspect
-from physx_core.dataset.manifest import Mode, Partition
+from physx_core.dataset.manifest import Mode, Partition, has_statistics
 from physx_core.dataset.partition import rewrite
-from physx_core.dataset.reader import Reader, Segment
+from physx_core.dataset.reader import Segment
 from physx_core.errors import DatasetError
-from physx_core.fields import RESERVED
+from physx_core.fields import Array, Field
 from physx_core.statistics import RunningStatistics
 
-_BLOCK = 2**22
+_BLOCK = 2**20
 
 
-def seal(directory: Path, mode_name: str, mode: Mode, partition: Partition) -> None:
+def seal(
+    directory: Path, mode_name: str, fields: Mapping[str, Field], partition: Partition
+) -> Partition:
     """Rewrite a partition's files at their exact size, if they are not full, and checksum them.
 
     A process that dies meanwhile leaves files that hold all the rows, some in their final form.
@@ -27,25 +32,48 @@ def seal(directory: Path, mode_name: str, mode: Mode, partition: Partition) -> N
     Args:
         directory: The dataset's folder.
         mode_name: Name of the mode.
-        mode: The mode.
+        fields: The fields of the mode.
         partition: What to seal; nothing writes to it any more.
+
+    Returns:
+        The sealed partition, for the manifest.
 
     Raises:
         DatasetError: A file is missing or damaged.
-        OSError: A file cannot be rewritten; the partition stays as it is, unsealed.
+        OSError: A file cannot be rewritten; all rows are still there.
     """
-    for name, field in mode.fields.items():
+    offsets = {}
+    for name, field in fields.items():
         path = directory / partition.file_name(mode_name, name)
         found = inspect(path, partition.offsets.get(name), field.nbytes)
-        offset = found.data_offset
+        offsets[name] = found.data_offset
         if found.capacity != partition.rows or found.rows != partition.rows:
             identity = partition.identity(mode_name, field)
-            offset = rewrite(path, identity, partition.rows, offset)
-        partition.offsets[name] = offset
-        rows = Segment(path, 0, partition.rows, offset, certain=True)
-        partition.checksums[name] = checksum(rows, field.nbytes)
+            offsets[name] = rewrite(path, identity, partition.rows, found.data_offset)
     files.sync_folder(directory)
-    partition.sealed, partition.writing = True, False
+    sealed = replace(partition, offsets=offsets, sealed=True, writing=False)
+    return scanned(directory, mode_name, fields, sealed)
+
+
+def scanned(
+    directory: Path, mode_name: str, fields: Mapping[str, Field], partition: Partition
+) -> Partition:
+    """Return a sealed partition with checksums and statistics of its rows, read once for both.
+
+    Raises:
+        DatasetError: A file is missing, truncated or damaged.
+    """
+    crc, running = {}, {}
+    for name, field in fields.items():
+        path = directory / partition.file_name(mode_name, name)
+        rows = Segment(path, 0, partition.rows, partition.offsets[name], certain=True)
+        statistics = running[name] = RunningStatistics()
+        crc[name] = 0
+        for block in _blocks(rows, field):
+            crc[name] = zlib.crc32(files.raw(block), crc[name])
+            if has_statistics(field):
+                statistics.update(block)
+    return replace(partition, checksums=crc, running=running, counted=False)
 
 
 def checksum(segment: Segment, row_nbytes: int) -> int:
@@ -67,28 +95,30 @@ def checksum(segment: Segment, row_nbytes: int) -> int:
     return crc
 
 
+def _blocks(rows: Segment, field: Field) -> Iterator[Array]:
+    """Yield the rows of a segment in blocks, each valid until the next."""
+    count = max(1, _BLOCK // max(1, field.nbytes))
+    buffer = np.empty((min(count, rows.rows), *(field.shape or ())), field.dtype)
+    file, place = rows.open(field.nbytes)
+    with file:
+        for first in range(0, rows.rows, count):
+            block = buffer[: rows.rows - first]
+            if not files.read_at(file.fileno(), files.raw(block), place + first * field.nbytes):
+                raise DatasetError(f"{rows.path} became shorter while it was read.")
+            yield block
+
+
+def sync_files(directory: Path, mode_name: str, mode: Mode, partition: Partition) -> None:
+    """Bring the rows of a partition to the disk."""
+    for name in mode.fields:
+        descriptor = files.open_regular(directory / partition.file_name(mode_name, name))
+        try:
+            os.fdatasync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
 def remove_files(directory: Path, mode_name: str, mode: Mode, partition: Partition) -> None:
-    """Remove the files of a partition that has no committed row."""
+    """Remove the files of a partition that the manifest does not list any more."""
     for name in mode.fields:
         (directory / partition.file_name(mode_name, name)).unlink(missing_ok=True)
-
-
-def cover(reader: Reader, mode_name: str) -> None:
-    """Bring the statistics of a mode's floating fields up to its last committed row.
-
-    Args:
-        reader: Reads the rows that are not covered yet.
-        mode_name: Name of the mode.
-
-    Raises:
-        DatasetError: A partition is missing or damaged.
-    """
-    mode = reader.mode(mode_name)
-    for name, field in mode.fields.items():
-        if name in RESERVED or np.dtype(field.dtype).kind != "f":
-            continue
-        statistics = mode.statistics.setdefault(name, RunningStatistics())
-        if statistics.count > mode.rows:
-            statistics = mode.statistics[name] = RunningStatistics()
-        for block in reader.blocks(mode_name, name, statistics.count):
-            statistics.update(block)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
+from physx_core.dataset.cache import ColumnCache
 from physx_core.dataset.reader import Reader
-from physx_core.dataset.sampling import ColumnCache
 from physx_core.fields import Array, Field
 
 
@@ -74,7 +74,8 @@ class FieldView:
         return self._reader.read(self._mode, self.field.name, start, stop)
 
     def _gather(self, index: Array) -> Array:
-        column = self._columns.get(self._mode, [self.field.name], load=False)[0]
+        column = self._columns.map(self._mode, self.field.name)
+        column.check()
         out = np.empty((len(index), *column.shape[1:]), column.dtype)
         column.gather(index.astype(np.intp, copy=False), out)
         return out

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+from collections import deque
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from physx_core.dataset import files
+from physx_core.dataset import coverage, files, recovery
 from physx_core.dataset.index import write_index
-from physx_core.dataset.manifest import Manifest, Mode, Partition
+from physx_core.dataset.ledger import Ledger
+from physx_core.dataset.manifest import Mode, Partition
 from physx_core.dataset.partition import PartitionFile
 from physx_core.dataset.reader import Reader
-from physx_core.dataset.sealing import cover, remove_files, seal
+from physx_core.dataset.sealing import remove_files, seal
+from physx_core.dataset.syncing import Syncer
 from physx_core.errors import DatasetError
-from physx_core.fields import Batch
+from physx_core.fields import Batch, Field
 
 _HEADER = 2**14
 
@@ -27,12 +32,16 @@ class OpenPartition:
     """
 
     def __init__(
-        self, partition: Partition, capacity: int, parts: dict[str, PartitionFile], durable: bool
+        self,
+        partition: Partition,
+        capacity: int,
+        parts: dict[str, PartitionFile],
+        syncer: Syncer | None,
     ) -> None:
         self.partition = partition
         self.capacity = capacity
         self._files = parts
-        self._durable = durable
+        self._syncer = syncer
 
     @property
     def free(self) -> int:
@@ -45,30 +54,39 @@ class OpenPartition:
         Raises:
             OSError: The disk is full; no row of the block was committed.
         """
+        if self._syncer is not None:
+            self._syncer.check()
         first = self.partition.rows
         last = first + count
         for file in self._files.values():
             file.reserve(last)
         for name, file in self._files.items():
             file.write(first, rows[name][start : start + count])
-        self._sync()
+        self._wait()
         try:
             for file in self._files.values():
                 file.commit(last)
-            self._sync()
+            self._wait()
         except BaseException:  # an interrupt, too: the next rows go to the same place
             for file in self._files.values():
                 file.commit(first)
             raise
         self.partition.rows = last
+        if self._syncer is not None:
+            for file in self._files.values():
+                self._syncer.note(file.descriptor)
 
     def close(self) -> None:
-        """Close the files."""
+        """Close the files, now or after their last sync."""
         for file in self._files.values():
-            file.close()
+            if self._syncer is not None:
+                self._syncer.retire(file.hand_over())
+            else:
+                file.close()
 
-    def _sync(self) -> None:
-        if self._durable:
+    def _wait(self) -> None:
+        """Wait for the disk, if no syncer comes by."""
+        if self._syncer is None:
             for file in self._files.values():
                 file.sync()
 
@@ -77,29 +95,27 @@ class Writer:
     """Appends checked rows to the modes of a dataset."""
 
     def __init__(
-        self,
-        directory: Path,
-        manifest: Manifest,
-        session: str,
-        max_file_size: float,
-        durable: bool = False,
+        self, ledger: Ledger, session: str, max_file_size: float, durable: bool = False
     ) -> None:
         """Keep where and how to write.
 
         Args:
-            directory: The dataset's folder.
-            manifest: What the dataset holds; kept up to date here and on the disk.
+            ledger: What the dataset holds; kept up to date here and on the disk.
             session: Name of the session that writes.
             max_file_size: Size in GB at which a partition is full.
-            durable: Whether a commit waits for the disk, to survive a power cut too.
+            durable: Whether a commit waits for the disk; otherwise files are synced about once a
+                second.
         """
         self.session = session
-        self._directory = directory
-        self._manifest = manifest
+        self.durable = durable
+        self.ledger = ledger
+        self._directory = ledger.directory
         self._max_nbytes = int(max_file_size * 1e9) - _HEADER
-        self._durable = durable
-        self._reader = Reader(directory, manifest)
+        self._syncer = None if durable else Syncer()
+        self._reader = Reader(ledger.directory, ledger.manifest)
         self._open: dict[str, OpenPartition] = {}
+        self._sealing: deque[tuple[str, Partition, Future[Partition]]] = deque()
+        self._sealer = ThreadPoolExecutor(1, "physx-seal")
 
     def append(self, mode_name: str, rows: Batch, count: int) -> None:
         """Store and commit rows.
@@ -122,10 +138,37 @@ class Writer:
                 partition.append(rows, done, part)
                 done += part
 
-    def save(self) -> None:
-        """Write the manifest."""
-        with files.storing("The dataset's manifest"):
-            self._manifest.save(self._directory)
+    def refresh(self) -> bool:
+        """See what other writers have committed; return whether rows known before have moved.
+
+        Raises:
+            DatasetError: The manifest is not valid any more.
+        """
+        if self.ledger.shared:
+            with files.storing("What other writers did"), files.turn(self._directory):
+                self.ledger.reload(recovery.load(self._directory))
+        moved, self.ledger.moved = self.ledger.moved, False
+        return moved
+
+    def finish(self, mode_name: str) -> None:
+        """Seal the open partition of a mode, if there is one, and all that wait for it.
+
+        Raises:
+            DatasetError: It is damaged.
+            OSError: The storage fails; its rows can be read, and it is sealed later.
+        """
+        if mode_name in self._open:
+            self._retire(mode_name)
+        self.wait()
+
+    def wait(self) -> None:
+        """Wait until everything that is full is sealed.
+
+        Raises:
+            DatasetError: A partition is damaged.
+            OSError: The storage fails; its rows can be read, and it is sealed later.
+        """
+        self._collect(wait=True)
 
     def close(self) -> None:
         """Seal what is open, and write manifest and index.
@@ -139,73 +182,104 @@ class Writer:
         try:
             with files.storing("The dataset's last partition"):
                 for mode_name in list(self._open):
-                    self._seal(mode_name)
-                self._save_all()
+                    self._retire(mode_name)
+                self._collect(wait=True)
+                self._complete()
         except DatasetError as error:
             cause = error.__cause__
             if not (isinstance(cause, OSError) and cause.errno in files.FULL):
                 raise
         finally:
-            for partition in self._open.values():
-                partition.close()
+            self._sealer.shutdown()
+            for opened in self._open.values():
+                opened.close()
             self._open.clear()
+            if self._syncer is not None:
+                with files.storing("The last rows"):
+                    self._syncer.close()
 
     def _next(self, mode_name: str) -> OpenPartition:
-        """Seal the full partition of a mode, if there is one, and begin the next."""
-        sealed = mode_name in self._open
-        if sealed:
-            self._seal(mode_name)
-        mode = self._manifest.modes[mode_name]
-        partition = self._open[mode_name] = self._begin(mode_name, mode)
-        if sealed:
-            write_index(self._directory, self.session, self._manifest)
-        return partition
+        """Have the full partition of a mode sealed, if there is one, and begin the next."""
+        if mode_name in self._open:
+            self._retire(mode_name)
+        self._collect(wait=False)
+        opened = self._open[mode_name] = self._begin(mode_name)
+        return opened
 
-    def _begin(self, mode_name: str, mode: Mode) -> OpenPartition:
+    def _retire(self, mode_name: str) -> None:
+        """Close the open partition of a mode and have it sealed, beside the writing."""
+        opened = self._open.pop(mode_name)
+        entry = opened.partition
+        entry.writing = not opened.free  # one that is full keeps its files as they are
+        opened.close()
+        fields = self.ledger.manifest.modes[mode_name].fields
+        work = self._sealer.submit(_sealed, self._directory, mode_name, fields, replace(entry))
+        self._sealing.append((mode_name, entry, work))
+
+    def _collect(self, *, wait: bool) -> None:
+        """Note in the manifest which partitions have been sealed."""
+        while self._sealing and (wait or self._sealing[0][2].done()):
+            mode_name, entry, work = self._sealing.popleft()
+            sealed = work.result()
+            with self.ledger.changing() as manifest:
+                mode = manifest.modes[mode_name]
+                if sealed.rows:
+                    mode.swap(sealed)
+                    coverage.settle(mode)
+                    write_index(self._directory, self.session, manifest)
+                else:
+                    del mode.partitions[mode.place(entry)]
+            if not sealed.rows:
+                remove_files(self._directory, mode_name, mode, entry)
+
+    def _begin(self, mode_name: str) -> OpenPartition:
         """Create the files of a partition, then list it; only then rows may be committed."""
-        entry = Partition(self.session, self._free_index(mode_name, mode), mode.rows, writing=True)
-        row_nbytes = max(1, *(field.nbytes for field in mode.fields.values()))
-        capacity = max(1, self._max_nbytes // row_nbytes)
         parts: dict[str, PartitionFile] = {}
         try:
-            for name, field in mode.fields.items():
-                identity = entry.identity(mode_name, field)
-                parts[name] = PartitionFile.create(self._directory, identity, capacity)
-                entry.offsets[name] = parts[name].data_offset
-            for part in parts.values():
-                part.publish()
-            mode.partitions.append(entry)
-            self._manifest.save(self._directory)
+            with self.ledger.changing() as manifest:
+                mode = manifest.modes[mode_name]
+                row_nbytes = max(1, *(field.nbytes for field in mode.fields.values()))
+                capacity = max(1, self._max_nbytes // row_nbytes)
+                entry = self.new_partition(mode_name, mode)
+                entry.writing = True
+                for name, field in mode.fields.items():
+                    identity = entry.identity(mode_name, field)
+                    parts[name] = PartitionFile.create(self._directory, identity, capacity)
+                    entry.offsets[name] = parts[name].data_offset
+                for part in parts.values():
+                    part.publish()
+                mode.partitions.append(entry)
         except BaseException:
-            if entry in mode.partitions:
-                mode.partitions.remove(entry)
             for part in parts.values():
                 part.discard()
             raise
-        return OpenPartition(entry, capacity, parts, self._durable)
+        return OpenPartition(entry, capacity, parts, self._syncer)
 
-    def _free_index(self, mode_name: str, mode: Mode) -> int:
-        """Return the first number whose files do not exist yet."""
-        used = [p.index for p in mode.partitions if p.session == self.session]
-        entry = Partition(self.session, max(used, default=-1) + 1, 0)
+    def new_partition(self, mode_name: str, mode: Mode) -> Partition:
+        """Return a partition with the first number whose files do not exist yet."""
+        listed = (*mode.partitions, *mode.dropped)
+        used = [partition.index for partition in listed if partition.session == self.session]
+        entry = Partition(self.session, max(used, default=-1) + 1, mode.next_row)
         while any(
             (self._directory / entry.file_name(mode_name, name)).exists() for name in mode.fields
         ):
             entry = replace(entry, index=entry.index + 1)
-        return entry.index
+        return entry
 
-    def _seal(self, mode_name: str) -> None:
-        """Seal the open partition of a mode, or remove it if it is empty."""
-        mode, entry = self._manifest.modes[mode_name], self._open[mode_name].partition
-        if entry.rows:
-            with contextlib.suppress(DatasetError):  # an older partition is damaged: not now
-                cover(self._reader, mode_name)
-            seal(self._directory, mode_name, mode, entry)
-        else:
-            mode.partitions.remove(entry)
-            remove_files(self._directory, mode_name, mode, entry)
-        self._open.pop(mode_name).close()
+    def _complete(self) -> None:
+        """Compute what is missing: checksums of updated partitions, statistics, the index."""
+        if self.ledger.shared:
+            return
+        manifest = self.ledger.manifest
+        recovery.complete_checksums(self._directory, manifest)
+        for mode_name in manifest.modes:
+            with contextlib.suppress(DatasetError):  # a partition is damaged: not now
+                coverage.statistics_of(self._reader, mode_name)
+        with self.ledger.changing():
+            write_index(self._directory, self.session, manifest)
 
-    def _save_all(self) -> None:
-        write_index(self._directory, self.session, self._manifest)
-        self._manifest.save(self._directory)
+
+def _sealed(
+    directory: Path, mode_name: str, fields: Mapping[str, Field], partition: Partition
+) -> Partition:
+    return seal(directory, mode_name, fields, partition) if partition.rows else partition

@@ -47,6 +47,8 @@ class Environment:
         factory: Draws the environment; None where no visualizer looks on.
         compute_training_data: False in the sub-steps whose data nobody reads.
         step_index: Number of steps that were finished before the present one.
+        episode_index: Number of the present trajectory, counted from 0.
+        sample_episode: Number of the trajectory that the last training data belong to.
         sample: A stored row that the environment shall replay, or None.
     """
 
@@ -78,6 +80,8 @@ class Environment:
         self.factory: Factory | None = None
         self.compute_training_data = True
         self.step_index = 0
+        self.episode_index = 0
+        self.sample_episode = 0
         self.sample: Sample | None = None
         self._fields: dict[str, Field] = {}
         self._training: dict[str, Any] | None = None
@@ -140,6 +144,16 @@ class Environment:
     def set_training_data(self, **fields: Any) -> None:
         """Give this step's training data: every training field, as arrays or numbers."""
         self._training = fields
+        self.sample_episode = self.episode_index
+
+    def new_episode(self) -> None:
+        """Begin a new trajectory: data that are given from now on do not continue those before.
+
+        Call it where the state jumps, for example where a new motion is drawn; the first
+        trajectory begins by itself. Rows keep the number in the field ``episode``, so that
+        `Dataset.episodes` can cut the trajectories out again.
+        """
+        self.episode_index += 1
 
     def set_additional_data(self, **fields: Any) -> None:
         """Give this step's additional data: every additional field, as arrays or numbers."""

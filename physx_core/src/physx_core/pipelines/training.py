@@ -41,7 +41,7 @@ class Training(Pipeline):
         batch_id: Number of batches of the present epoch that are finished.
         losses: What `Optimization.transform_loss` returned for the present batch.
         training_loss: Mean loss over the batches of the last epoch; NaN before its end.
-        validation_loss: Mean loss over the validation mode; NaN before the first validation.
+        validation_loss: Mean loss over the samples to validate with; NaN before the first time.
         checkpoint_path: Folder of the checkpoint that was written last.
     """
 
@@ -64,7 +64,8 @@ class Training(Pipeline):
     seed: int | None = at_least(0, None)
     """Seed of the network's first parameters and of the order of samples; None: a fresh one."""
     validation_every: int = at_least(0, 1)
-    """Validate after each so many epochs, if the dataset has a validation mode; 0: never."""
+    """Validate after each so many epochs, if the dataset has a validation mode or
+    `validation_split` holds samples back; 0: never."""
     resume: bool = field(default=False, metadata={"recorded": False})
     """Go on from the session's last checkpoint, until `epoch_nb` epochs are made in all."""
 
@@ -177,7 +178,7 @@ class Training(Pipeline):
         self.save_checkpoint()
 
     def validate(self) -> float:
-        """Return the mean loss over the samples of the validation mode."""
+        """Return the mean loss over the samples to validate with."""
         return self.learner.mean_loss(self.data.validation_batches(self.learner.batch_fields))
 
     def save_checkpoint(self) -> Path:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 
 from physx_core.config import DatasetConfig
-from physx_core.dataset import Dataset
+from physx_core.dataset import Dataset, Subset
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import Batch, Field
 from physx_core.sources.source import Source
@@ -19,6 +20,8 @@ class TrainingData:
         dataset: Where batches are read from, and stored if environments make them.
         source: The environments; None where the dataset alone is read.
         batches_read: Number of batches that were read from the dataset.
+        parts: The samples to learn from and those held back, ``training`` and ``validation``;
+            empty where none are held back.
     """
 
     def __init__(
@@ -46,7 +49,8 @@ class TrainingData:
             data_type: Floating type of the batches that are read.
 
         Raises:
-            ConfigError: Environments make the samples, and `batch_nb` is missing.
+            ConfigError: Environments make the samples, and `batch_nb` is missing or some are to
+                be held back; or there are too few to hold back some.
             DatasetError: The dataset alone is read, and has no samples of the mode.
         """
         if source is not None and batch_nb is None:
@@ -68,6 +72,21 @@ class TrainingData:
                 f'The dataset has no samples of mode "{self._mode}" to train on. '
                 f"It has: {listed(dataset.modes)}."
             )
+        self.parts = self._split()
+
+    def _split(self) -> dict[str, Subset]:
+        share = self._config.validation_split
+        if not share:
+            return {}
+        if self.source is not None:
+            raise ConfigError(
+                "DatasetConfig.validation_split holds back stored samples, but environments make "
+                'these. Make the samples first, or make others in the mode "validation".'
+            )
+        if self._count("validation"):
+            return {}
+        shares = {"training": 1 - share, "validation": share}
+        return self.dataset.split(self._mode, shares, by=self._config.split_by)
 
     def begin_epoch(self, epoch_id: int, names: Sequence[str]) -> int:
         """Get ready for an epoch and return its number of batches.
@@ -78,8 +97,9 @@ class TrainingData:
         """
         self._produces = self.source is not None and (epoch_id == 0 or self._always_produce)
         if not self._produces and self._reader is None:
-            self._reader = self.dataset.batches(
-                self._mode,
+            part = self.parts.get("training")
+            batches = part.batches if part else partial(self.dataset.batches, self._mode)
+            self._reader = batches(
                 self._batch_size,
                 shuffle=self._config.shuffle,
                 seed=self._seed,
@@ -88,7 +108,7 @@ class TrainingData:
                 dtype=self._data_type,
                 reuse=True,
             )
-        return self._batch_nb or -(-self._count(self._mode) // self._batch_size)
+        return self._batch_nb or -(-self._samples // self._batch_size)
 
     def next_batch(self) -> Batch:
         """Return the next batch in physical units; stored already if environments made it."""
@@ -113,15 +133,15 @@ class TrainingData:
         return self._produces
 
     def validation_batches(self, names: Sequence[str]) -> Iterator[Batch]:
-        """Return the batches of the validation mode, in the order of writing."""
-        return self.dataset.batches(
-            "validation", 1024, fields=names, dtype=self._data_type, reuse=True
-        )
+        """Return the batches to validate with, in the order of writing."""
+        part = self.parts.get("validation")
+        batches = part.batches if part else partial(self.dataset.batches, "validation")
+        return batches(1024, fields=names, dtype=self._data_type, reuse=True)
 
     @property
     def has_validation(self) -> bool:
-        """Whether the dataset has samples of the validation mode."""
-        return self._count("validation") > 0
+        """Whether there are samples to validate with."""
+        return bool(self.parts) or self._count("validation") > 0
 
     @property
     def fields(self) -> Mapping[str, Field]:
@@ -132,9 +152,16 @@ class TrainingData:
         """Return what normalizes the fields; empty where nothing shall be normalized."""
         if not self._config.normalize:
             return {}
+        if self.parts:
+            return self.parts["training"].normalization()
         if self._config.recompute_normalization and not self._produces:
             return self.dataset.recompute_normalization(self._mode)
         return self.dataset.normalization_of(self._mode)
+
+    @property
+    def _samples(self) -> int:
+        part = self.parts.get("training")
+        return part.num_samples if part else self._count(self._mode)
 
     def _count(self, mode: str) -> int:
         return self.dataset.num_samples(mode) if mode in self.dataset.modes else 0

@@ -64,7 +64,9 @@ class LocalSource(Source):
             if columns is None:
                 columns = self._columns = Columns(shaped_by(instance.fields, sample), size)
                 self.fields = columns.fields
-            columns.put(row, sample, instance.instance_id, instance.last_step)
+            columns.put(
+                row, sample, instance.instance_id, instance.last_episode, instance.last_step
+            )
             self._next += 1
         if columns is None:
             raise UsageError(f"A batch has at least one row, not {size}.")

@@ -99,7 +99,9 @@ class Producer:
             size = max(1, row_bytes([*fields, *ROW_FIELDS]))
             capacity = min(max(1, _BLOCK_BYTES // size), _BLOCK_ROWS)
             columns = self._columns = Columns(fields, capacity)
-        columns.put(self._filled, sample, instance.instance_id, instance.last_step)
+        columns.put(
+            self._filled, sample, instance.instance_id, instance.last_episode, instance.last_step
+        )
         if not self.made:
             table = [field.to_dict() for field in columns.fields]
             self._link.send(pack(Kind.FIELDS, encode(table)))

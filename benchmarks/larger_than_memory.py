@@ -1,0 +1,200 @@
+"""Training on a dataset of twice the memory that the process may take.
+
+The training runs in a process of its own whose control group limits its memory, file cache
+included, to half of the dataset's size. Where no control group can be made, the limit is only that
+the file cache is emptied before each round, and how rows are read is asked for by name.
+
+Claim: batches come, and a small network trains on them, at 0.2 or more of the speed at which the
+same files are read in sequence under the same limit, and the process does not grow.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from measure import claim, finish, rates, report
+
+from physx_core import Dataset
+
+LIMIT = 384 * 2**20
+ROUNDS = 7
+GROWTH = 16
+CASES = {
+    "rows of 48 B": ({"x": (5,), "y": (1,)}, 4096, "disk windowed"),
+    "rows of 48 kB": ({"x": (1000, 3), "y": (1000, 3)}, 32, "disk exact"),
+}
+
+
+def store(folder: Path, shapes: dict[str, tuple[int, ...]], size: int) -> None:
+    """Write a dataset of random numbers, `size` bytes of rows."""
+    rng = np.random.default_rng(0)
+    row_nbytes = sum(8 * int(np.prod(shape)) for shape in shapes.values())
+    count = 2**24 // row_nbytes
+    with Dataset.create(folder, max_file_size=0.064) as dataset:
+        for _ in range(size // (count * row_nbytes)):
+            rows = {name: rng.random((count, *shape)) for name, shape in shapes.items()}
+            dataset.append("training", rows)
+
+
+def files(folder: Path) -> list[Path]:
+    """Return the partition files."""
+    return sorted(folder.glob("*_training_*.h5"))
+
+
+def forget(folder: Path) -> None:
+    """Drop the files from the file cache."""
+    for path in files(folder):
+        descriptor = os.open(path, os.O_RDONLY)
+        os.fsync(descriptor)
+        os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+        os.close(descriptor)
+
+
+def sequential(folder: Path) -> Callable[[], int]:
+    """Return a round of reading all files from their beginning to their end."""
+    buffer = memoryview(bytearray(2**23))
+
+    def read() -> int:
+        forget(folder)
+        total = 0
+        for path in files(folder):
+            descriptor = os.open(path, os.O_RDONLY)
+            while count := os.readv(descriptor, [buffer]):
+                total += count
+            os.close(descriptor)
+        return total
+
+    return read
+
+
+def shuffled(
+    dataset: Dataset, batch_size: int, policy: str, learn: Callable[..., None]
+) -> Callable[[], int]:
+    """Return a round of one shuffled epoch."""
+
+    def epoch() -> int:
+        forget(dataset.directory)
+        total = 0
+        for batch in dataset.batches(
+            "training", batch_size, shuffle=True, seed=0, reuse=True, policy=policy
+        ):
+            learn(**batch)
+            total += sum(values.nbytes for values in batch.values())
+        return total
+
+    return epoch
+
+
+def trainer(x_shape: tuple[int, ...], y_shape: tuple[int, ...]) -> Callable[..., None]:
+    """Return one optimization step of a linear network of few parameters."""
+    size = min(64, int(np.prod(x_shape)))
+    layer = torch.nn.Linear(size, y_shape[-1], dtype=torch.float64)
+    optimizer = torch.optim.SGD(layer.parameters(), lr=1e-3)
+
+    def learn(x: np.ndarray, y: np.ndarray) -> None:
+        inputs = torch.from_numpy(x).reshape(len(x), -1)[:, :size]
+        targets = torch.from_numpy(y).reshape(len(y), -1)[:, : y_shape[-1]]
+        loss = torch.nn.functional.mse_loss(layer(inputs), targets)
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+
+    return learn
+
+
+def resident() -> int:
+    """Return the bytes of memory that this process has taken."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
+
+
+def measure(root: Path, limited: bool) -> None:
+    """Measure and print; this is the process under the limit."""
+    torch.set_num_threads(1)
+    met = []
+    for number, (title, (shapes, batch_size, expected)) in enumerate(CASES.items()):
+        folder = root / str(number)
+        with Dataset.open(folder) as dataset:
+            policy = "auto" if limited else expected
+            chosen = dataset.reading_policy("training") if limited else expected
+            step = trainer(*shapes.values())
+            sizes: list[int] = []
+
+            def epoch(train: Callable[[], int], sizes: list[int] = sizes) -> Callable[[], int]:
+                def run() -> int:
+                    total = train()
+                    sizes.append(resident())
+                    return total
+
+                return run
+
+            candidates = {
+                "sequential read": sequential(folder),
+                "batches": epoch(shuffled(dataset, batch_size, policy, lambda **_: None)),
+                "training": epoch(shuffled(dataset, batch_size, policy, step)),
+            }
+            measured = rates(candidates, ROUNDS)
+        count = sum(path.stat().st_size for path in files(folder))
+        heading = f"{title}, batches of {batch_size}, {count / 2**20:.0f} MiB: {chosen}"
+        in_mb = {name: [rate / 1e6 for rate in each] for name, each in measured.items()}
+        met.append(report(heading, "MB", in_mb, "sequential read", 0.2, "batches", "training"))
+        growth = (max(sizes[2:]) - sizes[1]) / 2**20
+        what = f"growth of the process after the first round, at {sizes[1] / 2**20:.0f} MiB, in MiB"
+        met.append(claim(what, growth, at_most=GROWTH) and chosen == expected)
+    finish(met)
+
+
+@contextlib.contextmanager
+def control_group(limit: int) -> Iterator[Path | None]:
+    """Make a control group within that of this process; give None where that is not allowed."""
+    for line in Path("/proc/self/cgroup").read_text().splitlines():
+        _, controllers, path = line.split(":", 2)
+        if controllers not in ("", "memory"):
+            continue
+        group = Path("/sys/fs/cgroup", controllers, path.lstrip("/"), f"physx_{os.getpid()}")
+        name = "memory.limit_in_bytes" if controllers else "memory.max"
+        try:
+            group.mkdir()
+        except OSError:
+            continue
+        try:
+            (group / name).write_text(str(limit))
+            yield group
+            return
+        except OSError:
+            continue
+        finally:
+            group.rmdir()
+    yield None
+
+
+def main() -> None:
+    """Write the datasets and start the process that reads them."""
+    if "--worker" in sys.argv:
+        root, limited = sys.argv[-2:]
+        measure(Path(root), limited == "limited")
+        return
+    with tempfile.TemporaryDirectory(dir=Path.cwd()) as name, control_group(LIMIT) as group:
+        for number, (shapes, _, _) in enumerate(CASES.values()):
+            store(Path(name, str(number)), shapes, 2 * LIMIT)
+
+        def enter() -> None:
+            if group is not None:
+                (group / "cgroup.procs").write_text(str(os.getpid()))
+
+        how = "limited" if group is not None else "unlimited"
+        print(f"memory limit {LIMIT / 2**20:.0f} MiB: {'control group' if group else 'none'}\n")
+        words = [sys.executable, __file__, *sys.argv[1:], "--worker", name, how]
+        status = subprocess.run(words, preexec_fn=enter, check=False).returncode
+    sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()

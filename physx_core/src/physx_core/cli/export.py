@@ -1,0 +1,78 @@
+"""``physx export``: a dataset in another format."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import tyro
+
+from physx_core.cli.dataset_report import counted
+from physx_core.dataset import Dataset
+from physx_core.dataset.exchange import ExportOptions, export
+from physx_core.observers import ProgressBar
+
+
+@dataclass
+class Export:
+    """Write the samples of a dataset as one file or folder of another format.
+
+    npz: NumPy. hdf5-single: one plain HDF5 file with MODE/FIELD. parquet: columns, for pandas,
+    polars and databases. zarr: chunked arrays. minari: episodes for offline reinforcement learning.
+    """
+
+    directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
+    """A session's or a dataset's folder."""
+    out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
+    """The file, or for zarr and minari the folder, to make."""
+    to: Literal["npz", "parquet", "minari", "zarr", "hdf5-single"]
+    """The format."""
+    mode: tuple[str, ...] = ()
+    """Modes to export; by default all that have samples. Parquet and minari take one."""
+    compression: str = "none"
+    """npz: deflate; parquet: snappy, gzip, zstd, lz4, brotli; zarr: zstd, gzip, blosc;
+    hdf5-single: gzip, lzf."""
+    observations: tuple[str, ...] = ()
+    """minari: fields that are the observations; by default all training fields that are not
+    chosen for something else, as a dictionary. One field is the observation itself."""
+    actions: tuple[str, ...] = ()
+    """minari: fields that are the actions; by default there is one action, which does nothing."""
+    rewards: str | None = None
+    """minari: field that is the reward; by default rewards are 0."""
+
+
+def run(words: Sequence[str]) -> None:
+    """Export as the words say and print what was written.
+
+    Raises:
+        PhysxError: The dataset cannot be read, or does not fit into the format.
+    """
+    options = tyro.cli(Export, args=words, prog="physx export")
+    form = ExportOptions(
+        options.compression, options.observations, options.actions, options.rewards
+    )
+    bar = ProgressBar()
+    with Dataset.open(options.directory) as dataset:
+        sizes = {row["mode"]: 0 for row in dataset.describe()}
+        for row in dataset.describe():
+            sizes[row["mode"]] += row["bytes"]
+        wanted = options.mode or sizes
+        bar.begin("export", sum(sizes.get(mode, 0) for mode in wanted), "B")
+        try:
+            written = export(
+                dataset,
+                options.to,
+                options.out,
+                modes=options.mode,
+                options=form,
+                advance=bar.advance,
+            )
+        finally:
+            bar.end()
+        stored = {mode: dataset.num_samples(mode) for mode in written}
+    for mode, rows in written.items():
+        print(f"{counted(rows, f'{mode} sample')}: {options.out}")
+        if rows < stored[mode]:
+            left = stored[mode] - rows
+            print(f"left out: {left:,} samples that are a trajectory of their own")

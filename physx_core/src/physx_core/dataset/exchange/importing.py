@@ -1,0 +1,159 @@
+"""Import: rows of a NumPy archive or an ordinary HDF5 file into a dataset."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from physx_core.config import MODES
+from physx_core.dataset.dataset import Dataset
+from physx_core.dataset.exchange import hdf5, npz
+from physx_core.dataset.exchange.table import Advance, Column, Notes, rows_of
+from physx_core.dataset.recovery import holds_dataset
+from physx_core.errors import ExchangeError, SampleError, listed
+from physx_core.fields import Field
+
+READERS = {".npz": npz.opened, ".h5": hdf5.opened, ".hdf5": hdf5.opened}
+_SESSION = "import"
+
+Columns = dict[str, Column]
+
+
+def import_file(
+    path: str | Path,
+    directory: str | Path,
+    *,
+    mode: str | None = None,
+    fields: Sequence[str] = (),
+    advance: Advance = lambda nbytes: None,
+) -> dict[str, int]:
+    """Store the arrays of a file as fields of a dataset, block by block.
+
+    Arrays of equal length become the fields of one mode; groups become part of the names
+    (``obs/state`` is the field ``obs_state``). Only groups that are named after modes, and those of
+    files that physx wrote, become modes themselves.
+
+    Args:
+        path: An ``.npz`` or ``.h5`` file.
+        directory: The dataset's folder. A dataset that is there gets the rows added.
+        mode: Mode for the rows, whatever mode the file says; of a file with several modes, the
+            one to take. None: the modes that the file names, or else ``training``.
+        fields: Names of the arrays to take, as in the file; empty: all of them.
+        advance: Is told how many bytes were stored.
+
+    Returns:
+        How many rows each mode got.
+
+    Raises:
+        ExchangeError: The file is missing or damaged, or holds other than arrays of one length.
+        SampleError: A value is NaN or infinite.
+        DatasetError: The dataset has other fields, or cannot be written.
+    """
+    path, directory = Path(path), Path(directory)
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise ExchangeError(f"{path} is imported by its ending: one of {listed(READERS)}.")
+    if not path.is_file():
+        raise ExchangeError(f"There is no file {path}.")
+    with reader(path) as (columns, notes):
+        chosen = _chosen(path, columns, fields)
+        modes = _arranged(path, chosen, notes, mode)
+        tables = {name: _fields(path, name, found, notes) for name, found in modes.items()}
+        with _target(directory) as dataset:
+            if not dataset.modes:
+                dataset.update_info(**{**notes.info, "imported_from": path.name})
+            return {
+                name: _copy(dataset, name, tables[name], found, advance)
+                for name, found in modes.items()
+            }
+
+
+@contextlib.contextmanager
+def _target(directory: Path) -> Iterator[Dataset]:
+    """Open the dataset for writing; one that is made for rows that fail leaves nothing behind."""
+    if holds_dataset(directory) or holds_dataset(directory / "dataset"):
+        with Dataset.open(directory, writable=True) as dataset:
+            yield dataset
+        return
+    was_there = directory.is_dir()
+    if was_there and any(directory.iterdir()):
+        raise ExchangeError(f"{directory} holds other things than a dataset; name a new folder.")
+    try:
+        with Dataset.create(directory, session=_SESSION) as dataset:
+            yield dataset
+    except BaseException:
+        for file in directory.iterdir():
+            file.unlink()
+        if not was_there:
+            directory.rmdir()
+        raise
+
+
+def _chosen(path: Path, columns: Columns, names: Sequence[str]) -> Columns:
+    missing = [name for name in names if name not in columns]
+    if missing or not columns:
+        wanted = f'no array "{missing[0]}"' if missing else "no arrays"
+        raise ExchangeError(f"{path} holds {wanted}. It holds: {listed(columns)}.")
+    chosen = {name: columns[name] for name in names} if names else columns
+    for name, column in chosen.items():
+        if column.dtype.kind not in "biufc" or not column.shape:
+            what = "no rows" if not column.shape else str(column.dtype)
+            raise ExchangeError(
+                f'"{name}" of {path} holds {what}; a field has rows of plain numbers. Choose what '
+                "to import by fields (--fields on the command line)."
+            )
+    return chosen
+
+
+def _arranged(path: Path, columns: Columns, notes: Notes, mode: str | None) -> dict[str, Columns]:
+    """Return the columns by mode and field name."""
+    parts = {name: name.split("/") for name in columns}
+    known = notes.modes.keys() or set(MODES)
+    has_modes = all(len(words) > 1 and words[0] in known for words in parts.values())
+    only = next(iter(notes.modes)) if len(notes.modes) == 1 else "training"
+    modes: dict[str, Columns] = {}
+    for name, words in parts.items():
+        of = words.pop(0) if has_modes else (mode or only)
+        field = re.sub(r"\W", "_", "_".join(words))
+        field = field if field.isidentifier() else f"_{field}"
+        found = modes.setdefault(of, {})
+        if field in found:
+            raise ExchangeError(f'Two arrays of {path} would become the field "{field}".')
+        found[field] = columns[name]
+    if mode is None:
+        return modes
+    if mode not in modes and len(modes) > 1:
+        raise ExchangeError(f'{path} has no mode "{mode}". Modes: {listed(modes)}.')
+    return {mode: modes[mode] if mode in modes else next(iter(modes.values()))}
+
+
+def _fields(path: Path, mode: str, columns: Columns, notes: Notes) -> dict[str, Field]:
+    lengths = {name: column.shape[0] for name, column in columns.items()}
+    if len(set(lengths.values())) > 1:
+        counts = ", ".join(f"{name} {count}" for name, count in lengths.items())
+        raise ExchangeError(
+            f"The arrays of {path} have different numbers of rows: {counts}. Choose those that "
+            "belong together by fields (--fields on the command line)."
+        )
+    noted = mode if mode in notes.modes else next(iter(notes.modes), mode)
+    return {name: notes.field(noted, name, column) for name, column in columns.items()}
+
+
+def _copy(
+    dataset: Dataset, mode: str, fields: Mapping[str, Field], columns: Columns, advance: Advance
+) -> int:
+    dataset.define_fields(mode, fields.values())
+    rows = next(iter(columns.values())).shape[0]
+    step = rows_of(sum(field.nbytes for field in fields.values()))
+    for start in range(0, rows, step):
+        count = min(step, rows - start)
+        block = {name: column.read(start, count) for name, column in columns.items()}
+        try:
+            dataset.append(mode, block)
+        except SampleError as error:
+            error.add_note(f"in rows {start} to {start + count - 1} of the file")
+            raise
+        advance(sum(array.nbytes for array in block.values()))
+    return rows

@@ -1,0 +1,59 @@
+"""Zarr: a folder with ``<mode>/<field>``, chunked along the rows, with units as attributes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.dataset.exchange.table import BLOCK, Table, describe, library, rows_of
+from physx_core.errors import ExchangeError
+
+COMPRESSIONS = ("none", "zstd", "gzip", "blosc")
+_CODECS = {"zstd": "ZstdCodec", "gzip": "GzipCodec", "blosc": "BloscCodec"}
+
+
+def write(tables: Sequence[Table], out: Path, compression: str) -> None:
+    """Write the modes as groups of arrays.
+
+    Args:
+        tables: The modes.
+        out: The folder.
+        compression: One of `COMPRESSIONS`.
+
+    Raises:
+        MissingLibraryError: zarr is not installed.
+        ExchangeError: Zarr has no such type.
+    """
+    zarr = library("zarr", "Exporting to Zarr", "zarr")
+    codecs = library("zarr.codecs", "Exporting to Zarr", "zarr")
+    used = [getattr(codecs, _CODECS[compression])()] if compression != "none" else None
+    root = zarr.create_group(str(out), attributes={"physx": json.loads(describe(tables))})
+    for table in tables:
+        group = root.create_group(table.mode)
+        for name in table.fields:
+            _write_field(group, table, name, used)
+
+
+def _write_field(group: Any, table: Table, name: str, codecs: list[Any] | None) -> None:
+    field, step = table.fields[name], rows_of(table.fields[name].nbytes, BLOCK)
+    shape = field.shape or ()
+    try:
+        stored = group.create_array(
+            name,
+            shape=(table.rows, *shape),
+            dtype=np.dtype(field.dtype),
+            chunks=(min(step, table.rows), *(max(1, length) for length in shape)),
+            compressors=codecs,
+            attributes={"unit": field.unit, "role": field.role},
+        )
+    except (ValueError, TypeError) as error:
+        raise ExchangeError(
+            f'Zarr cannot hold the field "{name}" of type {np.dtype(field.dtype)}: {error}.'
+        ) from error
+    for start, block in table.column(name, step):
+        if field.nbytes:
+            stored[start : start + len(block)] = block

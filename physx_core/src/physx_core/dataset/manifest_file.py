@@ -1,0 +1,105 @@
+"""The file ``dataset.json``: written whole, and read with distrust.
+
+Its last entry is a CRC-32 of all that comes before it, so that a file that was cut or edited by
+hand is noticed before a wrong offset gives wrong numbers. Every value is checked: a dataset may
+come from a stranger.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from physx_core.dataset import files, parsing
+from physx_core.dataset.manifest import Manifest
+from physx_core.errors import ConfigError, DatasetError
+
+FILE = "dataset.json"
+FORMAT = "physx dataset"
+VERSION = 1
+READABLE: Mapping[int, Callable[[Mapping[str, Any]], Manifest]] = {1: parsing.manifest_of}
+"""What makes the manifest of each version of the format that this physx reads."""
+
+_LARGEST = 2**28
+_END = re.compile(rb',\n "crc32": "([0-9a-f]{8})"\n\}\s*$')
+_END_NBYTES = 64
+
+
+def save(directory: Path, manifest: Manifest) -> None:
+    """Write the manifest; a reader finds the old or the new file, whole.
+
+    Raises:
+        OSError: It cannot be written; the old one is still there.
+    """
+    plain = {
+        "format": FORMAT,
+        "format_version": VERSION,
+        "versions": manifest.versions,
+        "info": manifest.info,
+        "modes": {name: mode.to_dict() for name, mode in manifest.modes.items()},
+    }
+    body = json.dumps(plain, indent=1).encode()[:-2]
+    end = f',\n "crc32": "{zlib.crc32(body):08x}"\n}}'.encode()
+    files.replace(directory / FILE, body + end)
+
+
+def load(directory: Path, *, edited: bool = False) -> Manifest:
+    """Read the manifest.
+
+    Args:
+        directory: The dataset's folder.
+        edited: Whether to take it though its checksum is missing or wrong.
+
+    Raises:
+        FileNotFoundError: There is none.
+        DatasetError: It is not the manifest of a dataset, or of a newer version.
+    """
+    path = directory / FILE
+    try:
+        content = files.content(path, _LARGEST)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read: {error.strerror}.") from error
+    try:
+        plain = json.loads(content)
+        if not isinstance(plain, dict) or plain.get("format") != FORMAT:
+            raise ValueError("it does not say that it is one")
+        read = READABLE.get(parsing.whole(plain["format_version"], "the format's version"))
+        if read is None:
+            raise _newer(path, plain["format_version"])
+        if not edited and not _is_whole(content):
+            raise ValueError("it was cut or edited by hand: its checksum does not fit")
+        return read(plain)
+    except (
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+        MemoryError,
+        ConfigError,
+    ) as error:
+        reason = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
+        raise DatasetError(
+            f"{path} ({len(content)} bytes) is not the manifest of a dataset: {reason}. "
+            "`physx verify --repair` or Dataset.repair(directory) puts it right, from the "
+            "partition files if need be; no row is lost."
+        ) from error
+
+
+def _is_whole(content: bytes) -> bool:
+    end = _END.search(content, max(0, len(content) - _END_NBYTES))
+    return end is not None and int(end[1], 16) == zlib.crc32(content[: end.start()])
+
+
+def _newer(path: Path, version: int) -> DatasetError:
+    return DatasetError(
+        f"{path} has version {version} of the dataset's format; this physx reads "
+        f"{', '.join(map(str, READABLE))}. Update it: pip install --upgrade physx-core."
+    )
