@@ -1,3 +1,6 @@
+import shutil
+import subprocess
+import sys
 import tracemalloc
 
 import h5py
@@ -181,7 +184,7 @@ def test_minari_holds_the_same(folder, tmp_path, minari):
         rows = {name: [] for name in dataset["training"]}
         for episode in found:
             assert found.observation_space.contains(
-                {name: array[0] for name, array in episode.observations.items()}
+                {name: np.asarray(array[0]) for name, array in episode.observations.items()}
             )
             assert found.action_space.contains(episode.actions[0])
             assert len(episode.actions) == len(episode.rewards) == 19
@@ -303,6 +306,41 @@ def test_an_export_that_fails_leaves_nothing(folder, tmp_path, to):
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
+FULL = """
+import os, sys
+sys.path[:] = {path!r}
+from physx_core.cli import main
+import resource
+resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
+import signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+sys.exit(main(["export", {folder!r}, {out!r}, "--to", {to!r}]))
+"""
+
+
+@pytest.mark.parametrize("to", ["npz", "parquet", "zarr", "hdf5-single"])
+def test_a_full_disk_is_an_error(folder, tmp_path, to):
+    """A limit of the file size stands for the disk: writing fails in the same way."""
+    pytest.importorskip(LIBRARIES[to])
+    with Dataset.create(folder) as dataset:
+        random = np.random.default_rng(0)
+        dataset.append("training", {"x": random.normal(size=(20_000, 9)), "y": np.zeros(20_000)})
+    out = tmp_path / "out"
+    code = FULL.format(path=sys.path, folder=str(folder), out=str(out), to=to)
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert run.returncode == 1, run.stderr
+    assert "ExchangeError" in run.stderr and "cannot be written" in run.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
+def test_minari_asks_for_room_before_it_begins(folder, tmp_path, minari, monkeypatch):
+    usage = type(shutil.disk_usage(tmp_path))(10**6, 10**6 - 10**4, 10**4)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
+    message, modes = "the disk has 0.0 MB left", {"training": table(["f8"])}
+    with make(folder, modes) as dataset, pytest.raises(ExchangeError, match=message):
+        export(dataset, "minari", tmp_path / "x-v0")
+
+
 def test_fields_without_elements(folder, tmp_path):
     with Dataset.create(folder) as dataset:
         dataset.append("training", {"x": np.ones(3), "none": np.empty((3, 0))})
@@ -319,7 +357,7 @@ def test_fields_without_elements(folder, tmp_path):
 @pytest.mark.parametrize("to", FORMATS)
 def test_memory_holds_a_few_blocks(folder, tmp_path, to):
     pytest.importorskip(LIBRARIES[to])
-    rows = {"x": np.ones((300, 50_000)), "step": np.arange(300) % 20}
+    rows = {"x": np.ones((200, 50_000)), "step": np.arange(200) % 20}
     with Dataset.create(folder) as dataset:
         dataset.append("training", rows)
         del rows
@@ -327,4 +365,4 @@ def test_memory_holds_a_few_blocks(folder, tmp_path, to):
         export(dataset, to, tmp_path / "out")
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-    assert peak < 60e6  # the rows are 120 MB
+    assert peak < 60e6  # the rows are 80 MB

@@ -66,6 +66,16 @@ def test_seed_and_instance_determine_the_samples(environment, drive):
     assert np.abs(states(seed=5, episode_steps=3, instance_id=2) - first).max() > 0.1
 
 
+@pytest.mark.parametrize("environment", [DartArm, PinocchioDoublePendulum])
+def test_each_motion_is_a_trajectory_of_its_own(environment, drive):
+    made = drive.make(environment, episode_steps=3)
+    numbers = []
+    for _ in range(8):
+        drive(made, 1)
+        numbers.append(made.sample_episode)
+    assert numbers == [0, 0, 0, 1, 1, 1, 2, 2]
+
+
 def test_fields_are_those_of_the_samples(drive):
     for task, names in (
         ("excite", {"state", "torque"}),

@@ -97,6 +97,7 @@ class ColumnCache:
             column = self._loaded[key] = MemoryColumn(self.reader, mode, field, key[2])
         rows = self.reader.rows(mode)
         if column.shape[0] != rows:
+            self.reader.check(mode, name, column.shape[0])
             column.extend(rows)
         return column
 

@@ -47,9 +47,10 @@ def run(reader: Reader, mode_name: str, partition: Partition) -> None:
         size = max(1, _BLOCK // max(1, field.nbytes))
         left = partition.rows - statistics.count
         buffer = np.empty((max(0, min(size, left)), *(field.shape or ())), field.dtype)
+        sums: dict[int, int] = {}
         while left > 0:
             block = buffer[:left]
-            reader.read_into(block, mode_name, name, start + statistics.count)
+            reader.read_into(block, mode_name, name, start + statistics.count, sums)
             statistics.update(block)
             left -= len(block)
 

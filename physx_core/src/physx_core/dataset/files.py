@@ -31,11 +31,21 @@ def storing(what: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = "the disk is full" if error.errno in FULL else (error.strerror or str(error))
-        advice = " Free some space and open the dataset again." if error.errno in FULL else ""
-        raise DatasetError(
-            f"{what} cannot be stored: {reason}. All rows committed before are intact.{advice}"
-        ) from error
+        raise not_stored(what, error, "All rows committed before") from error
+
+
+def not_stored(what: str, error: OSError, safe: str) -> DatasetError:
+    """Return the error for something that could not be stored.
+
+    Args:
+        what: What it was.
+        error: What the system says.
+        safe: What is intact all the same.
+    """
+    full = error.errno in FULL
+    reason = "the disk is full" if full else (error.strerror or str(error))
+    advice = " Free some space and go on, or open the dataset again." if full else ""
+    return DatasetError(f"{what} cannot be stored: {reason}. {safe} are intact.{advice}")
 
 
 def open_regular(path: Path | str, flags: int = os.O_RDONLY) -> int:
@@ -72,7 +82,7 @@ def content(path: Path, limit: int) -> bytes:
         size = os.fstat(file.fileno()).st_size
         if size > limit:
             raise OSError(errno.EFBIG, f"it has {size} bytes, more than {limit}", str(path))
-        return file.read(limit)
+        return file.read(size)
 
 
 def write_at(descriptor: int, content: bytes | memoryview, offset: int) -> None:
@@ -103,14 +113,21 @@ def temporary(path: Path) -> Path:
     return path.with_name(path.name + ".tmp")
 
 
-def replace(path: Path, content: bytes) -> None:
-    """Write a file that is either the old or the new one, whole, whenever the process dies."""
+def replace(path: Path, content: bytes, *, sync: bool = True) -> None:
+    """Write a file that is either the old or the new one, whole, whenever the process dies.
+
+    Args:
+        path: The file.
+        content: What it holds then.
+        sync: Whether to wait for the disk, so that this holds for a power cut too.
+    """
     draft = temporary(path)
     try:
         descriptor = create_new(draft)
         try:
             write_at(descriptor, content, 0)
-            os.fsync(descriptor)
+            if sync:
+                os.fsync(descriptor)
         finally:
             os.close(descriptor)
         draft.replace(path)
@@ -118,7 +135,8 @@ def replace(path: Path, content: bytes) -> None:
         with contextlib.suppress(OSError):
             draft.unlink(missing_ok=True)
         raise
-    sync_folder(path.parent)
+    if sync:
+        sync_folder(path.parent)
 
 
 def sync_folder(folder: Path) -> None:

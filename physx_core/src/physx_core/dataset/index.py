@@ -40,7 +40,7 @@ def write_index(directory: Path, session: str, manifest: Manifest) -> None:
             for field in mode.fields.values():
                 if field.shape is not None:
                     _add(group, name, mode, field)
-    files.replace(directory / f"{session}.h5", image.getvalue())
+    files.replace(directory / f"{session}.h5", image.getvalue(), sync=False)
 
 
 def _add(group: Any, mode_name: str, mode: Mode, field: Field) -> None:

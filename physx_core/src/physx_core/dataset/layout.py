@@ -267,6 +267,8 @@ def _plain_dataset(content: Any, name: str) -> Any:
     if not isinstance(content.get(name, getlink=True), h5py.HardLink):
         raise ValueError(f"{name!r} is a link to somewhere else")
     dataset = content[name]
+    if not isinstance(dataset, h5py.Dataset):
+        raise ValueError(f"{name!r} holds no rows")
     layout = dataset.id.get_create_plist()
     if layout.get_layout() != h5py.h5d.CONTIGUOUS or layout.get_external_count():
         raise ValueError(f"{name!r} is not stored as plain rows in this file")

@@ -119,11 +119,14 @@ def _partition(plain: Any, fields: Mapping[str, Field]) -> Partition:
         raise ValueError("a sealed partition lacks offsets or checksums")
     if sealed and any(field.shape is None for field in fields.values()):
         raise ValueError("a sealed partition has fields of unknown shape")
+    rows = whole(plain["rows"], "a number of rows") if sealed else 0
+    for name, place in offsets.items():
+        whole(place + rows * fields[name].nbytes, "the end of the rows")
     return Partition(
         session=session,
         index=whole(plain["index"], "the number of a partition", 2**31),
         first_row=whole(plain["first_row"], "a first row"),
-        rows=whole(plain["rows"], "a number of rows") if sealed else 0,
+        rows=rows,
         sealed=sealed,
         offsets=offsets,
         checksums=checksums,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import FileIO
@@ -35,6 +36,7 @@ class Segment:
         offset: Where they begin in the file.
         certain: Whether `offset` holds; otherwise the file itself is asked, because another
             process may replace it by its final form at any moment.
+        checksum: CRC-32 of all its rows; None where it is not known.
     """
 
     path: Path
@@ -42,6 +44,7 @@ class Segment:
     rows: int
     offset: int
     certain: bool
+    checksum: int | None = None
 
     def open(self, row_nbytes: int) -> tuple[FileIO, int]:
         """Open the file; return it with the place of the first row.
@@ -122,6 +125,7 @@ class Reader:
                         partition.rows,
                         partition.offsets.get(name, 0),
                         partition.sealed or partition.writing,
+                        partition.checksums.get(name),
                     )
                 )
             start += partition.rows
@@ -134,12 +138,45 @@ class Reader:
             DatasetError: A partition is missing, truncated or damaged.
         """
         field = self.field(mode, name)
+        if (stop - start) * field.nbytes > _BLOCK:
+            self.check(mode, name, start, stop)
         out = np.empty((max(0, stop - start), *(field.shape or ())), field.dtype)
         self.read_into(out, mode, name, start)
         return out
 
-    def read_into(self, out: Array, mode: str, name: str, start: int) -> None:
-        """Fill a contiguous array of the field's type with the rows from `start` on."""
+    def check(self, mode: str, name: str, start: int = 0, stop: int | None = None) -> None:
+        """Check that the files have the rows, before memory is taken for rows that are not there.
+
+        Raises:
+            DatasetError: A partition is missing, truncated or damaged.
+        """
+        size = self.field(mode, name).nbytes
+        for segment in self.segments(mode, name):
+            if start < segment.start + segment.rows and (stop is None or segment.start < stop):
+                segment.open(size)[0].close()
+
+    def read_into(
+        self,
+        out: Array,
+        mode: str,
+        name: str,
+        start: int,
+        sums: dict[int, int] | None = None,
+    ) -> None:
+        """Fill a contiguous array of the field's type with the rows from `start` on.
+
+        Sealed partitions that are read as a whole are compared with their checksums.
+
+        Args:
+            out: Gets the rows.
+            mode: Name of the mode.
+            name: Name of the field.
+            start: First row.
+            sums: Checksums of partitions that are read in several calls, kept from one to the next.
+
+        Raises:
+            DatasetError: A partition is missing, truncated or damaged.
+        """
         size, stop = self.field(mode, name).nbytes, start + len(out)
         if not size:
             return
@@ -155,6 +192,7 @@ class Reader:
                 place = offset + (first - segment.start) * size
                 if not files.read_at(file.fileno(), part, place):
                     raise DatasetError(f"{segment.path} became shorter while it was read.")
+            _compare(segment, first, count, part, {} if sums is None else sums)
 
     def blocks(self, mode: str, name: str, start: int = 0) -> Iterator[Array]:
         """Yield all rows from `start` on in blocks of about a megabyte, each valid until the next.
@@ -165,7 +203,25 @@ class Reader:
         field, total = self.field(mode, name), self.rows(mode)
         count = max(1, _BLOCK // max(1, field.nbytes))
         buffer = np.empty((min(count, max(0, total - start)), *(field.shape or ())), field.dtype)
+        sums: dict[int, int] = {}
         for first in range(start, total, count):
             block = buffer[: total - first]
-            self.read_into(block, mode, name, first)
+            self.read_into(block, mode, name, first, sums)
             yield block
+
+
+def _compare(
+    segment: Segment, first: int, count: int, part: memoryview, sums: dict[int, int]
+) -> None:
+    """Add rows to the checksum of their segment, and compare it when they are the last ones."""
+    if segment.checksum is None or (first > segment.start and segment.start not in sums):
+        return
+    crc = zlib.crc32(part, sums.pop(segment.start, 0))
+    if first + count < segment.start + segment.rows:
+        sums[segment.start] = crc
+    elif crc != segment.checksum:
+        raise DatasetError(
+            f"{segment.path} was changed or is damaged: its rows have checksum {crc:08x}, not "
+            f"{segment.checksum:08x}. Put it back from a copy, or set it aside with "
+            "`physx verify --repair`."
+        )

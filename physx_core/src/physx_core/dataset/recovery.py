@@ -76,7 +76,7 @@ def load_from_files(directory: Path) -> Manifest:
     """
     manifest = Manifest()
     _adopt(directory, manifest, strict=True)
-    _count_all(directory, manifest)
+    count_all(directory, manifest)
     return manifest
 
 
@@ -182,7 +182,7 @@ def _load(directory: Path, edited: bool) -> Manifest:
     except FileNotFoundError:
         return load_from_files(directory)
     _adopt(directory, manifest, strict=False)
-    _count_all(directory, manifest)
+    count_all(directory, manifest)
     return manifest
 
 
@@ -195,7 +195,8 @@ def _state(directory: Path) -> tuple[int, int] | None:
     return now.st_ino, now.st_mtime_ns
 
 
-def _count_all(directory: Path, manifest: Manifest) -> None:
+def count_all(directory: Path, manifest: Manifest) -> None:
+    """Count what is committed; modes whose rows cannot be counted are noted as problems."""
     for name, mode in manifest.modes.items():
         try:
             _count(directory, name, mode)

@@ -28,6 +28,7 @@ def repair(folder: Path) -> list[str]:
             for partition in list(mode.partitions):
                 done += _repair_partition(folder, name, mode, partition)
         manifest.problems.clear()
+        recovery.count_all(folder, manifest)  # a damaged partition kept later ones from it
         done += recovery.repair(folder, manifest)
         if done:
             _store(folder, manifest)

@@ -95,6 +95,8 @@ class Batches:
         if policy == "memory":
             loaded = [self.columns.load(mode, name, dtype) for name in names]
             return MemoryEpoch(loaded, random, self.subset)
+        for name in names:
+            self.columns.reader.check(mode, name)
         if policy == "disk exact" and random is not None:
             return ExactEpoch(self.columns, mode, names, dtype, random, self.subset)
         disk = [DiskColumn(self.columns.reader, mode, name, dtype) for name in names]

@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from physx_core.dataset import coverage, files, recovery
+from physx_core.dataset import coverage, files, manifest_file, recovery
 from physx_core.dataset.index import write_index
 from physx_core.dataset.ledger import Ledger
 from physx_core.dataset.manifest import Mode, Partition
@@ -114,7 +114,7 @@ class Writer:
         self._syncer = None if durable else Syncer()
         self._reader = Reader(ledger.directory, ledger.manifest)
         self._open: dict[str, OpenPartition] = {}
-        self._sealing: deque[tuple[str, Partition, Future[Partition]]] = deque()
+        self._sealing: deque[tuple[str, Future[Partition]]] = deque()
         self._sealer = ThreadPoolExecutor(1, "physx-seal")
 
     def append(self, mode_name: str, rows: Batch, count: int) -> None:
@@ -130,13 +130,17 @@ class Writer:
         """
         done = 0
         while done < count:
-            with files.storing(f"{count - done} of {count} rows of mode {mode_name!r}"):
+            try:
                 partition = self._open.get(mode_name)
                 if partition is None or not partition.free:
                     partition = self._next(mode_name)
                 part = min(partition.free, count - done)
                 partition.append(rows, done, part)
                 done += part
+            except OSError as error:
+                what = f"{count - done} of {count} rows of mode {mode_name!r}"
+                safe = f"The {self.ledger.manifest.modes[mode_name].rows} samples before them"
+                raise files.not_stored(what, error, safe) from error
 
     def refresh(self) -> bool:
         """See what other writers have committed; return whether rows known before have moved.
@@ -214,23 +218,32 @@ class Writer:
         opened.close()
         fields = self.ledger.manifest.modes[mode_name].fields
         work = self._sealer.submit(_sealed, self._directory, mode_name, fields, replace(entry))
-        self._sealing.append((mode_name, entry, work))
+        self._sealing.append((mode_name, work))
 
     def _collect(self, *, wait: bool) -> None:
         """Note in the manifest which partitions have been sealed."""
-        while self._sealing and (wait or self._sealing[0][2].done()):
-            mode_name, entry, work = self._sealing.popleft()
-            sealed = work.result()
-            with self.ledger.changing() as manifest:
+        sealed: list[tuple[str, Partition]] = []
+        try:
+            while self._sealing and (wait or self._sealing[0][1].done()):
+                mode_name, work = self._sealing.popleft()
+                sealed.append((mode_name, work.result()))
+        finally:
+            if sealed:
+                self._note(sealed)
+
+    def _note(self, sealed: list[tuple[str, Partition]]) -> None:
+        with self.ledger.changing() as manifest:
+            for mode_name, entry in sealed:
                 mode = manifest.modes[mode_name]
-                if sealed.rows:
-                    mode.swap(sealed)
+                if entry.rows:
+                    mode.swap(entry)
                     coverage.settle(mode)
-                    write_index(self._directory, self.session, manifest)
                 else:
                     del mode.partitions[mode.place(entry)]
-            if not sealed.rows:
-                remove_files(self._directory, mode_name, mode, entry)
+            write_index(self._directory, self.session, manifest)
+        for mode_name, entry in sealed:
+            if not entry.rows:
+                remove_files(self._directory, mode_name, manifest.modes[mode_name], entry)
 
     def _begin(self, mode_name: str) -> OpenPartition:
         """Create the files of a partition, then list it; only then rows may be committed."""
@@ -271,12 +284,15 @@ class Writer:
         if self.ledger.shared:
             return
         manifest = self.ledger.manifest
-        recovery.complete_checksums(self._directory, manifest)
-        for mode_name in manifest.modes:
-            with contextlib.suppress(DatasetError):  # a partition is damaged: not now
-                coverage.statistics_of(self._reader, mode_name)
-        with self.ledger.changing():
-            write_index(self._directory, self.session, manifest)
+        changed = recovery.complete_checksums(self._directory, manifest)
+        for name, mode in manifest.modes.items():
+            if any(partition.sealed and not partition.counted for partition in mode.partitions):
+                changed = True
+                with contextlib.suppress(DatasetError):  # a partition is damaged: not now
+                    coverage.statistics_of(self._reader, name)
+        if changed:
+            manifest_file.save(self._directory, manifest)
+        write_index(self._directory, self.session, manifest)
 
 
 def _sealed(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePath
 from typing import Any
@@ -30,15 +31,50 @@ def write(tables: Sequence[Table], out: Path, compression: str) -> None:
     """
     import h5py
 
-    with h5py.File(out, "w") as file:
-        file.attrs["physx"] = describe(tables, _ATTRIBUTE)
-        for table in tables:
-            group = file.create_group(table.mode)
-            for name in table.fields:
-                _write_field(group, table, name, COMPRESSIONS[compression])
+    with _Sink(out, "w+") as sink:
+        with h5py.File(sink, "w") as file:
+            file.attrs["physx"] = describe(tables, _ATTRIBUTE)
+            for table in tables:
+                group = file.create_group(table.mode)
+                for name in table.fields:
+                    _write_field(group, table, name, COMPRESSIONS[compression], sink)
+        sink.check()
 
 
-def _write_field(group: Any, table: Table, name: str, compression: str | None) -> None:
+class _Sink(io.FileIO):
+    """A file that keeps the first error of writing to itself until it is asked.
+
+    HDF5 ends the process when a write fails, so none ever fails for it.
+    """
+
+    _error: OSError | None = None
+
+    def write(self, content: Any) -> int:
+        """Write all of the content; after an error, nothing more."""
+        view = memoryview(content).cast("B")
+        count = len(view)
+        try:
+            while view and self._error is None:
+                view = view[super().write(view) :]
+        except OSError as error:
+            self._error = error
+        return count
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Set the length of the file, unless there was an error."""
+        try:
+            return super().truncate(size) if self._error is None else 0
+        except OSError as error:
+            self._error = error
+            return 0
+
+    def check(self) -> None:
+        """Raise the first error of writing."""
+        if self._error is not None:
+            raise self._error
+
+
+def _write_field(group: Any, table: Table, name: str, compression: str | None, sink: _Sink) -> None:
     field = table.fields[name]
     shape, options = (table.rows, *(field.shape or ())), {}
     if compression and 0 not in shape:
@@ -48,6 +84,7 @@ def _write_field(group: Any, table: Table, name: str, compression: str | None) -
     stored.attrs["unit"], stored.attrs["role"] = field.unit, field.role
     for start, block in table.column(name, rows_of(field.nbytes)):
         stored[start : start + len(block)] = block
+        sink.check()
 
 
 class Hdf5Column:

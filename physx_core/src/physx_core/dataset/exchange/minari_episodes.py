@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,10 @@ from physx_core.errors import ConfigError, ExchangeError, listed, nearest
 from physx_core.fields import Batch, Field
 
 _PURPOSE = "Exporting to Minari"
+_OVERHEAD = 6000
+"""Bytes that an array of an episode takes besides its values, at most."""
+_OWN_ARRAYS = 4
+"""Arrays that Minari adds to each episode: actions, rewards, terminations, truncations."""
 _NAME = re.compile(r"[-_\w]+-v\d+")
 
 
@@ -96,6 +101,7 @@ def write(table: Table, out: Path, roles: Roles) -> int:
             "needs. A trajectory ends where an environment calls new_episode(), and where "
             "check_sample() refuses a sample."
         )
+    _check_space(table, out, len(episodes))
     out.mkdir()
     storage = storages.MinariStorage.new(
         out / "data",
@@ -115,6 +121,17 @@ def write(table: Table, out: Path, roles: Roles) -> int:
         }
     )
     return table.rows - sum(len(episode.rows) for episode in episodes)
+
+
+def _check_space(table: Table, out: Path, episodes: int) -> None:
+    """Check that the disk has room: HDF5, which Minari writes with, crashes where it has not."""
+    arrays = episodes * (len(table.fields) + _OWN_ARRAYS)
+    needed, free = table.nbytes + arrays * _OVERHEAD, shutil.disk_usage(out.parent).free
+    if needed > free:
+        raise ExchangeError(
+            f"{len(table.fields)} fields in {episodes} episodes take up to {needed / 1e6:.1f} MB, "
+            f"but the disk has {free / 1e6:.1f} MB left."
+        )
 
 
 def _episode(table: Table, roles: Roles, episode: Episode) -> dict[str, Any]:
