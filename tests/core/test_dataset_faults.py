@@ -1,11 +1,13 @@
 """Kills at random moments, full disks, and readers beside a writer: real processes, real files."""
 
+import json
 import os
-import random
-import signal
+import re
+import shutil
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -13,110 +15,139 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from physx_core import Dataset
-from physx_core.errors import DatasetError
+from physx_core.errors import DatasetError, DatasetNotFoundError
 
-WRITER = """
-import sys
-import numpy as np
-from physx_core import Dataset
-
-folder, seed, durable = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "durable"
-random = np.random.default_rng(seed)
-try:
-    dataset = Dataset.open(folder, writable=True, max_file_size=2e-4, durable=durable)
-except Exception:
-    dataset = Dataset.create(folder, max_file_size=2e-4, durable=durable)
-total = dataset.num_samples("training") if dataset.modes else 0
-while True:
-    count = int(random.integers(1, 400))
-    rows = np.arange(total, total + count)
-    values = np.sin(rows[:, None] * np.arange(1, 31))
-    dataset.append("training", {"n": rows, "x": values, "y": values[:, 0].astype("float32")})
-    total += count
-    sys.stdout.write(f"{total}\\n")
-    sys.stdout.flush()
-"""
+KILLS = Path(__file__).with_name("dataset_kills.py")
+WORKS = ["create", "append", "roll-over", "seal", "json", "update"]
 
 
-def expected(count):
-    rows = np.arange(count)
+def expected(count, first=0):
+    rows = np.arange(first, first + count)
     values = np.sin(rows[:, None] * np.arange(1, 31))
     return {"n": rows, "x": values, "y": values[:, 0].astype("float32")}
 
 
-def write_and_kill(script, folder, seed, durable, seconds):
-    """Run a writer, kill it after some seconds, and return how many rows it said to be stored."""
-    arguments = [sys.executable, str(script), str(folder), str(seed), durable]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE) as process:
-        first = process.stdout.readline()
-        time.sleep(seconds)
-        process.send_signal(signal.SIGKILL)
-        rest = process.stdout.read()
-    return int((first + rest).split(b"\n")[-2])
+# Kills ------------------------------------------------------------------------------------------
 
 
-def check_after_kill(folder, committed):
-    for path in folder.glob("run_*.h5"):
-        with h5py.File(path) as file:
-            assert 0 <= file["rows"][()] <= len(file["data"])
-    with Dataset.open(folder) as dataset:
-        total = dataset.num_samples("training")
-        assert total >= committed
-        rows = expected(total)
-        for name, values in rows.items():
-            assert_array_equal(dataset["training"][name][:], values)
-        assert dataset.verify() == []
-        mean = dataset.normalization["x"].mean
-        np.testing.assert_allclose(mean, rows["x"].mean(axis=0), atol=1e-9)
+def kill(tmp_path, work, durability, seed, kills):
+    """Kill writers, have what they leave checked, and return the counts."""
+    arguments = [str(KILLS), str(tmp_path / "data"), work, durability, str(seed), str(kills)]
+    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    counts = json.loads(done.stdout.splitlines()[-1])
+    assert counts["kills"] == kills
+    return counts
 
 
-def campaign(tmp_path, trials, seed):
-    script = tmp_path / "writer.py"
+@pytest.mark.parametrize("work", WORKS)
+def test_kill_9_loses_no_committed_row(tmp_path, work):
+    kill(tmp_path, work, "durable" if work in ("append", "json") else "fast", 1, 2)
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("durability", ["fast", "durable"])
+@pytest.mark.parametrize("work", WORKS)
+def test_kill_9_loses_no_committed_row_in_many_trials(
+    tmp_path, record_property, work, durability
+):  # 204 kills in all
+    record_property("counts", kill(tmp_path, work, durability, 2, 17))
+
+
+# Readers beside a writer ------------------------------------------------------------------------
+
+WRITER = """
+import sys, time
+import numpy as np
+from physx_core import Dataset
+
+random, total = np.random.default_rng(0), 0
+with Dataset.create(sys.argv[1], max_file_size=4e-4) as dataset:
+    while True:
+        rows = np.arange(total, total + int(random.integers(1, 200)))
+        values = np.sin(rows[:, None] * np.arange(1, 31))
+        dataset.append("training", {"n": rows, "x": values, "y": values[:, 0].astype("float32")})
+        total += len(rows)
+        print(total, flush=True)
+        time.sleep(0.001)
+"""
+
+
+def read_beside_a_writer(tmp_path, seconds):
+    """Open and read a dataset, again and again, while it is written; return how often."""
+    script, folder = tmp_path / "writer.py", tmp_path / "data"
     script.write_text(WRITER)
-    chance = random.Random(seed)
-    for trial in range(trials):
-        folder = tmp_path / f"trial_{trial // 2}"  # the second kill hits an extended dataset
-        durable = "durable" if trial % 4 == 3 else "fast"
-        committed = write_and_kill(script, folder, trial, durable, chance.uniform(0.0, 0.1))
-        check_after_kill(folder, committed)
+    arguments = [sys.executable, str(script), str(folder)]
+    with (tmp_path / "told").open("wb") as told:
+        process = subprocess.Popen(arguments, stdout=told)
+    try:
+        wait_for(lambda: (tmp_path / "told").stat().st_size)
+        with Dataset.open(folder) as beside:
+            deadline, opened, seen = time.monotonic() + seconds, 0, 0
+            while time.monotonic() < deadline:
+                with Dataset.open(folder) as dataset:
+                    seen = check_new_rows(dataset, seen)
+                beside.refresh()
+                assert beside.num_samples("training") >= seen
+                check_new_rows(beside, seen)
+                opened += 1 + open_in_h5py(folder)
+        assert process.poll() is None
+    finally:
+        process.kill()
+        process.wait()
+    with Dataset.open(folder) as dataset:
+        assert dataset.verify() == []
+        assert dataset.describe()[0]["partitions"] > 4
+    return opened
 
 
-def test_kill_9_loses_no_committed_row(tmp_path):
-    campaign(tmp_path, 6, seed=1)
+def wait_for(condition):
+    deadline = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
-@pytest.mark.slow
-def test_kill_9_loses_no_committed_row_in_many_trials(tmp_path):
-    campaign(tmp_path, 60, seed=2)
+def check_new_rows(dataset, seen):
+    total = dataset.num_samples("training")
+    assert total >= seen
+    for name, values in expected(total - seen, seen).items():
+        assert_array_equal(dataset["training"][name][seen:], values)
+    some = np.random.default_rng(total).integers(0, total, 50)
+    assert_array_equal(dataset["training"]["n"][some], some)
+    return total
+
+
+def open_in_h5py(folder):
+    """Open the newest files as other tools do; return how many."""
+    paths = sorted(folder.glob("*.h5"), key=lambda path: path.stat().st_mtime_ns)[-7:]
+    for path in paths:
+        with h5py.File(path) as file:
+            if path.name == "run.h5":
+                n = file["training/n"][-100:]
+            else:
+                count = int(file["rows"][()])
+                n = file["data"][max(0, count - 100) : count] if "_n_" in path.name else []
+            assert not len(n) or (np.diff(n) == 1).all()
+    return len(paths)
 
 
 def test_a_reader_beside_a_writer_sees_only_committed_rows(tmp_path):
-    script, folder = tmp_path / "writer.py", tmp_path / "data"
-    script.write_text(WRITER)
-    arguments = [sys.executable, str(script), str(folder), "0", "fast"]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE) as process:
-        try:
-            process.stdout.readline()
-            with Dataset.open(folder) as dataset:
-                seen, deadline = 0, time.monotonic() + 30
-                while dataset.describe()[0]["partitions"] < 4 and time.monotonic() < deadline:
-                    dataset.refresh()
-                    total = dataset.num_samples("training")
-                    assert total >= seen
-                    for name, values in expected(total).items():
-                        assert_array_equal(dataset["training"][name][seen:], values[seen:])
-                    seen = total
-                    os.read(process.stdout.fileno(), 2**16)
-                assert dataset.describe()[0]["partitions"] >= 4
-        finally:
-            process.kill()
+    assert read_beside_a_writer(tmp_path, 2) > 10
 
+
+@pytest.mark.faults
+def test_a_reader_beside_a_writer_for_half_a_minute(tmp_path, record_property):
+    record_property("opened", read_beside_a_writer(tmp_path, 30))
+
+
+# Full disks -------------------------------------------------------------------------------------
 
 FILLER = """
 import resource, sys
 import numpy as np
 from physx_core import Dataset
-from physx_core.errors import DatasetError
+from physx_core.errors import DatasetError, DatasetNotFoundError
 
 folder, limit = sys.argv[1], int(sys.argv[2])
 if limit:
@@ -142,7 +173,9 @@ def check_full(tmp_path, folder, limit, file_size):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     total, message = done.stdout.split("\n", 1)
-    assert "the disk is full" in message and "intact" in message
+    assert "the disk is full" in message
+    safe = re.search(r"The (\d+) samples before them are intact", message)
+    assert (int(safe[1]) if safe else 0) == int(total)
     return int(total)
 
 
@@ -180,6 +213,15 @@ def test_a_full_disk_loses_no_committed_row(tmp_path, small_disk, file_size):
         with pytest.raises(DatasetError):
             Dataset.open(folder, writable=True)
         check_rows(folder, total)
+    subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
+    with Dataset.open(folder, writable=True) as dataset:  # there is space: the next run goes on
+        stored = dataset.num_samples("training")
+        rows = expected(1000, stored)
+        dataset.append("training", {name: rows[name] for name in ("n", "x")})
+    check_rows(folder, stored + 1000)
+    for path in folder.glob("run_*.h5"):
+        with h5py.File(path) as file:
+            assert file["rows"][()] == len(file["data"])
 
 
 def test_a_file_size_limit_loses_no_committed_row(tmp_path):
@@ -195,7 +237,8 @@ def test_a_full_disk_in_this_process_and_space_again(small_disk):
     rows = expected(500)
     with Dataset.create(small_disk / "data") as dataset:
         stored = 0
-        with pytest.raises(DatasetError, match=r"500 of 500 rows of mode 'training'"):
+        what = r"500 of 500 rows of mode 'training' cannot be stored: the disk is full"
+        with pytest.raises(DatasetError, match=what):
             while True:
                 dataset.append("training", rows)
                 stored += 500
@@ -209,3 +252,61 @@ def test_a_full_disk_in_this_process_and_space_again(small_disk):
     with Dataset.open(small_disk / "data") as dataset:
         assert dataset.num_samples("training") >= stored + 500
         assert_array_equal(dataset["training"]["x"][stored : stored + 500], rows["x"])
+
+
+def fill_up(folder, free):
+    """Fill a disk that has so many bytes left, in one way after the other; lose nothing."""
+    ballast = folder.parent / "ballast"
+    ballast.write_bytes(b"")
+    left = os.statvfs(folder.parent)
+    space = left.f_bavail * left.f_frsize
+    ballast.write_bytes(bytes(max(0, space - free)))
+    total, errors = 0, 0
+    try:
+        with Dataset.create(folder, max_file_size=5e-5) as dataset:
+            for _ in range(3):
+                for count in (1, 90, 170, 60) * 10:
+                    try:
+                        dataset.append("training", expected(count, total))
+                        total += count
+                    except DatasetError as error:
+                        assert "the disk is full" in str(error)
+                        errors += 1
+                        total = dataset.num_samples("training") if dataset.modes else 0
+            if total:
+                dataset.update("training", 0, {"y": expected(1)["y"][0]})
+    except DatasetError as error:
+        assert "the disk is full" in str(error)
+    try:
+        with Dataset.open(folder) as dataset:
+            total = check_all(dataset, total)
+    except DatasetNotFoundError:
+        assert not total
+    ballast.unlink()
+    exists = (folder / "dataset.json").exists()
+    with Dataset.open(folder, writable=True) if exists else Dataset.create(folder) as dataset:
+        dataset.append("training", expected(10, total))
+    with Dataset.open(folder) as dataset:
+        assert check_all(dataset, total + 10) == total + 10
+        assert not list(folder.glob("*.tmp"))
+    shutil.rmtree(folder)
+    return errors
+
+
+def check_all(dataset, least):
+    total = dataset.num_samples("training") if dataset.modes else 0
+    assert total >= least
+    for name, values in expected(total).items() if total else ():
+        assert_array_equal(dataset["training"][name][:], values)
+    assert dataset.verify() == []
+    return total
+
+
+def test_a_disk_that_is_full_at_some_moment(small_disk):
+    assert sum(fill_up(small_disk / "data", free) for free in (0, 30_000, 90_000, 400_000))
+
+
+@pytest.mark.faults
+def test_a_disk_that_is_full_at_any_moment(small_disk):
+    for free in range(0, 1_200_000, 4096 * 9):
+        fill_up(small_disk / "data", free)

@@ -25,6 +25,11 @@ FORMAT = "physx partition"
 VERSION = 1
 READABLE = (1,)
 """Versions of the partition file that this physx reads."""
+UNREADABLE = (
+    OSError, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError,
+    MemoryError,
+)  # fmt: skip
+"""What h5py raises at files that are damaged."""
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _PAGE = 4096
 _END_OF_FILE = 40  # place of the file's size in an HDF5 superblock of version 0
@@ -193,7 +198,7 @@ def inspect_open(
     try:
         with h5py.File(file, "r") as content:
             found = _inspection(content)
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError, PhysxError) as error:
+    except (*UNREADABLE, PhysxError) as error:
         raise DatasetError(f"{path} is no partition of a dataset, or damaged: {error}.") from error
     size, field = os.fstat(file.fileno()).st_size, found.identity.field
     expected = found.data_offset + found.capacity * field.nbytes

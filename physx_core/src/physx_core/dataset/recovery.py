@@ -10,7 +10,7 @@ from pathlib import Path
 
 from physx_core.dataset import manifest_file
 from physx_core.dataset.definitions import compare_fields
-from physx_core.dataset.layout import FORMAT, Inspection, inspect, open_partition
+from physx_core.dataset.layout import FORMAT, UNREADABLE, Inspection, inspect, open_partition
 from physx_core.dataset.manifest import Manifest, Mode, Partition
 from physx_core.dataset.sealing import remove_files, scanned, seal, sync_files
 from physx_core.errors import DatasetError, DatasetNotFoundError, FieldsMismatchError, listed
@@ -292,5 +292,5 @@ def _is_foreign(path: Path) -> bool:
     try:
         with open_partition(path) as raw, h5py.File(raw, "r") as file:
             return bool(file.attrs.get("format") != FORMAT)
-    except (DatasetError, OSError, RuntimeError):
+    except (DatasetError, *UNREADABLE):
         return False

@@ -115,6 +115,7 @@ class Writer:
         self._reader = Reader(ledger.directory, ledger.manifest)
         self._open: dict[str, OpenPartition] = {}
         self._sealing: deque[tuple[str, Future[Partition]]] = deque()
+        self._sealed: list[tuple[str, Partition]] = []
         self._sealer = ThreadPoolExecutor(1, "physx-seal")
 
     def append(self, mode_name: str, rows: Batch, count: int) -> None:
@@ -128,6 +129,9 @@ class Writer:
         Raises:
             DatasetError: The disk is full or fails; says how many of the rows are stored.
         """
+        if self._sealing:
+            with contextlib.suppress(OSError):  # it is noted later; the rows below tell
+                self._collect(wait=False)
         done = 0
         while done < count:
             try:
@@ -206,7 +210,6 @@ class Writer:
         """Have the full partition of a mode sealed, if there is one, and begin the next."""
         if mode_name in self._open:
             self._retire(mode_name)
-        self._collect(wait=False)
         opened = self._open[mode_name] = self._begin(mode_name)
         return opened
 
@@ -222,18 +225,13 @@ class Writer:
 
     def _collect(self, *, wait: bool) -> None:
         """Note in the manifest which partitions have been sealed."""
-        sealed: list[tuple[str, Partition]] = []
-        try:
-            while self._sealing and (wait or self._sealing[0][1].done()):
-                mode_name, work = self._sealing.popleft()
-                sealed.append((mode_name, work.result()))
-        finally:
-            if sealed:
-                self._note(sealed)
-
-    def _note(self, sealed: list[tuple[str, Partition]]) -> None:
+        while self._sealing and (wait or self._sealing[0][1].done()):
+            mode_name, work = self._sealing.popleft()
+            self._sealed.append((mode_name, work.result()))
+        if not self._sealed:
+            return
         with self.ledger.changing() as manifest:
-            for mode_name, entry in sealed:
+            for mode_name, entry in self._sealed:
                 mode = manifest.modes[mode_name]
                 if entry.rows:
                     mode.swap(entry)
@@ -241,9 +239,10 @@ class Writer:
                 else:
                     del mode.partitions[mode.place(entry)]
             write_index(self._directory, self.session, manifest)
-        for mode_name, entry in sealed:
-            if not entry.rows:
-                remove_files(self._directory, mode_name, manifest.modes[mode_name], entry)
+        empty = [(name, entry) for name, entry in self._sealed if not entry.rows]
+        self._sealed.clear()
+        for mode_name, entry in empty:
+            remove_files(self._directory, mode_name, self.ledger.manifest.modes[mode_name], entry)
 
     def _begin(self, mode_name: str) -> OpenPartition:
         """Create the files of a partition, then list it; only then rows may be committed."""

@@ -1,0 +1,230 @@
+"""Truncated, emptied, overwritten and changed files: an error or the right rows, nothing else."""
+
+import os
+import random
+import shutil
+import time
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from physx_core import Dataset, Field
+from physx_core.errors import DatasetError
+
+N = 1000
+ROWS = {"x": np.random.default_rng(0).normal(size=(N, 5)), "n": np.arange(N, dtype="int32")}
+FIELDS = [Field("x", (5,), unit="m"), Field("n", (), "int32", role="additional")]
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    """A closed dataset, and one whose writer was killed; three partitions each."""
+    place = tmp_path_factory.mktemp("places")
+    with Dataset.create(place / "closed", max_file_size=3e-5) as dataset:
+        dataset.define_fields("training", FIELDS)
+        dataset.append("training", ROWS)
+        while (place / "closed" / "dataset.json").read_text().count("crc32") < 3:
+            time.sleep(0.01)  # full partitions are sealed beside the writing
+            dataset.append("training", {name: values[:0] for name, values in ROWS.items()})
+        shutil.copytree(place / "closed", place / "killed")
+    return place
+
+
+@pytest.fixture(params=["closed", "killed"])
+def copy(request, places, tmp_path):
+    """Return a function that gives a fresh copy of a dataset."""
+
+    def make():
+        shutil.rmtree(tmp_path / request.param, ignore_errors=True)
+        return shutil.copytree(places / request.param, tmp_path / request.param)
+
+    return make
+
+
+def outcome(read):
+    try:
+        return read()
+    except DatasetError:
+        return None
+
+
+def read_rows(dataset):
+    return {name: dataset["training"][name][:] for name in ROWS}
+
+
+def read_batch(dataset):
+    return next(dataset.batches("training", N))
+
+
+def read_some(dataset):
+    index = np.arange(0, N, 7)
+    return {name: dataset["training"][name][index] for name in ROWS}
+
+
+def examine(folder):
+    """Read a damaged dataset in every way; return whether it was noticed."""
+    try:
+        dataset = Dataset.open(folder)
+    except DatasetError:
+        return True
+    with dataset:
+        found = bool(dataset.verify())
+        for read, index in (
+            (read_rows, slice(None)), (read_batch, slice(None)), (read_some, slice(None, None, 7)),
+        ):  # fmt: skip
+            rows = outcome(lambda read=read: read(dataset))
+            if rows is None:
+                assert found, "reading fails, but nothing was found"
+            elif not found or read is not read_some:
+                for name, values in ROWS.items():
+                    assert_array_equal(rows[name], values[index])
+    return found
+
+
+def repaired(folder):
+    """Repair a dataset, and check that the rows that are left are right."""
+    done = Dataset.repair(folder)
+    with Dataset.open(folder) as dataset:
+        assert dataset.verify() == []
+        n = dataset["training"]["n"][:] if "training" in dataset else np.zeros(0, int)
+        assert len(np.unique(n)) == len(n) and (np.diff(n) > 0).all()
+        if len(n):
+            assert_array_equal(dataset["training"]["x"][:], ROWS["x"][n])
+            mean = dataset.normalization["x"].mean
+            np.testing.assert_allclose(mean, ROWS["x"][n].mean(axis=0), atol=1e-12)
+    assert Dataset.repair(folder) == []
+    return done
+
+
+def damages(content, step, guarded):
+    """Yield what may become of a file: each length, and then other bytes.
+
+    What was never sealed has no checksum: other bytes in the place of its rows are not tried.
+    """
+    for length in range(0, len(content), step):
+        yield content[:length]
+    chance = random.Random(len(content))
+    yield chance.randbytes(len(content))
+    yield bytes(len(content))
+    if guarded:
+        yield content[: len(content) // 2] + chance.randbytes(len(content) // 2)
+    yield content + b"more"
+
+
+def campaign(copy, step, *, repair_every):
+    """Damage each file in each way; return how often, and how often it was noticed."""
+    tried = noticed = 0
+    folder = copy()
+    for name in sorted(path.name for path in folder.iterdir()):
+        content = (folder / name).read_bytes()
+        guarded = folder.name == "closed" or not name.endswith("_2.h5")
+        for damaged in damages(content, step, guarded):
+            (folder / name).write_bytes(damaged)
+            noticed += examine(folder)
+            tried += 1
+            if tried % repair_every == 0:
+                repaired(folder)
+                folder = copy()
+        (folder / name).write_bytes(content)
+        assert not examine(folder)
+    return tried, noticed
+
+
+def test_damaged_files_give_no_wrong_rows(copy):
+    tried, noticed = campaign(copy, 4500, repair_every=9)
+    assert noticed > tried / 2
+
+
+@pytest.mark.faults
+def test_files_cut_at_every_512th_byte_give_no_wrong_rows(copy, record_property):
+    record_property("tried, noticed", campaign(copy, 512, repair_every=40))
+
+
+@pytest.mark.parametrize("name", ["run_training_x_1.h5", "run_training_n_0.h5", "dataset.json"])
+def test_a_lost_file_gives_no_wrong_rows(copy, name):
+    folder = copy()
+    (folder / name).unlink()
+    assert examine(folder) == (name != "dataset.json")
+    assert repaired(folder)
+
+
+def flips(folder, step):
+    """Yield a file and its content with one bit flipped, for bits all over the dataset."""
+    chance = random.Random(step)
+    for path in sorted(folder.iterdir()):
+        content = path.read_bytes()
+        for start in range(0, len(content), step):
+            place = min(len(content) - 1, start + chance.randrange(step))
+            changed = bytearray(content)
+            changed[place] ^= 1 << chance.randrange(8)
+            yield path, content, bytes(changed), place
+
+
+def flip_bits(places, tmp_path, step):
+    """Flip bits in files of a closed dataset: rows are right, or the flip is noticed."""
+    folder = shutil.copytree(places / "closed", tmp_path / "copy")
+    tried = noticed = 0
+    for path, content, changed, place in flips(folder, step):
+        path.write_bytes(changed)
+        found = examine(folder)
+        path.write_bytes(content)
+        tried, noticed = tried + 1, noticed + found
+        rows = len(content) - len(content) % 4096  # where they begin is a page of its own
+        if path.name == "dataset.json" or ("_training_" in path.name and place >= rows > 12000):
+            assert found, f"bit of byte {place} of {path.name}"
+    return tried, noticed
+
+
+def test_a_flipped_bit_is_noticed(places, tmp_path):
+    tried, noticed = flip_bits(places, tmp_path, 1500)
+    assert 0 < noticed < tried
+
+
+@pytest.mark.faults
+def test_flipped_bits_all_over_are_noticed(places, tmp_path, record_property):
+    record_property("tried, noticed", flip_bits(places, tmp_path, 100))
+
+
+def test_every_flipped_bit_of_the_rows_is_noticed_when_they_are_read(places, tmp_path):
+    folder = shutil.copytree(places / "closed", tmp_path / "copy")
+    path, chance = folder / "run_training_x_1.h5", random.Random(0)
+    content = path.read_bytes()
+    for _ in range(30):
+        place = len(content) - 1 - chance.randrange(340 * 40)
+        changed = bytearray(content)
+        changed[place] ^= 1 << chance.randrange(8)
+        path.write_bytes(changed)
+        for dtype in (None, "float32"):
+            with (
+                Dataset.open(folder) as dataset,
+                pytest.raises(DatasetError, match=r"run_training_x_1\.h5 was changed"),
+            ):
+                next(dataset.batches("training", 10, dtype=dtype))
+        with (
+            Dataset.open(folder) as dataset,
+            pytest.raises(DatasetError, match=r"run_training_x_1\.h5 was changed"),
+        ):
+            dataset.recompute_normalization()
+    os.utime(path)
+
+
+@pytest.mark.faults
+def test_open_partitions_with_flipped_bits_end_no_process(places, tmp_path):
+    folder = shutil.copytree(places / "killed", tmp_path / "copy")
+    chance = random.Random(1)
+    path = folder / "run_training_x_2.h5"
+    content = path.read_bytes()
+    for _ in range(600):
+        changed = bytearray(content)
+        for _ in range(chance.choice((1, 1, 1, 8))):
+            changed[chance.randrange(12288)] ^= 1 << chance.randrange(8)
+        path.write_bytes(changed)
+        try:
+            with Dataset.open(folder) as dataset:
+                dataset.verify()
+                rows = outcome(lambda dataset=dataset: dataset["training"]["n"][:])
+                if rows is not None:  # the number of rows itself may be what was flipped
+                    assert_array_equal(rows[:680], ROWS["n"][:680])
+        except DatasetError:
+            continue
