@@ -172,7 +172,7 @@ def batches_against_ram(root: Path, title: str) -> list[bool]:
             partitions = dataset.describe()[0]["partitions"]
         with Dataset.open(folder) as dataset:
             for size in (32, 256, 1024):
-                batches = min(2000, max(40, 2 * count // size))
+                batches = min(2000, max(120, 2 * count // size))
                 candidates = {
                     "index_select": in_ram(tensors, size, batches),
                     "dataset": from_dataset(dataset, size, batches),

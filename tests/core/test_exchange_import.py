@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from physx_core import Dataset
-from physx_core.dataset.exchange import import_file
+from physx_core.dataset.exchange import export, import_file
 from physx_core.errors import (
     DatasetError,
     ExchangeError,
@@ -112,12 +112,14 @@ def test_a_folder_of_other_things_is_left_alone(folder, tmp_path):
 
 
 def test_what_is_no_file_to_import(folder, tmp_path):
-    (tmp_path / "a.csv").touch()
-    (tmp_path / "a.npz").write_bytes(b"no zip")
-    (tmp_path / "a.h5").write_bytes(b"no hdf5")
+    (tmp_path / "empty").touch()
+    (tmp_path / "a.csv").write_text("x, y\n1, 2\n")
+    (tmp_path / "a.npz").write_bytes(b"PK but no zip")
+    (tmp_path / "a.h5").write_bytes(b"\x89HDF\r\n\x1a\n and no more")
     np.savez(tmp_path / "none.npz")
     for name, message in {
-        "a.csv": r"\.h5, \.hdf5, \.npz",
+        "empty": "neither a NumPy archive",
+        "a.csv": "neither a NumPy archive",
         "b.npz": "There is no file",
         "a.npz": "no sound npz",
         "a.h5": "as HDF5",
@@ -229,3 +231,11 @@ def test_links_out_of_an_hdf5_file_are_not_followed(folder, tmp_path):
         with pytest.raises(ExchangeError, match="link|another folder|holds itself"):
             import_file(tmp_path / f"{number}.h5", folder)
     assert not folder.exists()
+
+
+@pytest.mark.parametrize("form", ["npz", "hdf5-single"])
+def test_a_file_is_known_by_its_content_not_by_its_name(folder, tmp_path, form):
+    with Dataset.create(folder) as dataset:
+        dataset.append("training", {"x": X})
+        export(dataset, form, tmp_path / "rows")
+    assert import_file(tmp_path / "rows", tmp_path / "b") == {"training": 10}

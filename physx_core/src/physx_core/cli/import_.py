@@ -22,7 +22,7 @@ class Import:
     """
 
     file: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE")]
-    """An .npz or .h5 file."""
+    """A NumPy archive (npz) or an HDF5 file."""
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
     """The dataset's folder; if there is a dataset with these fields, it gets the rows added."""
     mode: str | None = None

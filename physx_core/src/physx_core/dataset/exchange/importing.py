@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from physx_core.config import MODES
@@ -15,7 +16,9 @@ from physx_core.dataset.recovery import holds_dataset
 from physx_core.errors import ExchangeError, SampleError, listed
 from physx_core.fields import Field
 
-READERS = {".npz": npz.opened, ".h5": hdf5.opened, ".hdf5": hdf5.opened}
+_READERS = {b"PK": npz.opened, b"\x89HDF\r\n\x1a\n": hdf5.opened}
+"""The first bytes of a file, whatever its name, to what reads it."""
+
 _SESSION = "import"
 
 Columns = dict[str, Column]
@@ -36,7 +39,7 @@ def import_file(
     files that physx wrote, become modes themselves.
 
     Args:
-        path: An ``.npz`` or ``.h5`` file.
+        path: A NumPy archive (npz) or an HDF5 file, of any name.
         directory: The dataset's folder. A dataset that is there gets the rows added.
         mode: Mode for the rows, whatever mode the file says; of a file with several modes, the
             one to take. None: the modes that the file names, or else ``training``.
@@ -52,12 +55,7 @@ def import_file(
         DatasetError: The dataset has other fields, or cannot be written.
     """
     path, directory = Path(path), Path(directory)
-    reader = READERS.get(path.suffix.lower())
-    if reader is None:
-        raise ExchangeError(f"{path} is imported by its ending: one of {listed(READERS)}.")
-    if not path.is_file():
-        raise ExchangeError(f"There is no file {path}.")
-    with reader(path) as (columns, notes):
+    with _reader(path)(path) as (columns, notes):
         chosen = _chosen(path, columns, fields)
         modes = _arranged(path, chosen, notes, mode)
         tables = {name: _fields(path, name, found, notes) for name, found in modes.items()}
@@ -68,6 +66,21 @@ def import_file(
                 name: _copy(dataset, name, tables[name], found, advance)
                 for name, found in modes.items()
             }
+
+
+def _reader(path: Path) -> Callable[[Path], AbstractContextManager[tuple[Columns, Notes]]]:
+    """Return what reads a file of this kind."""
+    if not path.is_file():
+        raise ExchangeError(f"There is no file {path}.")
+    try:
+        with path.open("rb") as file:
+            begin = file.read(8)
+    except OSError as error:
+        raise ExchangeError(f"{path} cannot be read: {error.strerror}.") from error
+    for signature, reader in _READERS.items():
+        if begin.startswith(signature):
+            return reader
+    raise ExchangeError(f"{path} is neither a NumPy archive (npz) nor an HDF5 file.")
 
 
 @contextlib.contextmanager
