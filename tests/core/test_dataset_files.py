@@ -156,9 +156,10 @@ def test_sessions_go_on_where_the_last_one_ended(folder):
     after = content(folder)
     check(folder)
     for name, was in before.items():
-        assert name in ("dataset.json", "dataset.lock") or after[name] == was
-    with h5py.File(folder / "two.h5") as index:
-        assert_array_equal(index["training/n"][:], ROWS["n"])
+        assert name in ("dataset.json", "dataset.lock", "one.h5") or after[name] == was
+    for session in ("one", "two"):
+        with h5py.File(folder / f"{session}.h5") as index:
+            assert_array_equal(index["training/n"][:], ROWS["n"])
     with Dataset.open(folder, writable=True) as dataset:
         assert dataset.session == "two"
         dataset.append("training", half)

@@ -103,6 +103,30 @@ def read_at(descriptor: int, view: memoryview, offset: int) -> bool:
     return True
 
 
+def copied(origin: int, place: int, target: int, target_place: int, count: int) -> bool:
+    """Have the system copy bytes from one open file to another; return whether it could.
+
+    Where the file system knows how, as Btrfs and XFS do, the files share the bytes on the disk.
+
+    Raises:
+        OSError: The disk is full.
+    """
+    done = 0
+    try:
+        while done < count:
+            step = os.copy_file_range(
+                origin, target, count - done, place + done, target_place + done
+            )
+            if not step:
+                return False
+            done += step
+    except OSError as error:
+        if error.errno in FULL:
+            raise
+        return False
+    return True
+
+
 def raw(array: Array) -> memoryview:
     """Return the bytes of a contiguous array, without a copy."""
     return array.reshape(-1).view("u1").data

@@ -1,5 +1,6 @@
 """The virtual index ``<session>.h5``: all sealed rows of a dataset in one file for other tools.
 
+Where several sessions wrote a dataset, the index under the name of each of them shows all rows.
 It holds ``/<mode>/<field>`` as virtual datasets that refer to the partitions beside it. physx
 itself never reads it.
 """
@@ -24,7 +25,7 @@ def write_index(directory: Path, session: str, manifest: Manifest) -> None:
 
     Args:
         directory: The dataset's folder.
-        session: Session whose name the index gets.
+        session: Session that writes it; it gets an index even if it has no rows yet.
         manifest: What the dataset holds.
 
     Raises:
@@ -40,7 +41,8 @@ def write_index(directory: Path, session: str, manifest: Manifest) -> None:
             for field in mode.fields.values():
                 if field.shape is not None:
                     _add(group, name, mode, field)
-    files.replace(directory / f"{session}.h5", image.getvalue(), sync=False)
+    for name in {session, *manifest.sessions}:
+        files.replace(directory / f"{name}.h5", image.getvalue(), sync=False)
 
 
 def _add(group: Any, mode_name: str, mode: Mode, field: Field) -> None:

@@ -191,9 +191,13 @@ def _copy(source: Path, source_offset: int, target: int, target_offset: int, cou
     try:
         while done < count:
             part = buffer[: count - done]
-            if not files.read_at(origin, part, source_offset + done):
+            here, there = source_offset + done, target_offset + done
+            shared = files.copied(origin, here, target, there, len(part))
+            descriptor, offset = (target, there) if shared else (origin, here)
+            if not files.read_at(descriptor, part, offset):
                 raise OSError(errno.EIO, f"{source} became shorter while it was read")
-            files.write_at(target, part, target_offset + done)
+            if not shared:
+                files.write_at(target, part, there)
             crc, done = zlib.crc32(part, crc), done + len(part)
     finally:
         os.close(origin)
