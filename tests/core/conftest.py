@@ -90,11 +90,9 @@ def local(services):
 def clients(services, nothing_stays_behind):
     """Return the source of an environment in client processes, named as for `local`."""
 
-    def make(environment="Plain", *, run_ahead=None, total=None, launch=True, **options):
+    def make(environment="Plain", *, run_ahead=None, total=None, **options):
         settings = configured(environment, options)
-        return ClientSource(
-            settings, services, SEED, run_ahead=run_ahead, total=total, launch=launch
-        )
+        return ClientSource(settings, services, SEED, run_ahead=run_ahead, total=total)
 
     return make
 

@@ -230,7 +230,7 @@ def test_training_on_a_dataset_learns_and_leaves_it_alone():
     assert (training.epoch_id, training.batch_id) == (2, 0)
     rows = Path("sessions/training/stats/scalars.csv").read_text().splitlines()
     assert rows[0] == "timeline,step,name,value"
-    assert sum(row.startswith("batch,") for row in rows) == 10
+    assert sum(row.startswith("batch,") and ",loss/batch," in row for row in rows) == 10
     assert sum("loss/validation" in row for row in rows) == 2
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from physx_core import Environment, plugins
 from physx_core.errors import ComponentNotFoundError, PluginNotFoundError, ReferenceFormError
+from physx_core.plugins.references import located
 
 
 def add_plugin(folder, name, code, distribution=None):
@@ -20,6 +21,7 @@ def add_plugin(folder, name, code, distribution=None):
 
 
 GOOD = """
+from physx_core.plugins.references import located
 from physx_core.plugins import hookimpl
 from physx_core.toy import Spring
 @hookimpl
@@ -122,3 +124,11 @@ def test_classes_that_no_process_can_find_are_refused():
 
     with pytest.raises(Exception, match="inside a function"):
         plugins.reference_of(Local)
+
+
+def test_components_are_named_so_that_a_client_needs_no_metadata():
+    assert located("environment", "toy/spring") == "physx_core.toy:Spring"
+    assert located("environment", "toy") == "physx_core.toy:Spring"
+    assert located("environment", "physx_core.toy:Spring") == "physx_core.toy:Spring"
+    for unknown in ("toy/nothing", "nothing/spring", "nothing"):  # the client says what is wrong
+        assert located("environment", unknown) == unknown

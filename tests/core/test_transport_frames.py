@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -59,6 +60,59 @@ def test_large_frames_arrive_between_small_ones():
         assert [bytes(reader.read(there).payload) for _ in data] == data
         sender.join()
         assert not reader.may_have_more
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.lists(st.sampled_from([0, 5, 16_000, 16_384, 16_385, 70_000, 200_000, 2_500_000])),
+    st.sampled_from([7, 1000, 16_000, 100_000, 1_000_000]),
+)
+def test_frames_of_any_length_arrive_in_their_order(lengths, cut):
+    reader, received = FrameReader(1 << 30), []
+    payloads = [np.full(length, place % 251, np.uint8) for place, length in enumerate(lengths)]
+    data = b"".join(pack(Kind.ROWS, each.tobytes(), len(each)) for each in payloads)
+    stream = InPieces(data, max(cut, len(data) // 2000))
+    while (frame := reader.read(stream)) is not None:
+        received.append(frame)
+    assert [frame.number for frame in received] == lengths
+    for frame, payload in zip(received, payloads, strict=True):
+        assert frame.payload == payload.data
+    assert not stream.data
+
+
+class InPieces:
+    """Has the bytes of a connection arrive in pieces."""
+
+    def __init__(self, data, size):
+        self.data, self.size = memoryview(data), size
+
+    def recv_into(self, target):
+        if not self.data:
+            raise BlockingIOError
+        piece = self.data[: min(self.size, len(target))]
+        target[: len(piece)] = piece
+        self.data = self.data[len(piece) :]
+        return len(piece)
+
+
+def test_who_announces_much_and_sends_little_takes_little_memory():
+    head = HEADER.pack(1 << 30, Kind.ROWS, 0, 1)
+    tracemalloc.start()
+    try:
+        reader = FrameReader(1 << 30)
+        assert reader.read(InPieces(head + bytes(1 << 20), 1 << 16)) is None
+        assert tracemalloc.get_traced_memory()[1] < 8e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_what_arrived_before_the_limit_was_raised_is_kept():
+    reader = FrameReader(100)
+    small, large = pack(Kind.PROOF, b"abc", 1), pack(Kind.READY, bytes(3000), 2)
+    stream = InPieces(small + large, 1 << 20)
+    assert reader.read(stream).payload == b"abc"
+    reader.limit = 5000
+    assert reader.read(stream).payload == bytes(3000)
 
 
 @pytest.mark.parametrize("header", [(11, 1, 0, 0), (5, 99, 0, 0), (5, 1, 1, 0)])

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from physx_core.errors import ClientError, ConfigError, ConnectionRefusedByPeerError
+from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.transport.client import run_client
 from physx_core.transport.launcher import ClientProcess, stop
 
@@ -97,7 +97,7 @@ def hands(count, port):
 def by_hand(clients, monkeypatch, port):
     """Return a source that waits at the port for clients with the token."""
     monkeypatch.setenv("PHYSX_TOKEN", "a token for this test")
-    return functools.partial(clients, "Plain", launch=False, port=port, timeout=20.0)
+    return functools.partial(clients, "Plain", launcher="physx/manual", port=port, timeout=20.0)
 
 
 def test_clients_started_by_hand_join_with_the_token(by_hand, port):
@@ -109,21 +109,9 @@ def test_clients_started_by_hand_join_with_the_token(by_hand, port):
     assert list(batch["step"]) == [0, 0, 1, 1, 2, 2]
 
 
-def test_a_client_that_was_started_by_hand_and_ends_is_named(by_hand, port):
-    with (
-        hands(1, port) as processes,
-        pytest.raises(ClientError, match="Client 1 closed the connection"),
-        by_hand() as source,
-    ):
-        source.batch(1)
-        processes[0].kill()
-        while True:
-            source.batch(1)
-
-
 def test_clients_started_by_hand_need_a_token(clients, monkeypatch):
     monkeypatch.delenv("PHYSX_TOKEN", raising=False)
-    with pytest.raises(ConfigError, match="PHYSX_TOKEN"), clients("Plain", launch=False):
+    with pytest.raises(ConfigError, match="PHYSX_TOKEN"), clients(launcher="physx/manual"):
         pass
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import threading
@@ -76,13 +77,17 @@ def test_a_silent_stranger_is_dropped_after_a_while(clients, port, monkeypatch):
 def test_many_silent_strangers_do_not_keep_clients_out(clients, port):
     with clients(port=port, num_clients=1) as source:
         crowd = []
-        for _ in range(50):
+        for _ in range(200):
             crowd.append(socket.create_connection(("127.0.0.1", port), timeout=2))
             source.batch(1)
             time.sleep(0.011)
-        assert crowd[0].recv(10) == b""
+        dropped = 0
         for connection in crowd:
+            connection.setblocking(False)
+            with contextlib.suppress(BlockingIOError):
+                dropped += connection.recv(10) == b""
             connection.close()
+        assert dropped > 50
         source.batch(1)
 
 
@@ -144,6 +149,7 @@ def test_an_address_of_another_machine_is_named(clients):
         pass
 
 
-def test_all_addresses_of_the_machine_can_be_listened_at(clients):
+def test_all_addresses_of_the_machine_can_be_listened_at(clients, monkeypatch):
+    monkeypatch.setenv("PHYSX_TOKEN", "a token for this test")
     with clients(ip_address="0.0.0.0") as source:
         assert source.batch(1)["step"] == [0]

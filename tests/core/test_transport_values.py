@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import struct
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from physx_core.errors import ConnectionRefusedByPeerError, UsageError
-from physx_core.transport.values import decode, encode
+from physx_core.transport.frames import Kind, pack
+from physx_core.transport.values import decode, encode, pack_value
 
 PLAIN_DTYPES = st.one_of(
     hnp.boolean_dtypes(),
@@ -26,7 +29,13 @@ PLAIN_DTYPES = st.one_of(
     hnp.byte_string_dtypes(),
     hnp.datetime64_dtypes(),
 )
-ARRAYS = hnp.arrays(PLAIN_DTYPES, hnp.array_shapes(min_dims=0, min_side=0, max_side=4))
+CONTIGUOUS = hnp.arrays(PLAIN_DTYPES, hnp.array_shapes(min_dims=0, min_side=0, max_side=4))
+ARRAYS = st.one_of(
+    CONTIGUOUS,
+    CONTIGUOUS.map(np.asfortranarray),
+    CONTIGUOUS.map(np.transpose),
+    CONTIGUOUS.map(lambda array: array[::-2] if array.ndim else array),
+)
 ATOMS = st.one_of(
     st.none(),
     st.booleans(),
@@ -48,6 +57,9 @@ VALUES = st.recursive(
     ),
     max_leaves=12,
 )
+
+
+FLAT = st.dictionaries(st.text(max_size=5), st.one_of(ARRAYS, SCALARS), max_size=4)
 
 
 def same(a, b):
@@ -77,11 +89,33 @@ def test_values_come_back_with_type_and_bits(value):
     assert same(decode(encode(value)), value)
 
 
+@settings(max_examples=150, deadline=None)
+@given(FLAT, st.sampled_from(Kind), st.integers(0, 2**64 - 1))
+def test_flat_dictionaries_come_back_however_often_they_travel(value, kind, number):
+    for _ in range(2):
+        data = encode(value)
+        assert same(decode(data), value)
+        assert same(decode(bytearray(data)), value)
+        assert pack_value(kind, value, "value", number) == pack(kind, data, number)
+
+
+def test_keys_that_only_look_alike_keep_their_type():
+    array = np.arange(3)
+    for key in ("x", np.str_("x"), 1, True, 1.0, "x"):
+        assert same(decode(encode({key: array})), {key: array})
+    for value in (np.float64(1), np.array(1.0), 1.0, np.float32(1), np.array([1.0])):
+        assert same(decode(encode({"x": value})), {"x": value})
+
+
 def test_particular_values_come_back():
     for value in (
         [-0.0, math.inf, -math.inf, math.nan, 5e-324, 0.1, 1e300],
         struct.unpack("<d", bytes.fromhex("010000000000f8ff"))[0],
         "\ud800 lone",
+        "\ud83d\ude00 two halves, \U0001f600 one whole",
+        np.str_("\ud83d\ude00"),
+        {"\ud83d\ude00": np.arange(2)},
+        {"unaligned": np.zeros(1, np.int8), "x": np.arange(3.0), "ä": np.float32(2)},
         10**5000,
         np.array(1.5),
         np.float32(0.1),
@@ -97,10 +131,12 @@ def test_particular_values_come_back():
 
 
 def test_decoded_arrays_are_their_own_and_writable():
-    array = decode(encode({"a": np.arange(5)}))["a"]
-    array[0] = 7
-    assert array.flags.owndata or array.base is not None
-    assert array.flags.writeable and array[0] == 7
+    original = np.arange(5)
+    for data in (encode({"a": original}), bytearray(encode({"a": original, "b": [1]}))):
+        array = decode(data)["a"]
+        array[0] = 7
+        assert array.flags.writeable and array.flags.aligned and array[0] == 7
+    assert original[0] == 0
 
 
 class Text(str):
@@ -124,16 +160,56 @@ def test_endless_nesting_is_an_error():
         encode(value)
 
 
-@settings(max_examples=150, deadline=None)
-@given(
-    st.binary(max_size=60)
-    | VALUES.map(encode).flatmap(
-        lambda data: st.integers(0, max(0, len(data) - 1)).map(lambda end: data[:end])
-    )
+ENCODED = st.one_of(VALUES, FLAT).map(encode)
+
+
+@st.composite
+def damaged(draw):
+    """Bytes of a value, of which some are changed, left out or added."""
+    data = bytearray(draw(ENCODED))
+    for _ in range(draw(st.integers(1, 3))):
+        place = draw(st.integers(0, len(data)))
+        length = draw(st.integers(0, 3))
+        data[place : place + length] = draw(st.binary(max_size=3))
+    return bytes(data)
+
+
+TAGS = st.sampled_from(["i", "f", "c", "b", "w", "t", "d", "a", "s", "u", "y", "p", "flat", "z"])
+PLAIN = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-3, 2**70),
+    st.floats(),
+    st.text(max_size=4),
+    st.sampled_from(["<f8", "|O", "<U1", "<M8[s]", "|S0", "(9,9)<f8", "f8,O", "scalar", "00"]),
 )
-def test_damaged_bytes_never_raise_anything_else(data):
+TREES = st.recursive(
+    PLAIN,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=4),
+        st.dictionaries(TAGS, inner, min_size=1, max_size=1),
+        st.dictionaries(st.text(max_size=2), inner, max_size=3),
+    ),
+    max_leaves=10,
+)
+
+
+def refused_or_taken(data):
     with contextlib.suppress(ConnectionRefusedByPeerError):
         decode(data)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.binary(max_size=60) | damaged())
+def test_damaged_bytes_never_raise_anything_else(data):
+    refused_or_taken(data)
+
+
+@settings(max_examples=300, deadline=None)
+@given(TREES, st.binary(max_size=20))
+def test_trees_of_any_tags_never_raise_anything_else(tree, data):
+    text = json.dumps(tree, separators=(",", ":")).encode()
+    refused_or_taken(struct.pack("<I", len(text)) + text + data)
 
 
 @pytest.mark.parametrize(
@@ -142,13 +218,57 @@ def test_damaged_bytes_never_raise_anything_else(data):
         b'{"a":["|O",[1],0]}',
         b'{"a":["<f8",[1000000000000],0]}',
         b'{"a":["<f8",[-1,-1],8]}',
+        b'{"a":["<f8",[0,1180591620717411303424],0]}',
+        b'{"a":["<S1000000000",[1],8]}',
+        b'{"a":["<f8",[1.0],8]}',
+        b'{"a":["(1000000,1000000)<f8",[1],8]}',
+        b'{"a":["<f8",{"a":1},8]}',
+        b'{"s":["<U1",[],4]}',
+        b'{"a":[">U2",[1],8]}',
+        b'{"a":["|b1",[8],8]}',
+        b'{"flat":[["x","|b1",[8]]]} ',
         b'{"zz":1}',
         b'{"a":1,"b":2}',
         b'{"b":-1}',
+        b'{"b":true}',
+        b'{"c":[]}',
         b'{"d":[[[],1]]}',
+        b'{"w":2}',
+        b'{"flat":[["x","<f8",[1000000000000]]]}',
+        b'{"flat":[["x","|O",[1]]]}',
+        b'{"flat":[["x","<f8",[1],1]]}',
+        b'{"flat":[[1,"<f8",[1]]]}',
+        b'{"flat":{"x":1}}',
+        b'{"flat":[["x","<f8",[1]]]',
+        b'{"flat":[]}' + b" " * 5000,
         b"[" * 100000,
+        b'{"t":[' * 100000,
+        b'{"d":[[1,' * 100000,
+        b"1" * 5000,
     ],
 )
-def test_malicious_text_is_refused(text):
-    with pytest.raises(ConnectionRefusedByPeerError):
-        decode(struct.pack("<I", len(text)) + text + bytes(8))
+def test_malicious_text_is_refused_and_takes_little_memory(text):
+    tracemalloc.start()
+    try:
+        with pytest.raises(ConnectionRefusedByPeerError) as caught:
+            decode(struct.pack("<I", len(text)) + text + b"\xff" * 8)
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
+    assert len(str(caught.value)) < 400
+
+
+def test_too_much_text_is_refused_on_both_sides(monkeypatch):
+    monkeypatch.setattr("physx_core.transport.values._MAX_TEXT", 1000)
+    assert decode(encode(list(range(100)))) == list(range(100))
+    with pytest.raises(UsageError, match=r"numbers holds .* Pass NumPy arrays"):
+        encode(list(range(1000)), "numbers")
+    text = b"1" + b" " * 1000
+    with pytest.raises(ConnectionRefusedByPeerError, match="1001 bytes of text"):
+        decode(struct.pack("<I", len(text)) + text)
+
+
+def test_a_message_that_is_too_long_is_refused_before_it_is_made():
+    huge = np.broadcast_to(np.zeros(1, np.int8), (1 << 30) + 1)
+    with pytest.raises(UsageError, match="too long"):
+        pack_value(Kind.PREDICT, {"x": huge}, "get_prediction()")

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
+import signal
+import socket
+import struct
 import subprocess
 import sys
 import time
@@ -254,3 +258,93 @@ class Names(Environment):
 
     def step(self):
         self.set_training_data(**{f"x{self.instance_id}": 1.0})
+
+
+class Faulty(Plain):
+    """Breaks in one way at one place: a method, or ``prediction`` for while it waits for one.
+
+    Each instance leaves a child process running. Before it breaks, it says so on its standard
+    error, and writes the time into the file ``broke``.
+    """
+
+    def __init__(self, *, fault: str, place: str, who: int = 2, at: int = 5, **kwargs):
+        super().__init__(**kwargs)
+        self.fault, self.place, self.who, self.at = fault, place, who, at
+        subprocess.Popen(["sleep", "600"])
+
+    def create(self):
+        self.reach("create")
+
+    def init_database(self):
+        super().init_database()
+        self.reach("init_database")
+
+    def act(self):
+        if self.step_index != self.at:
+            return
+        self.reach("step")
+        if self.place == "prediction":
+            self.wait_for_prediction()
+
+    def wait_for_prediction(self):
+        if self.instance_id == self.who:
+            signal.signal(signal.SIGALRM, lambda *args: self.reach("prediction"))
+            signal.setitimer(signal.ITIMER_REAL, 0.1)
+        else:
+            time.sleep(0.5)  # requests are answered together: the other one waits for this one
+        self.get_prediction(x=np.zeros(2))
+
+    def close(self):
+        self.reach("close")
+
+    def reach(self, place):
+        if place == self.place and self.instance_id == self.who:
+            print("last words", file=sys.stderr, flush=True)
+            Path("broke").write_text(str(time.monotonic()))
+            getattr(self, f"do_{self.fault}")()
+
+    def do_raise(self):
+        raise RuntimeError("no more beans")
+
+    def do_exit(self):
+        os._exit(3)
+
+    def do_kill(self):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def do_stop(self):
+        os.kill(os.getpid(), signal.SIGSTOP)
+
+    def do_spin(self):
+        while True:
+            pass
+
+    def do_garbage(self):
+        own_connection().sendall(bytes(range(1, 256)) * 20)
+        time.sleep(60)
+
+    def do_half(self):
+        own_connection().sendall(struct.pack("<IHHQ", 1000, 8, 0, 1) + bytes(500))
+        time.sleep(60)
+
+    def do_dribble(self):
+        connection = own_connection()
+        connection.sendall(struct.pack("<IHHQ", 1000, 8, 0, 1))
+        for _ in range(600):
+            time.sleep(0.1)
+            connection.sendall(b"x")
+
+    def do_disconnect(self):
+        own_connection().shutdown(socket.SHUT_RDWR)
+        time.sleep(60)
+
+
+def own_connection():
+    """The client's connection to its server, found among the open files of the process."""
+    for entry in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):
+            found = socket.socket(fileno=os.dup(int(entry.name)))
+            found.getpeername()
+            found.setblocking(True)
+            return found
+    raise RuntimeError("there is no connection")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -14,11 +15,12 @@ from physx_core.errors import (
     FieldTypeError,
     MissingFieldError,
     NotFiniteError,
+    SampleError,
     UnknownFieldError,
     listed,
     nearest,
 )
-from physx_core.fields import Array, Batch, Field
+from physx_core.fields import Array, Batch, Field, Sample
 
 ROW_FIELDS = (
     Field("env_id", shape=(), dtype="int32", role="additional"),
@@ -37,6 +39,11 @@ def shaped_by(fields: Iterable[Field], sample: Mapping[str, Any]) -> list[Field]
                 field = replace(field, shape=np.asarray(sample[field.name]).shape)
         shaped.append(field)
     return shaped
+
+
+def row_of(batch: Batch, row: int) -> Sample:
+    """Return a copy of one row of a batch as a sample, each value an array."""
+    return {name: np.array(values[row]) for name, values in batch.items()}
 
 
 class Columns:
@@ -107,9 +114,14 @@ class Columns:
         """
         for name in self._floating:
             values = self.arrays[name][:count]
-            if not np.isfinite(values).all():
+            # The sum of squares is finite only if all are; it is quicker, but may overflow.
+            if not cmath.isfinite(np.vdot(values, values)) and not np.isfinite(values).all():
                 self._raise_not_finite(name, values)
         return {name: array[:count] for name, array in self.arrays.items()}
+
+    def is_finite(self, row: int) -> bool:
+        """Return whether a row holds neither NaN nor an infinite number."""
+        return all(np.isfinite(self.arrays[name][row]).all() for name in self._floating)
 
     def _raise_not_finite(self, name: str, values: Array) -> None:
         bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
@@ -141,6 +153,65 @@ class Columns:
             instance_id=instance_id,
             step=step,
         )
+
+
+class Refused:
+    """Samples that `check_sample` refused, in the order of their steps.
+
+    Nothing invalid is ever stored: one that lacks a field, has one of another name, shape or type,
+    or holds NaN or an infinite number, is left out.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[Sample, int, int]] = []
+
+    def note(self, sample: Mapping[str, Any], episode: int, step: int) -> None:
+        """Keep a copy of a sample.
+
+        Args:
+            sample: Field name to value.
+            episode: The instance's trajectory that it belongs to.
+            step: The instance's step that made it.
+        """
+        with contextlib.suppress(ValueError, TypeError):  # it is ragged, or no array at all
+            copies = {name: np.array(value) for name, value in sample.items()}
+            self._waiting.append((copies, episode, step))
+
+    def shaped(self, fields: Sequence[Field]) -> list[Field]:
+        """Return fields with shapes that are open taken from the first sample that has them all."""
+        for sample, _, _ in self._waiting:
+            if all(field.name in sample for field in fields):
+                return shaped_by(fields, sample)
+        return list(fields)
+
+    def take(self, fields: Sequence[Field], instance_id: int) -> Batch:
+        """Return the samples as rows, with the fields that physx adds, and forget them.
+
+        Args:
+            fields: The environment's fields; where a shape is open no sample fits.
+            instance_id: Instance that made the samples.
+        """
+        waiting, self._waiting = self._waiting, []
+        if any(field.shape is None for field in fields):
+            waiting = []
+        columns, count = Columns(fields, len(waiting)), 0
+        for sample, episode, step in waiting:
+            with contextlib.suppress(SampleError):
+                columns.put(count, sample, instance_id, episode, step)
+                count += columns.is_finite(count)
+        return columns.rows(count)
+
+    def clear(self) -> None:
+        """Forget all samples."""
+        self._waiting.clear()
+
+
+def joined(blocks: Sequence[Batch]) -> Batch:
+    """Return blocks of rows of the same fields as one; empty where there are no rows."""
+    blocks = [block for block in blocks if len(next(iter(block.values()), ()))]
+    if not blocks:
+        return {}
+    return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
 
 
 def _converted(

@@ -6,12 +6,11 @@ import contextlib
 import dataclasses
 import functools
 import sys
-import tomllib
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, Literal, TypeVar, dataclass_transform
 
 from physx_core.errors import ConfigError, ConfigFileError, UnknownOptionError, UsageError
 
@@ -113,8 +112,22 @@ class EnvironmentConfig:
     """Calls of `step` for one sample; `compute_training_data` is False in all but the last."""
     max_wrong_samples_per_step: int = at_least(0, 10)
     """How many samples in a row `check_sample` may refuse before the run ends with an error."""
+    record_wrong_samples: bool = False
+    """Store the samples that `check_sample` refuses too, in the mode "wrong", with the same fields;
+    those that are invalid, for example with NaN, are left out. A prediction does so if it records.
+    """
+    load_samples: bool = False
+    """Send stored samples of `DatasetConfig.existing_dir`, or else of the session, through the
+    environments, which find them in `Environment.sample`. In a training, what they make of them
+    takes the samples' place in the session's own copy of the dataset, and is learned from. In a
+    prediction the samples are only read, in the order of writing, again and again."""
+    only_first_epoch: bool = True
+    """With `load_samples`, in a training: True: samples are sent in the first epoch, and the later
+    ones read what was made of them; False: all are sent in every epoch, as the last one left them.
+    """
     always_produce: bool = False
-    """Make new samples in every epoch of a training, not only in the first."""
+    """Make new samples in every epoch of a training, not only in the first; excludes
+    `load_samples`."""
     visualizer: str | type[Any] | None = None
     """Visualizer, for example "rerun"; None: the environment has no factory."""
     visualizer_kwargs: dict[str, Any] = field(default_factory=dict)
@@ -123,6 +136,17 @@ class EnvironmentConfig:
     """Seed of all instances' random streams; None: a fresh one, noted in the session."""
     timeout: float = at_least(0.1, 60.0)
     """Longest time in s that a client may stay silent while the server waits for it."""
+    restarts: int = at_least(0, 0)
+    """How often each client that fails is started again; the samples are those of a run without
+    the failure."""
+    launcher: str | type[Any] = "physx/subprocess"
+    """What starts the clients: "physx/subprocess" on this machine; "physx/manual": they are started
+    by hand, with ``physx client``; or that of a plugin."""
+    launcher_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the launcher."""
+    token_file: str | None = None
+    """File that holds the secret that clients must know, readable by its owner alone; None: the
+    environment variable PHYSX_TOKEN, or else a random one for clients that are started here."""
 
 
 @configuration
@@ -172,14 +196,23 @@ class NetworkConfig:
     """Further keyword arguments of the optimizer."""
     lr: float | None = None
     """Learning rate; None: the optimizer's own."""
+    scheduler: str | type[Any] | None = None
+    """What changes the learning rate after each epoch, a class or the name of one of the network's
+    library; None: it stays."""
+    scheduler_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the scheduler."""
     network_dir: str | None = None
     """Session or network folder whose parameters a training starts from."""
     network_name: str = "network"
     """Name of the checkpoints in the session."""
-    which_network: int = -1
-    """Number of the checkpoint to load; -1: the last."""
+    which_network: int | Literal["best"] = -1
+    """Number of the checkpoint to load; -1: the last; "best": that of the smallest loss."""
     save_each_epoch: bool = False
     """Keep a checkpoint of every epoch, not only the one at the end."""
+    save_best: bool | None = None
+    """Keep the network of the epoch with the smallest validation loss, or training loss where
+    nothing is validated, as checkpoint "best". None: where something is validated, or
+    `Training.patience` is set; a training loss alone is the smallest at the end anyway."""
     data_type: str = field(default="float32", metadata={"choices": ("float32", "float64")})
     """Floating type that the network computes in."""
     device: str = "auto"
@@ -231,6 +264,8 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     Raises:
         ConfigFileError: The file is missing or is not TOML.
     """
+    import tomllib
+
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:

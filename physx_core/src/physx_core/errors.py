@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return `` Did you mean "x"?`` for the known name closest to `name`, or an empty string."""
+    import difflib
+
     matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
     return f' Did you mean "{matches[0]}"?' if matches else ""
 
@@ -193,6 +194,10 @@ class ConnectionRefusedByPeerError(PhysxError):
     """The other side of a connection did not prove that it knows the token, or spoke nonsense."""
 
 
+class UnansweredError(ConnectionRefusedByPeerError):
+    """Nothing answers at an address, or the connection ended before anything was proved."""
+
+
 # Sessions, datasets, checkpoints ------------------------------------------------------------
 
 
@@ -221,14 +226,16 @@ class MissingLibraryError(PhysxError):
 
     Attributes:
         library: Name of the package.
-        extra: Extra of physx-core that brings it.
+        extra: Extra that brings it.
     """
 
-    def __init__(self, purpose: str, library: str, extra: str) -> None:
+    def __init__(
+        self, purpose: str, library: str, extra: str, distribution: str = "physx-core"
+    ) -> None:
         self.library, self.extra = library, extra
         super().__init__(
             f'{purpose} needs the package "{library}", which is not installed. '
-            f'To install it: pip install "physx-core[{extra}]"'
+            f'To install it: pip install "{distribution}[{extra}]"'
         )
 
 
@@ -277,7 +284,22 @@ class SimulationError(PhysxError):
 
 
 class FeatureNotSupportedError(SimulationError):
-    """The engine does not have the feature that was asked for."""
+    """The engine does not have the feature that was asked for.
+
+    Attributes:
+        engine: Name of the engine.
+        feature: What was asked for.
+        features: What the engine has.
+    """
+
+    def __init__(
+        self, engine: str, feature: str, features: Iterable[str], advice: str = ""
+    ) -> None:
+        self.engine, self.feature, self.features = engine, feature, sorted(features)
+        super().__init__(
+            f'{engine} does not have the feature "{feature}".{advice and " " + advice} '
+            f"It has: {listed(self.features)}."
+        )
 
 
 class VisualizerError(PhysxError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
@@ -69,7 +70,7 @@ class Field:
     @property
     def nbytes(self) -> int:
         """Bytes of one sample's value; 0 while the shape is unknown."""
-        count = int(np.prod(self.shape, dtype=np.int64)) if self.shape is not None else 0
+        count = math.prod(self.shape) if self.shape is not None else 0
         return count * np.dtype(self.dtype).itemsize
 
     def to_dict(self) -> dict[str, Any]:

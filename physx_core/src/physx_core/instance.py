@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from physx_core.columns import Refused
 from physx_core.errors import EnvironmentFailedError, PhysxError, UsageError, WrongSamplesError
 from physx_core.fields import Field, Sample
 from physx_core.interfaces.environment import Environment, Services
@@ -24,6 +25,7 @@ class Instance:
             sample.
         last_step: Number of the step that made the last sample, counted from 0.
         last_episode: Number of the trajectory that the last sample belongs to, counted from 0.
+        refused: The samples that `check_sample` refused, if they are recorded; else None.
     """
 
     def __init__(
@@ -36,6 +38,7 @@ class Instance:
         seed: Sequence[int],
         simulations_per_step: int = 1,
         max_wrong_samples: int = 10,
+        record_wrong: bool = False,
     ) -> None:
         """Keep what the environment is made from.
 
@@ -47,12 +50,14 @@ class Instance:
             seed: Seed of the whole run.
             simulations_per_step: Calls of `step` for one sample.
             max_wrong_samples: How many samples in a row `check_sample` may refuse.
+            record_wrong: Whether the samples that it refuses are kept in `refused`.
         """
         self.instance_id = instance_id
         self.environment: Environment | None = None
         self.fields: list[Field] = []
         self.last_step = -1
         self.last_episode = 0
+        self.refused = Refused() if record_wrong else None
         self._reference = environment
         self._arguments: dict[str, Any] = {
             **env_kwargs,
@@ -99,7 +104,8 @@ class Instance:
         """Simulate until `check_sample` accepts a sample, and return it, not yet checked.
 
         Args:
-            stored: A stored row that the environment shall replay, or None.
+            stored: A stored row that the environment shall replay, or None. It is the same one for
+                all sub-steps, and again after a sample that was refused.
 
         Raises:
             WrongSamplesError: `check_sample` refused too many samples in a row.
@@ -110,12 +116,14 @@ class Instance:
         environment.sample = stored
         wrong = 0
         while True:
-            sample = self._simulate(environment)
+            sample, accepted = self._simulate(environment)
             self.last_step = environment.step_index
             self.last_episode = environment.sample_episode
             environment.step_index += 1
-            if sample is not None:
+            if accepted:
                 return sample
+            if self.refused is not None:
+                self.refused.note(sample, self.last_episode, self.last_step)
             wrong += 1
             if wrong > self._max_wrong_samples:
                 raise WrongSamplesError(
@@ -149,8 +157,8 @@ class Instance:
                 self._runner.close()
                 self._runner = None
 
-    def _simulate(self, environment: Environment) -> dict[str, Any] | None:
-        """Run the sub-steps and the step; return the sample, or None if it was refused."""
+    def _simulate(self, environment: Environment) -> tuple[dict[str, Any], bool]:
+        """Run the sub-steps and the step; return the sample, and whether it was accepted."""
         method = "step"
         try:
             if self._sub_steps:
@@ -163,7 +171,7 @@ class Instance:
                 self._finish(result)
             sample = environment.take_sample()
             method = "check_sample"
-            return sample if environment.check_sample() else None
+            return sample, environment.check_sample()
         except Exception as error:
             raise self._failure(method, error) from error
 

@@ -1,4 +1,4 @@
-"""The six hooks that a plugin may implement.
+"""The seven hooks that a plugin may implement.
 
 Each returns a dictionary from a component's name to the component: a class, a function that
 returns one when it is called with the component's keyword arguments, or a text
@@ -27,6 +27,7 @@ KINDS = {
     "transformation": "physx_transformations",
     "visualizer": "physx_visualizers",
     "backend": "physx_backends",
+    "launcher": "physx_launchers",
 }
 """Kind of component to the hook that gives it."""
 
@@ -59,3 +60,8 @@ def physx_visualizers() -> Components:  # type: ignore[empty-body]
 @hookspec
 def physx_backends() -> Components:  # type: ignore[empty-body]
     """Return subclasses of `physx_core.Backend` by name."""
+
+
+@hookspec
+def physx_launchers() -> Components:  # type: ignore[empty-body]
+    """Return subclasses of `physx_core.Launcher` by name."""

@@ -10,8 +10,13 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from physx_core.config import SCRIPT_PREFIX
-from physx_core.errors import ComponentNotFoundError, PluginError, ReferenceFormError
+from physx_core.config import SCRIPT_PREFIX, reference_of
+from physx_core.errors import (
+    ComponentNotFoundError,
+    PhysxError,
+    PluginError,
+    ReferenceFormError,
+)
 from physx_core.plugins.hookspecs import KINDS
 from physx_core.plugins.registry import load
 
@@ -20,8 +25,8 @@ def resolve(kind: str, reference: Any) -> Any:
     """Return the component that a reference names.
 
     Args:
-        kind: ``environment``, ``network``, ``optimization``, ``transformation``, ``visualizer``
-            or ``backend``.
+        kind: ``environment``, ``network``, ``optimization``, ``transformation``, ``visualizer``,
+            ``backend`` or ``launcher``.
         reference: ``"plugin/name"``; ``"plugin"`` where it has just one of the kind;
             ``"package.module:Class"``; ``"script.py:Class"``; or the class itself.
 
@@ -38,6 +43,37 @@ def resolve(kind: str, reference: Any) -> Any:
         raise ReferenceFormError(f'"{kind}" is no kind of component: {", ".join(KINDS)}.')
     component = _find(kind, reference)
     return component() if kind == "backend" and isinstance(component, type) else component
+
+
+def located(kind: str, reference: Any) -> str:
+    """Return the text by which another process finds a component without looking for plugins.
+
+    To look through the metadata of all installed packages takes a good part of a client's start.
+
+    Args:
+        kind: See `resolve`.
+        reference: See `resolve`.
+
+    Returns:
+        ``"package.module:Class"`` where a plugin names its component so, or where it can be named
+        so; otherwise the reference's own text.
+
+    Raises:
+        UsageError: It is a class that no other process can find.
+    """
+    text = reference_of(reference)
+    if ":" in text:
+        return text
+    plugin_name, _, name = text.partition("/")
+    try:
+        components = load(plugin_name).components.get(kind, {})
+        if not name and len(components) == 1:
+            name = next(iter(components))
+        component = components[name]
+        place = reference_of(component)
+        return place if place == component or _find(kind, place) is component else text
+    except (PhysxError, LookupError, AttributeError):  # the other process says what is wrong
+        return text
 
 
 def _find(kind: str, reference: Any) -> Any:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pluggy
 
 from physx_core.errors import PluginError, PluginNotFoundError
 from physx_core.plugins import hookspecs
 from physx_core.plugins.hookspecs import GROUP, KINDS, Components
+
+if TYPE_CHECKING:  # it takes a third of a client's start, and few clients need it
+    from importlib.metadata import EntryPoint
 
 OFFICIAL = {
     "dart": "physx-dart",
@@ -80,6 +82,8 @@ def load(name: str) -> Plugin:
 
 
 def _found() -> dict[str, list[EntryPoint]]:
+    from importlib.metadata import entry_points
+
     # An editable package can be listed twice by its own metadata: one owner counts once.
     found: dict[str, dict[str, EntryPoint]] = {}
     for entry in entry_points(group=GROUP):

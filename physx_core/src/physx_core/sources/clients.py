@@ -7,15 +7,19 @@ from types import TracebackType
 
 import numpy as np
 
-from physx_core.columns import ROW_FIELDS
+from physx_core.columns import ROW_FIELDS, joined
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import FieldShapeError, FieldsMismatchError, UsageError
+from physx_core.errors import (
+    FieldShapeError,
+    FieldsMismatchError,
+    UsageError,
+    WrongSamplesError,
+)
 from physx_core.fields import Batch, Field
 from physx_core.interfaces.environment import Services
-from physx_core.sources.source import Source
+from physx_core.sources.source import Source, check_stored
 from physx_core.transport.frames import Kind, pack
 from physx_core.transport.group import ClientGroup
-from physx_core.transport.peer import Peer
 from physx_core.transport.rows import row_bytes
 from physx_core.transport.values import encode
 
@@ -41,7 +45,6 @@ class ClientSource(Source):
         *,
         run_ahead: int | None = None,
         total: int | None = None,
-        launch: bool = True,
     ) -> None:
         """Keep what the clients are started with.
 
@@ -54,12 +57,14 @@ class ClientSource(Source):
                 rows depend on a network that is trained, or on predictions that are applied.
             total: How many rows will ever be asked for; no client makes rows beyond. None: nobody
                 knows.
-            launch: Whether to start the clients on this machine; otherwise `open` waits for those
-                that are started by hand with the token in ``PHYSX_TOKEN``.
         """
         self.instance_nb = config.num_clients
         self.fields = []
-        self._group = ClientGroup(config, services, seed, launch=launch)
+        self._group = ClientGroup(config, services, seed)
+        self._refusals = 0
+        if config.record_wrong_samples:
+            self._refusals = config.max_wrong_samples_per_step + 1
+        self._failed_row: int | None = None
         self._run_ahead, self._total = run_ahead, total
         self._asked = 0
         self._taken = [0] * self.instance_nb
@@ -81,14 +86,25 @@ class ClientSource(Source):
             raise
         self.fields = [*first, *ROW_FIELDS]
 
-    def batch(self, size: int) -> Batch:
-        """Return the next rows: see `Source.batch`."""
+    def batch(self, size: int, stored: Batch | None = None) -> Batch:
+        """Return the next rows: see `Source.batch`.
+
+        Raises:
+            UsageError: Stored rows are given, but the clients run ahead of what is asked for.
+        """
         if size < 1:
             raise UsageError(f"A batch has at least one row, not {size}.")
         if not self.fields or self._closed:
             raise UsageError("This source is not open: use it in a with statement.")
+        if stored is not None:
+            check_stored(stored, size)
+            if self._run_ahead != 0:
+                raise UsageError("Stored rows need ClientSource(run_ahead=0).")
+        self.take_refused()
         self._first, self._asked = self._asked, self._asked + size
         try:
+            if stored is not None:
+                self._send_shares(Kind.STORED, stored, "a stored row")
             self._grant()
             if not self._table:
                 self._group.wait(self._without_table)
@@ -115,18 +131,15 @@ class ClientSource(Source):
         """
         if self._run_ahead != 0:
             raise UsageError("apply() needs ClientSource(run_ahead=0).")
-        size = self._asked - self._first
-        for number in range(1, self.instance_nb + 1):
-            # The position of the instance's first row in the last batch.
-            start = (number - 1 - self._first) % self.instance_nb
-            rows = {
-                name: np.asarray(values)[start : size : self.instance_nb]
-                for name, values in prediction.items()
-            }
-            count = len(range(start, size, self.instance_nb))
-            if count:
-                message = pack(Kind.APPLY, encode(rows, "the prediction"), count)
-                self._group.peer(number).send(message)
+        self._send_shares(Kind.APPLY, prediction, "the prediction")
+
+    def take_refused(self) -> Batch:
+        """Return what was refused: see `Source.take_refused`."""
+        blocks: list[Batch] = []
+        for number, peer in sorted(self._group.server.peers.items()) if self._refusals else ():
+            if self._table and peer.row_fields == self._table:
+                blocks += peer.refused.take(self._end_of_refused(number))
+        return joined(blocks)
 
     def close(self) -> None:
         """Close the environments and end the clients: see `Source.close`."""
@@ -152,6 +165,31 @@ class ClientSource(Source):
         self._failed = self._failed or kind is not None
         super().__exit__(kind, error, trace)
 
+    def _send_shares(self, kind: Kind, batch: Batch, what: str) -> None:
+        """Send each instance those rows that are for its rows of the last batch."""
+        size = self._asked - self._first
+        for number in range(1, self.instance_nb + 1):
+            # The position of the instance's first row in the batch.
+            start = (number - 1 - self._first) % self.instance_nb
+            rows = {
+                name: np.asarray(values)[start : size : self.instance_nb]
+                for name, values in batch.items()
+            }
+            count = len(range(start, size, self.instance_nb))
+            if count:
+                self._group.peer(number).send(pack(kind, encode(rows, what), count))
+
+    def _end_of_refused(self, number: int) -> int | None:
+        """Return the step before which an instance's refused rows belong to the last batch.
+
+        None: all that there are, as its last row could not be made.
+        """
+        end = self._asked if self._failed_row is None else self._failed_row
+        if self._failed_row is not None and self._failed_row % self.instance_nb == number - 1:
+            return None
+        last = (self._wanted(number, end) - 1) * self.instance_nb + number - 1 - self._first
+        return int(self._out["step"][last]) if last >= 0 else 0
+
     def _wanted(self, number: int, rows: int) -> int:
         """Return how many of the first `rows` rows belong to an instance."""
         return (rows - number + self.instance_nb) // self.instance_nb
@@ -170,6 +208,7 @@ class ClientSource(Source):
                 allowed = max(needed, min(allowed, self._wanted(number, self._total)))
             if peer.granted < needed or allowed - peer.granted > ahead // 4:
                 peer.granted = allowed
+                peer.refusable = allowed * self._refusals
                 peer.send(pack(Kind.CREDIT, number=allowed))
 
     def _without_table(self) -> list[int]:
@@ -178,12 +217,13 @@ class ClientSource(Source):
         if peer.row_fields:
             self._table = self.fields = peer.row_fields
             return []
-        self._raise_failure(peer)
+        if peer.failure is not None:
+            raise peer.failure
         return [1]
 
     def _without_rows(self) -> list[int]:
         """Move rows that arrived into the batch; return the instances that owe some."""
-        owing = []
+        owing, failed = [], {}
         for number in range(1, self.instance_nb + 1):
             peer, taken = self._group.peer(number), self._taken[number - 1]
             missing = self._wanted(number, self._asked) - taken
@@ -196,15 +236,22 @@ class ClientSource(Source):
                 moved = peer.rows.take(missing, self._out, start, self.instance_nb)
                 self._taken[number - 1] += moved
                 missing -= moved
-            if missing:
-                self._raise_failure(peer)
+            if missing and peer.failure is not None and not peer.rows.count:
+                failed[self._next_row(number)] = peer.failure
+            elif missing:
                 owing.append(number)
+        if failed:
+            row = min(failed)
+            earlier = [number for number in owing if self._next_row(number) < row]
+            if not (earlier and self._refusals and isinstance(failed[row], WrongSamplesError)):
+                self._failed_row = row
+                raise failed[row]
+            return earlier  # what was refused before it is wanted too
         return owing
 
-    def _raise_failure(self, peer: Peer) -> None:
-        """Raise what the client failed with; all its rows before were taken."""
-        if peer.failure is not None and not peer.rows.count:
-            raise peer.failure
+    def _next_row(self, number: int) -> int:
+        """Return the number of the row that an instance makes next, among those of all."""
+        return self._taken[number - 1] * self.instance_nb + number - 1
 
     def _agree(self, number: int, first: Sequence[Field], other: Sequence[Field]) -> None:
         """Check that an instance has the same fields as the first one."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Sequence
 
-from physx_core.columns import ROW_FIELDS, Columns, shaped_by
+from physx_core.columns import ROW_FIELDS, Columns, joined, row_of, shaped_by
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import UsageError
 from physx_core.fields import Batch
 from physx_core.instance import Instance
 from physx_core.interfaces.environment import Services
-from physx_core.sources.source import Source
+from physx_core.sources.source import Source, check_stored
 
 
 class LocalSource(Source):
@@ -38,6 +38,7 @@ class LocalSource(Source):
                 seed=seed,
                 simulations_per_step=config.simulations_per_step,
                 max_wrong_samples=config.max_wrong_samples_per_step,
+                record_wrong=config.record_wrong_samples,
             )
             for number in range(1, self.instance_nb + 1)
         ]
@@ -51,8 +52,12 @@ class LocalSource(Source):
             instance.open(self._services, draw=self._config.visualizer is not None)
         self.fields = [*self._instances[0].fields, *ROW_FIELDS]
 
-    def batch(self, size: int) -> Batch:
+    def batch(self, size: int, stored: Batch | None = None) -> Batch:
         """Return the next rows: see `Source.batch`."""
+        if stored is not None:
+            check_stored(stored, size)
+        if self._config.record_wrong_samples:
+            self.take_refused()
         columns = self._columns
         if columns is not None and columns.capacity < size:
             columns = self._columns = Columns(columns.fields[: -len(ROW_FIELDS)], size)
@@ -60,7 +65,7 @@ class LocalSource(Source):
         self._last = range(self._next, self._next + size)
         for row in range(size):
             instance = instances[self._next % count]
-            sample = instance.step()
+            sample = instance.step(None if stored is None else row_of(stored, row))
             if columns is None:
                 columns = self._columns = Columns(shaped_by(instance.fields, sample), size)
                 self.fields = columns.fields
@@ -71,6 +76,18 @@ class LocalSource(Source):
         if columns is None:
             raise UsageError(f"A batch has at least one row, not {size}.")
         return columns.rows(size)
+
+    def take_refused(self) -> Batch:
+        """Return what was refused: see `Source.take_refused`."""
+        blocks = []
+        for instance in self._instances:
+            if instance.refused is not None:
+                if self._columns is None:
+                    fields = instance.refused.shaped(instance.fields)
+                else:
+                    fields = self._columns.fields[: -len(ROW_FIELDS)]
+                blocks.append(instance.refused.take(fields, instance.instance_id))
+        return joined(blocks)
 
     def apply(self, prediction: Batch) -> None:
         """Give predictions to the instances: see `Source.apply`."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from abc import ABC, abstractmethod
 from types import TracebackType
 from typing import Self
 
+from physx_core.errors import PhysxError, UsageError
 from physx_core.fields import Batch, Field
 
 
@@ -34,15 +36,30 @@ class Source(ABC):
         """
 
     @abstractmethod
-    def batch(self, size: int) -> Batch:
+    def batch(self, size: int, stored: Batch | None = None) -> Batch:
         """Return the next `size` rows, each checked; valid until the next call.
 
         Args:
             size: How many rows; shape of each array: (size, *field shape).
+            stored: Stored rows to replay, field name to array of shape (size, *field shape): the
+                instance that makes row i finds stored row i in `Environment.sample`, a copy as a
+                dictionary of arrays. None: nothing is replayed, and it finds None.
 
         Raises:
+            WrongSamplesError: `check_sample` refused too many samples in a row.
             SampleError: A sample cannot be stored; names the field, instance and step.
             PhysxError: An environment or client failed.
+        """
+
+    @abstractmethod
+    def take_refused(self) -> Batch:
+        """Return what `check_sample` refused while the last batch was made, and forget it.
+
+        They have the same fields as other rows and come by instance, then by step; a refused row
+        belongs to the batch that holds the next accepted one of its instance. After a
+        `WrongSamplesError` they are all those that were refused before it. An invalid one, for
+        example with NaN, is left out: see `physx_core.columns.Refused`. Empty without refused rows
+        and where ``record_wrong_samples`` is off.
         """
 
     @abstractmethod
@@ -54,11 +71,12 @@ class Source(ABC):
         """Close the environments; nothing stays behind. Calling it again does nothing."""
 
     def __enter__(self) -> Self:
-        """Open the source."""
+        """Open the source; where that fails, environments that cannot be closed are not told of."""
         try:
             self.open()
         except BaseException:
-            self.close()
+            with contextlib.suppress(PhysxError):
+                self.close()
             raise
         return self
 
@@ -68,5 +86,17 @@ class Source(ABC):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the source."""
-        self.close()
+        """Close the source; after an error, no other takes its place."""
+        with contextlib.suppress(PhysxError) if kind is not None else contextlib.nullcontext():
+            self.close()
+
+
+def check_stored(stored: Batch, size: int) -> None:
+    """Check that stored rows are as many as a batch has.
+
+    Raises:
+        UsageError: There are more or fewer.
+    """
+    for name, values in stored.items():
+        if len(values) != size:
+            raise UsageError(f'{len(values)} stored rows of "{name}" cannot make {size} rows.')

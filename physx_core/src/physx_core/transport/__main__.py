@@ -10,6 +10,7 @@ import sys
 
 from physx_core.errors import PhysxError
 from physx_core.transport.client import run_client
+from physx_core.transport.descendants import kill_descendants
 from physx_core.transport.handshake import TOKEN_VARIABLE
 
 
@@ -20,6 +21,7 @@ def main() -> int:
     parser.add_argument("--instance", type=int, help="number of the instance; any by default")
     options = parser.parse_args()
     faulthandler.enable()  # a crash of an engine says in which step it happened
+    faulthandler.register(signal.SIGTERM, all_threads=False, chain=True)  # a hang, where
     token = os.environ.pop(TOKEN_VARIABLE, "")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server decides when a run ends
     try:
@@ -27,6 +29,8 @@ def main() -> int:
     except PhysxError as error:
         sys.stderr.write(f"physx client: {error}\n")
         return 1
+    finally:
+        kill_descendants()  # where the server is gone too, nobody else does
 
 
 if __name__ == "__main__":

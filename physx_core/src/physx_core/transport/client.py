@@ -2,65 +2,84 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from physx_core.errors import ConnectionRefusedByPeerError, PhysxError
+from physx_core.errors import PhysxError
 from physx_core.fields import Sample
 from physx_core.instance import Instance
 from physx_core.scene import Event
-from physx_core.transport.failures import decode_error, encode_error
+from physx_core.transport.failures import encode_error
 from physx_core.transport.frames import Kind, pack
+from physx_core.transport.joining import PATIENCE, join
 from physx_core.transport.launcher import CLIENT_VARIABLE
-from physx_core.transport.link import Link, RunEnded, connect
+from physx_core.transport.link import Link, RunEnded, ServerGone
 from physx_core.transport.producer import Producer
-from physx_core.transport.values import decode, encode
+from physx_core.transport.values import encode
 
 
-def run_client(address: str, token: str, instance: int | None = None) -> int:
+def run_client(
+    address: str,
+    token: str,
+    instance: int | None = None,
+    *,
+    patience: float = PATIENCE,
+    say: Callable[[str], None] = lambda text: None,
+) -> int:
     """Run one instance of the environment for a server until it ends the run.
 
     Args:
         address: The server's ``HOST:PORT``.
         token: Token of the run.
         instance: Number of the instance to run, counted from 1; None: any that is free.
+        patience: Time in s for which to try again where nothing listens.
+        say: Is told what happens.
 
     Returns:
-        Exit status of the process: 0, or 1 where the environment failed; the server knows why.
+        Exit status of the process: 0 once the run has ended, 1 where the environment failed or the
+        server is gone; the server knows why.
 
     Raises:
         ConnectionRefusedByPeerError: Nothing answers at the address, not a server with this token,
             or the server has no place for the instance.
     """
-    link = connect(address, token, instance or 0)
+    say(f"looks for the server at {address}")
+    link, setup = join(address, token, instance or 0, patience)
     try:
-        return _serve(link)
+        return _serve(link, setup, say)
     except RunEnded:
+        say("the server is gone")
         return 1
     finally:
         link.close()
 
 
-def _serve(link: Link) -> int:
-    frame = link.receive()
-    if frame.kind is Kind.ERROR:
-        raise decode_error(frame.payload)
-    if frame.kind is not Kind.SETUP:
-        raise ConnectionRefusedByPeerError(f"The server began with {frame.kind.name}.")
-    setup: dict[str, Any] = decode(frame.payload)
+def _serve(link: Link, setup: dict[str, Any], say: Callable[[str], None]) -> int:
     os.environ[CLIENT_VARIABLE] = "1"
-    draw = setup.pop("draw")
+    draw, skip = setup.pop("draw"), setup.pop("skip")
     _take_place(setup.pop("path"), setup.pop("directory"))
-    client = _Client(link, Instance(**setup))
+    say(
+        f"runs {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"
+        + (f"; {skip['rows']} rows are there and are made again" if skip["rows"] else "")
+    )
+    client = _Client(link, Instance(**setup), skip)
     try:
         client.live(draw)
     finally:
         client.close()
-    link.send(pack(Kind.BYE))
-    return 1 if client.failed else 0
+    if client.is_forsaken:
+        raise ServerGone
+    with contextlib.suppress(ServerGone):  # the run has ended, for whatever reason
+        link.send(pack(Kind.BYE))
+    if client.failure is not None:
+        say(f"{type(client.failure).__name__}: {client.failure}")
+        return 1
+    say("the run has ended")
+    return 0
 
 
 def _take_place(path: list[str], directory: str) -> None:
@@ -75,14 +94,16 @@ class _Client:
     """The life of one instance; its errors go to the server.
 
     Attributes:
-        failed: Whether an error was sent.
+        failure: The error that was sent.
+        is_forsaken: Whether the server has gone without a word.
     """
 
-    def __init__(self, link: Link, instance: Instance) -> None:
-        self.failed = False
+    def __init__(self, link: Link, instance: Instance, skip: dict[str, int]) -> None:
+        self.failure: PhysxError | None = None
+        self.is_forsaken = False
         self._link, self._instance = link, instance
-        self._producer = Producer(link, instance)
-        self._services = RemoteServices(link, self._producer.flush)
+        self._producer = Producer(link, instance, skip["rows"], skip["refused"])
+        self._services = RemoteServices(link, self._producer.flush, skip["shown"])
 
     def live(self, draw: bool) -> None:
         """Open the environment and make rows until the run ends or the environment fails."""
@@ -91,7 +112,8 @@ class _Client:
             fields = [field.to_dict() for field in self._instance.fields]
             self._link.send(pack(Kind.READY, encode(fields)))
             self._producer.run()
-        except RunEnded:
+        except RunEnded as end:
+            self.is_forsaken = isinstance(end, ServerGone)
             if self._producer.failure is not None:
                 self._report(self._producer.failure, self._producer.made)
         except PhysxError as error:
@@ -102,25 +124,26 @@ class _Client:
         try:
             self._instance.close()
         except PhysxError as error:
-            if not self.failed:
+            if self.failure is None:
                 self._report(error, 0)
 
     def _report(self, error: PhysxError, row: int) -> None:
-        self.failed = True
+        self.failure = error
         self._link.send(pack(Kind.ERROR, encode_error(error), row))
 
 
 class RemoteServices:
     """Services of the run, asked over the connection."""
 
-    def __init__(self, link: Link, flush: Callable[[], None]) -> None:
+    def __init__(self, link: Link, flush: Callable[[], None], shown: int = 0) -> None:
         """Keep the connection.
 
         Args:
             link: Connection to the server.
             flush: Sends what waits to be sent; called before each wait for an answer.
+            shown: How many times what is drawn first was sent by a client before this one.
         """
-        self._link, self._flush = link, flush
+        self._link, self._flush, self._to_skip = link, flush, shown
 
     def predict(self, fields: Sample) -> Sample:
         """Return the network's prediction: see `Services.predict`."""
@@ -138,10 +161,12 @@ class RemoteServices:
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:
         """Send drawing events: see `Services.show`."""
+        if self._to_skip:
+            self._to_skip -= 1
+            return
         plain = [(event.action, event.kind, event.name, dict(event.values)) for event in events]
         self._link.send(pack(Kind.SHOW, encode(plain, "update_visualization()"), step))
 
     def _ask(self, kind: Kind, value: Any, what: str) -> Any:
-        message = encode(value, what)
         self._flush()
-        return decode(self._link.ask(kind, message))
+        return self._link.ask(kind, value, what)

@@ -6,8 +6,10 @@ import traceback
 from typing import Any
 
 from physx_core import errors
-from physx_core.errors import PhysxError, UsageError
+from physx_core.errors import ConnectionRefusedByPeerError, PhysxError, UsageError
 from physx_core.transport.values import decode, encode
+
+_PARTS = {"classes": list, "message": str, "attributes": dict, "traceback": str}
 
 
 class RemoteTraceback(Exception):  # noqa: N818 - it is the cause of an error, not an error itself
@@ -41,6 +43,8 @@ def decode_error(payload: bytes | bytearray) -> PhysxError:
         ConnectionRefusedByPeerError: The bytes were not made by `encode_error`.
     """
     plain: dict[str, Any] = decode(payload)
+    if not _is_error(plain):
+        raise ConnectionRefusedByPeerError("What was received as an error describes none.")
     cls = next((c for c in map(_error_class, plain["classes"]) if c is not None), PhysxError)
     error = cls.__new__(cls)
     Exception.__init__(error, plain["message"])
@@ -52,6 +56,14 @@ def decode_error(payload: bytes | bytearray) -> PhysxError:
 def _error_class(name: str) -> type[PhysxError] | None:
     found = getattr(errors, name, None)
     return found if isinstance(found, type) and issubclass(found, PhysxError) else None
+
+
+def _is_error(plain: Any) -> bool:
+    if not isinstance(plain, dict) or {k: type(value) for k, value in plain.items()} != _PARTS:
+        return False
+    notes = plain["attributes"].get("__notes__", [])
+    texts = [*plain["classes"], *plain["attributes"], *(notes if type(notes) is list else [None])]
+    return all(type(text) is str for text in texts)
 
 
 def _is_plain(value: Any) -> bool:

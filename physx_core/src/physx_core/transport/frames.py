@@ -5,14 +5,16 @@ from __future__ import annotations
 import enum
 import socket
 import struct
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from physx_core.errors import ConnectionRefusedByPeerError, UsageError
 
 HEADER = struct.Struct("<IHHQ")
 """Length of the payload in bytes, kind, spare (0), number."""
 
-_BUFFER = 1 << 15
+_BUFFER = 1 << 17
+_DIRECT = 1 << 14
+_STEP = 1 << 20
 
 MAX_PAYLOAD = 1 << 30
 """Longest payload in bytes that an authenticated peer may send."""
@@ -57,13 +59,18 @@ class Kind(enum.IntEnum):
     """Server: close the environment and end."""
     BYE = 18
     """Client: the environment is closed."""
+    STORED = 19
+    """Server: stored rows that the next rows shall be made of [how many]."""
+    WRONG = 20
+    """Client: rows that `check_sample` refused, as in ROWS, before the next accepted [how many]."""
+    AGAIN = 21
+    """Client: makes rows again that the server has from a client before it [how many so far]."""
 
 
-_KINDS = frozenset(Kind)
+_KINDS = {int(kind): kind for kind in Kind}
 
 
-@dataclass(frozen=True)
-class Frame:
+class Frame(NamedTuple):
     """One message.
 
     Attributes:
@@ -104,11 +111,9 @@ def header(kind: Kind, length: int, number: int = 0) -> bytes:
 class FrameReader:
     """Reads frames from a socket, blocking or not.
 
-    Small frames come several to a system call through a buffer; the bulk of a large one goes
-    straight to its place.
-
-    Attributes:
-        limit: Longest payload in bytes that is taken.
+    Frames come several to a system call through a buffer; what a long one still lacks then goes
+    straight to its place, which grows as its bytes arrive: a peer that announces much and sends
+    little takes little memory.
     """
 
     def __init__(self, limit: int) -> None:
@@ -117,23 +122,45 @@ class FrameReader:
         Args:
             limit: Longest payload in bytes that is taken.
         """
-        self.limit = limit
+        self._limit = limit
         self._socket_may_have_more = False
-        self._buffer = memoryview(bytearray(_BUFFER))
+        self._bytes = bytearray(min(HEADER.size + limit, _BUFFER))
+        self._buffer = memoryview(self._bytes)
         self._start = self._end = 0
-        self._header = bytearray(HEADER.size)
-        self._announced: Frame | None = None
-        self._missing = memoryview(self._header)
+        self._large: _LargeFrame | None = None
+        self._after_large = False
+
+    @property
+    def limit(self) -> int:
+        """Longest payload in bytes that is taken."""
+        return self._limit
+
+    @limit.setter
+    def limit(self, limit: int) -> None:
+        self._limit = limit
+        size = max(self._end - self._start, min(HEADER.size + limit, _BUFFER))
+        larger = bytearray(size)
+        larger[: self._end - self._start] = self._buffer[self._start : self._end]
+        self._start, self._end = 0, self._end - self._start
+        self._bytes, self._buffer = larger, memoryview(larger)
 
     @property
     def has_buffered(self) -> bool:
-        """Whether bytes that were received wait to be read."""
-        return self._start < self._end
+        """Whether a whole frame that was received waits to be read."""
+        waiting = self._end - self._start - HEADER.size
+        if waiting < 0 or self._large is not None:
+            return False
+        return waiting >= int(HEADER.unpack_from(self._bytes, self._start)[0])
+
+    @property
+    def has_large(self) -> bool:
+        """Whether a part of a long frame has arrived, which may take its time."""
+        return self._large is not None
 
     @property
     def may_have_more(self) -> bool:
         """Whether another `read` may find something at once; False is certain."""
-        return self.has_buffered or self._socket_may_have_more
+        return self._socket_may_have_more or self.has_buffered
 
     def read(self, connection: socket.socket) -> Frame | None:
         """Return the next frame, or None where a socket that does not block has no more for now.
@@ -143,47 +170,93 @@ class FrameReader:
             ConnectionRefusedByPeerError: The peer sent what is no frame, or too long a one.
         """
         while True:
-            if self._missing and not self._receive(connection):
-                return None
-            if self._missing:
-                continue
-            if self._announced is None:
-                self._announced = self._parsed()
-                self._missing = memoryview(self._announced.payload)
-            else:
-                frame, self._announced = self._announced, None
-                self._missing = memoryview(self._header)
-                return frame
-
-    def _receive(self, connection: socket.socket) -> bool:
-        """Fill some of what is missing; return False where nothing is there."""
-        if self._start == self._end:
-            direct = len(self._missing) >= len(self._buffer)
-            target = self._missing if direct else self._buffer
+            if self._large is not None:
+                if not self._large.missing:
+                    frame, self._large = self._large.frame, None
+                    return frame
+            elif self._start < self._end:
+                buffered = self._buffered()
+                if buffered is not None:
+                    return buffered
+            target = self._room()
             try:
                 count = connection.recv_into(target)
             except BlockingIOError:
-                return False
+                return None
             except OSError as error:
                 raise EOFError(str(error)) from error
             if not count:
                 raise EOFError("end of stream")
             self._socket_may_have_more = count == len(target)
-            if direct:
-                self._missing = self._missing[count:]
-                return True
-            self._start, self._end = 0, count
-        count = min(len(self._missing), self._end - self._start)
-        self._missing[:count] = self._buffer[self._start : self._start + count]
-        self._missing = self._missing[count:]
-        self._start += count
-        return True
+            if self._large is None:
+                self._end += count
+            else:
+                self._large.filled(target, count)
 
-    def _parsed(self) -> Frame:
-        length, kind, spare, number = HEADER.unpack(self._header)
-        if length > self.limit or spare or kind not in _KINDS:
+    def _buffered(self) -> Frame | None:
+        """Return the frame at the begin of the buffer if it is whole; make room for a long one."""
+        start = self._start + HEADER.size
+        if start > self._end:
+            return None
+        length, kind, spare, number = HEADER.unpack_from(self._bytes, self._start)
+        known = _KINDS.get(kind)
+        if length > self._limit or spare or known is None:
             raise ConnectionRefusedByPeerError(
                 "The other side of a connection sent what is no message of physx, or one longer "
-                f"than the {self.limit} bytes that are taken here."
+                f"than the {self._limit} bytes that are taken here."
             )
-        return Frame(Kind(kind), number, bytearray(length))
+        end = start + length
+        if end <= self._end:
+            self._start, self._after_large = end, False
+            return Frame(known, number, self._bytes[start:end])
+        if length > _DIRECT:
+            self._large = _LargeFrame(known, number, length)
+            self._large.put(self._buffer[start : self._end])
+            self._start, self._end, self._after_large = 0, 0, True
+        return None
+
+    def _room(self) -> memoryview:
+        """Return where the next bytes go."""
+        if self._large is not None:
+            return self._large.room()
+        waiting = self._end - self._start
+        if self._start:
+            if waiting:
+                self._bytes[:waiting] = self._bytes[self._start : self._end]
+            self._start, self._end = 0, waiting
+        if self._after_large:  # after a long frame comes another: leave its bulk where it is
+            return self._buffer[waiting : max(_DIRECT, waiting + HEADER.size)]
+        return self._buffer[waiting:] if waiting else self._buffer
+
+
+class _LargeFrame:
+    """A long frame while it arrives.
+
+    Attributes:
+        frame: The frame.
+        missing: How many bytes of its payload have not arrived.
+    """
+
+    def __init__(self, kind: Kind, number: int, length: int) -> None:
+        self.frame = Frame(kind, number, bytearray(min(length, _STEP)))
+        self.missing = length
+        self._received = 0
+
+    def put(self, data: memoryview) -> None:
+        """Add bytes that were received elsewhere."""
+        self.frame.payload[: len(data)] = data
+        self._received += len(data)
+        self.missing -= len(data)
+
+    def room(self) -> memoryview:
+        """Return where the next bytes belong."""
+        payload = self.frame.payload
+        if self._received == len(payload):
+            payload += bytes(min(self.missing, len(payload)))
+        return memoryview(payload)[self._received :]
+
+    def filled(self, room: memoryview, count: int) -> None:
+        """Note how many bytes were put into the room."""
+        room.release()
+        self._received += count
+        self.missing -= count

@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
-import os
+import logging
+import socket
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import ClientError, ConfigError
+from physx_core.errors import ClientError, ConfigError, EnvironmentFailedError, PhysxError
 from physx_core.interfaces.environment import Services
-from physx_core.plugins import reference_of
+from physx_core.interfaces.launcher import ClientHandle, Launcher
+from physx_core.plugins import reference_of, resolve
+from physx_core.plugins.references import located
 from physx_core.transport.handshake import TOKEN_VARIABLE
-from physx_core.transport.launcher import ClientProcess, ending, stop
+from physx_core.transport.launcher import stop
+from physx_core.transport.losses import ended, silent
 from physx_core.transport.peer import Peer
 from physx_core.transport.server import Server
+from physx_core.transport.tokens import run_token
 from physx_core.transport.values import encode
 
 _TICK = 0.1
 _GRACE = 1.0
 _EXIT_TIME = 5.0
-_SHORTEST_TOKEN = 16
+_SAY_EVERY = 5.0
+_PASSING = (EnvironmentFailedError, ClientError)  # what may not come again
+_LOG = logging.getLogger("physx")
 
 
 class ClientGroup:
@@ -32,59 +41,58 @@ class ClientGroup:
         config: Which environment, how many clients, and how long they may be silent.
     """
 
-    def __init__(
-        self,
-        config: EnvironmentConfig,
-        services: Services,
-        seed: Sequence[int],
-        *,
-        launch: bool = True,
-    ) -> None:
+    def __init__(self, config: EnvironmentConfig, services: Services, seed: Sequence[int]) -> None:
         """Keep what the clients are started with.
 
         Args:
-            config: Which environment, and how many clients.
+            config: Which environment, how many clients, and what starts them.
             services: What the environments may ask of the run.
             seed: Seed of all instances.
-            launch: Whether to start the clients; otherwise they are started by hand, with the
-                token that the environment variable ``PHYSX_TOKEN`` holds on both sides.
         """
         self.config = config
         self._seed = list(seed)
-        self._launch = launch
-        self._processes: dict[int, ClientProcess] = {}
+        self._launcher = _make_launcher(config)
+        self._handles: dict[int, ClientHandle] = {}
+        self._launched: dict[int, float] = {}
         self._exits: dict[int, float] = {}
-        self._checked = self._served = 0.0
-        token = None if launch else os.environ.get(TOKEN_VARIABLE, "")
+        self._restarts: Counter[int] = Counter()
+        self._checked = self._served = self._said = 0.0
+        self._closing = False
         self.server = Server(
-            config.ip_address, config.port, config.num_clients, services, self._setup, token
+            config.ip_address,
+            config.port,
+            config.num_clients,
+            services,
+            self._setup,
+            run_token(config, self._launcher.by_hand),
+            self._replaces,
         )
 
     def open(self) -> None:
         """Start the clients and wait until their environments live.
 
         Raises:
-            ConfigError: The server cannot listen there, or there is no token.
+            ConfigError: The server cannot listen there.
             ClientError: A client did not come to life.
             PhysxError: An environment failed.
         """
-        if len(self.server.token) < _SHORTEST_TOKEN:
-            raise ConfigError(
-                f"Clients that are started by hand need a secret: set {TOKEN_VARIABLE}, at least "
-                f"{_SHORTEST_TOKEN} characters, for the server and for each client."
-            )
-        self._setup(1)  # what cannot travel is named before anything is started
+        self._encoded(1)  # what cannot travel is named before anything is started
         self.server.open()
-        numbers = range(1, self.config.num_clients + 1)
-        if self._launch:
-            for number in numbers:
-                process = ClientProcess(number, self.server.address, self.server.token)
-                self._processes[number] = process
-                process.start()
+        numbers = list(self._numbers)
+        self._launch(numbers)
+        if self._launcher.by_hand:
+            _LOG.warning(
+                "The run waits for %d %s. Start each with: physx client --connect %s "
+                "(and the token in %s, or in a file with --token-file)",
+                len(numbers),
+                "clients" if len(numbers) > 1 else "client",
+                self._public_address(),
+                TOKEN_VARIABLE,
+            )
         self.wait(lambda: [number for number in numbers if not self._is_ready(number)])
 
     def peer(self, instance_id: int) -> Peer:
-        """Return the connection of an instance's client."""
+        """Return the connection of an instance's client, or of the last one that it had."""
         return self.server.peers[instance_id]
 
     def wait(self, missing: Callable[[], Sequence[int]]) -> None:
@@ -94,24 +102,20 @@ class ClientGroup:
             missing: Tells the instances that are waited for; called after each round.
 
         Raises:
-            ClientError: A client ended, or one that is waited for is silent for too long.
+            PhysxError: A client ended, failed, or let the server wait for too long, and none takes
+                its place.
         """
         began = time.monotonic()
         if began - self._served > _TICK / 10:
             self._serve(0.0)
         while waited := missing():
             self._serve(_TICK)
+            self._say(waited, began)
             if self._silent(waited, began):
                 self._serve(0.0)  # an answer may have taken long while others had their say
-                self._raise_silent(self._silent(waited, began))
-
-    def _serve(self, timeout: float) -> None:
-        self.server.pump(timeout)
-        self._served = time.monotonic()
-        gone = any(peer.gone for peer in self.server.peers.values())
-        if gone or self._served - self._checked > _TICK:
-            self._checked = self._served
-            self._check_ended(self._served)
+                for number in self._silent(waited, began):
+                    peer, handle = self.server.peers.get(number), self._handles.get(number)
+                    self._lose(number, silent(number, peer, handle, self.config.timeout))
 
     def close(self, *, orderly: bool) -> None:
         """Have the clients close their environments, and end them; no process is left behind.
@@ -124,7 +128,9 @@ class ClientGroup:
             ClientError: A client ended too early or is silent for too long.
         """
         patience = 0.0
+        self._closing = True
         try:
+            stop([h for n, h in self._handles.items() if self._present(n) is None], 0.0)
             self.server.end()
             if orderly:
                 self.wait(self._unfinished)
@@ -133,9 +139,41 @@ class ClientGroup:
                 self._wait_a_moment()
                 patience = 0.0 if self._unfinished() else _GRACE
         finally:
-            stop(self._processes.values(), patience)
-            self._processes = {}
+            stop(self._handles.values(), patience)
+            self._handles = {}
             self.server.close()
+
+    @property
+    def _numbers(self) -> range:
+        return range(1, self.config.num_clients + 1)
+
+    def _launch(self, numbers: Sequence[int]) -> None:
+        now = time.monotonic()
+        started = self._launcher.launch(numbers, self.server.address, self.server.token)
+        handles = {handle.instance_id: handle for handle in started}
+        self._handles.update(handles)
+        self._launched.update(dict.fromkeys(numbers, now))
+        without = [number for number in numbers if number not in handles]
+        if without and not self._launcher.by_hand:
+            raise ClientError(
+                without[0],
+                f"was not started: {type(self._launcher).__name__}.launch() returned no handle "
+                "for it. A launcher that starts nothing says by_hand = True.",
+            )
+
+    def _public_address(self) -> str:
+        """Return ``HOST:PORT`` for people."""
+        if self.config.ip_address not in ("", "0.0.0.0", "::"):
+            return self.server.address
+        return f"{socket.gethostname()}:{self.server.address.rpartition(':')[2]}"
+
+    def _serve(self, timeout: float) -> None:
+        self.server.pump(timeout)
+        self._served = time.monotonic()
+        lost = any(peer.is_lost and not peer.vacant for peer in self.server.peers.values())
+        if lost or self._served - self._checked > _TICK:
+            self._checked = self._served
+            self._check_ended(self._served)
 
     def _wait_a_moment(self) -> None:
         until = time.monotonic() + _GRACE
@@ -149,73 +187,145 @@ class ClientGroup:
         peers = self.server.peers.values()
         return [p.instance_id for p in peers if not (p.finished or p.gone or p.failure)]
 
-    def _is_ready(self, number: int) -> bool:
+    def _present(self, number: int) -> Peer | None:
+        """Return the connection of an instance's client; None where it has none now."""
         peer = self.server.peers.get(number)
+        return None if peer is None or peer.vacant else peer
+
+    def _is_ready(self, number: int) -> bool:
+        peer = self._present(number)
         if peer is not None and peer.failure is not None:
             raise peer.failure
         return peer is not None and bool(peer.fields)
 
     def _check_ended(self, now: float) -> None:
-        for number in range(1, self.config.num_clients + 1):
-            process, peer = self._processes.get(number), self.server.peers.get(number)
-            said_why = peer is not None and (peer.failure is not None or peer.finished)
-            if said_why or (process is None and (peer is None or not peer.gone)):
+        for number in self._numbers:
+            handle, peer = self._handles.get(number), self._present(number)
+            if peer is not None and peer.failure is not None:
+                if self._replaces(number, peer.failure):
+                    self._lose(number, peer.failure)
                 continue
-            status = process.exit_status() if process is not None else None
+            if peer is not None and peer.finished:
+                continue
             if peer is not None and peer.gone:
-                self._raise_ended(number, peer, process)
-            if status is not None and process is not None:
+                left = handle is None and not peer.offense
+                self._lose(number, ended(number, peer, handle), left=left)
+            elif handle is not None and handle.exit_status() is not None:
                 # What it sent before its end may still be on its way.
                 since = self._exits.setdefault(number, now)
                 if peer is None or now - since > 2 * _TICK:
-                    self._raise_ended(number, peer, process)
+                    self._lose(number, ended(number, peer, handle))
 
-    def _raise_ended(self, number: int, peer: Peer | None, process: ClientProcess | None) -> None:
-        if process is None:
-            raise ClientError(number, "closed the connection. Its own terminal may say why.")
-        process.wait(time.monotonic() + 1.0)
-        status, made = process.exit_status(), 0 if peer is None else peer.received
-        how = "closed the connection" if status is None else ending(status)
-        when = "before it connected" if peer is None else f"after {made} rows"
-        raise ClientError(
-            number,
-            f"{how} {when}. To see what it does, run with as_tcp_ip_client=False.",
-            exit_status=status,
-            stderr=process.stderr(),
-        )
+    # Clients that others take the place of --------------------------------------------------
+
+    def _replaces(self, number: int, error: PhysxError | None) -> bool:
+        """Return whether another client goes on where one failed, or left without an error."""
+        if error is None and self._launcher.by_hand:
+            return True
+        passing = error is None or isinstance(error, _PASSING)
+        return passing and self._restarts[number] < self.config.restarts
+
+    def _lose(self, number: int, error: PhysxError, *, left: bool = False) -> None:
+        """Have another client take the place of one that is lost.
+
+        Args:
+            number: The instance.
+            error: How it was lost.
+            left: Whether it closed the connection, as those may that people start.
+
+        Raises:
+            PhysxError: None takes its place: the error.
+        """
+        absent = self._launcher.by_hand and self._present(number) is None
+        if absent or not self._replaces(number, None if left else error):
+            raise error
+        if not left:
+            self._restarts[number] += 1
+        text, _, details = str(error).partition("\n")
+        follows = self._what_follows(number, left)
+        _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
+        self.server.vacate(number)
+        handle = self._handles.pop(number, None)
+        closes = isinstance(error, EnvironmentFailedError)  # and needs a moment for it
+        stop([] if handle is None else [handle], _GRACE if closes else 0.0)
+        self._exits.pop(number, None)
+        if not self._closing:
+            self._launch([number])
+
+    def _what_follows(self, number: int, left: bool) -> str:
+        if self._closing:
+            return "The run was at its end, and all rows are there."
+        text = "Another client goes on in its place."
+        if self._launcher.by_hand:
+            text = (
+                f"The run waits up to {self.config.timeout:g} s for another client to go on in its "
+                f"place, at {self._public_address()}."
+            )
+        restart = f"Restart {self._restarts[number]} of {self.config.restarts}."
+        return text if left else f"{restart} {text}"
+
+    def _say(self, waited: Sequence[int], began: float) -> None:
+        """Say now and then which clients are not there."""
+        now = time.monotonic()
+        if now - max(began, self._said) < _SAY_EVERY:
+            return
+        times = {n: now - max(began, self._heard(n)) for n in self.server.holding_up(waited)}
+        absent = [n for n in sorted(times) if self._present(n) is None and times[n] > _SAY_EVERY]
+        if absent:
+            self._said = now
+            _LOG.warning(
+                "The run waits for a client to run instance %s, since %.0f s, at %s. "
+                "It waits no longer than %g s.",
+                ", ".join(map(str, absent)),
+                max(times[number] for number in absent),
+                self._public_address(),
+                self.config.timeout,
+            )
+
+    def _heard(self, number: int) -> float:
+        peer = self.server.peers.get(number)
+        return max(self._launched.get(number, 0.0), peer.heard if peer is not None else 0.0)
 
     def _silent(self, waited: Sequence[int], began: float) -> list[int]:
         """Return those that let the server wait for too long."""
         limit = time.monotonic() - self.config.timeout
         numbers = sorted(self.server.holding_up(waited))
-        peers = ((number, self.server.peers.get(number)) for number in numbers)
-        return [number for number, p in peers if max(began, p.heard if p else 0.0) < limit]
+        return [number for number in numbers if max(began, self._heard(number)) < limit]
 
-    def _raise_silent(self, silent: Sequence[int]) -> None:
-        for number in silent:
-            process = self._processes.get(number)
-            what = "sent nothing" if number in self.server.peers else "did not connect"
-            raise ClientError(
-                number,
-                f"{what} for {self.config.timeout:g} s while the server waited for it. If its "
-                "steps take that long, raise EnvironmentConfig.timeout.",
-                stderr="" if process is None else process.stderr(),
-            )
+    def _setup(self, peer: Peer) -> bytes:
+        """Return what a client is told first: the instance, and what of it is there already."""
+        skip = {"rows": peer.received, "refused": peer.refused.count, "shown": peer.shown}
+        return self._encoded(peer.instance_id, skip=skip)
 
-    def _setup(self, instance_id: int) -> bytes:
+    def _encoded(self, instance_id: int, **progress: Any) -> bytes:
         config = self.config
         return encode(
             {
-                "environment": reference_of(config.environment),
+                "environment": located("environment", config.environment),
                 "env_kwargs": config.env_kwargs,
                 "seed": self._seed,
                 "instance_id": instance_id,
                 "instance_nb": config.num_clients,
                 "simulations_per_step": config.simulations_per_step,
                 "max_wrong_samples": config.max_wrong_samples_per_step,
+                "record_wrong": config.record_wrong_samples,
                 "draw": config.visualizer is not None,
                 "path": [str(Path(entry).resolve()) for entry in sys.path],
                 "directory": str(Path.cwd()),
+                **progress,
             },
             "EnvironmentConfig",
         )
+
+
+def _make_launcher(config: EnvironmentConfig) -> Launcher:
+    make = resolve("launcher", config.launcher)
+    name = reference_of(config.launcher)
+    try:
+        launcher = make(**config.launcher_kwargs)
+    except TypeError as error:
+        text = str(error).split("() ")[-1]
+        raise ConfigError(f"EnvironmentConfig.launcher_kwargs: {name} {text}.") from error
+    if not isinstance(launcher, Launcher):
+        raise ConfigError(f"EnvironmentConfig.launcher: {name} is no Launcher.")
+    return launcher

@@ -12,7 +12,7 @@ import secrets
 import socket
 import struct
 
-from physx_core.errors import ConnectionRefusedByPeerError
+from physx_core.errors import ConnectionRefusedByPeerError, UnansweredError
 from physx_core.transport.frames import MAX_PAYLOAD, Frame, FrameReader, Kind, pack
 
 TOKEN_VARIABLE = "PHYSX_TOKEN"
@@ -87,8 +87,9 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
         The reader for what the server sends next.
 
     Raises:
-        ConnectionRefusedByPeerError: The server is of another version, knows another token, is no
-            server of physx, or does not answer.
+        UnansweredError: The server does not answer, or ended the connection.
+        ConnectionRefusedByPeerError: The server is of another version, knows another token, or is
+            no server of physx.
     """
     reader = FrameReader(HANDSHAKE_LIMIT)
     own = secrets.token_bytes(32)
@@ -96,7 +97,7 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
         connection.sendall(pack(Kind.HELLO, _OPENING.pack(_MAGIC, VERSION, own)))
         frame = reader.read(connection)
     except (EOFError, OSError) as error:
-        raise ConnectionRefusedByPeerError(
+        raise UnansweredError(
             f"The server ended the connection or did not answer ({error})."
         ) from error
     if frame is None or frame.kind is not Kind.CHALLENGE:
@@ -112,10 +113,14 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
     ):
         raise ConnectionRefusedByPeerError(
             "The server does not know this client's token. Set the environment variable "
-            f"{TOKEN_VARIABLE} to the token of the run that the client shall join."
+            f"{TOKEN_VARIABLE} to the token of the run that the client shall join, or name the "
+            "file that holds it with --token-file."
         )
     proof = _proof(token, b"client", other, own, instance)
-    connection.sendall(pack(Kind.PROOF, proof, instance))
+    try:
+        connection.sendall(pack(Kind.PROOF, proof, instance))
+    except OSError as error:
+        raise UnansweredError(f"The server ended the connection ({error}).") from error
     reader.limit = MAX_PAYLOAD
     return reader
 

@@ -1,4 +1,4 @@
-"""Launcher: client processes, each in a process group of its own that is always cleared away."""
+"""Launchers of the core: processes on this machine, or people who start clients themselves."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import IO
 
-from physx_core.errors import ClientError
+from physx_core.errors import ClientError, ConfigError
+from physx_core.interfaces.launcher import ClientHandle, Launcher
 from physx_core.transport.handshake import TOKEN_VARIABLE
 
 CLIENT_VARIABLE = "PHYSX_CLIENT"
 """Environment variable that is set in every client process."""
 
 _TAIL = 8192
-_LINES = 30
+_LINES = 60
 _TERMINATE_TIME = 0.5
 
 
-class ClientProcess:
+class ClientProcess(ClientHandle):
     """One client, started on this machine.
 
     Its standard input is empty, its standard output is this process's, and the end of its standard
@@ -33,15 +34,17 @@ class ClientProcess:
         instance_id: Number of the instance that it runs, counted from 1.
     """
 
-    def __init__(self, instance_id: int, address: str, token: str) -> None:
+    def __init__(self, instance_id: int, address: str, token: str, core: int | None = None) -> None:
         """Keep what the process is started with.
 
         Args:
             instance_id: Number of the instance, counted from 1.
             address: The server's ``HOST:PORT``.
             token: Token of the run.
+            core: The only processor core that it may use; None: all that this process may use.
         """
         self.instance_id = instance_id
+        self._core = core
         self._command = [
             *(sys.executable, "-P", "-m", "physx_core.transport"),
             *("--connect", address, "--instance", str(instance_id)),
@@ -70,6 +73,9 @@ class ClientProcess:
             )
         except OSError as error:
             raise ClientError(self.instance_id, f"could not be started: {error}.") from error
+        if self._core is not None:
+            with contextlib.suppress(ProcessLookupError):  # it has ended already
+                os.sched_setaffinity(self._process.pid, {self._core})
         self._reader = threading.Thread(
             target=self._keep_tail, args=(self._process.stderr,), daemon=True
         )
@@ -87,7 +93,7 @@ class ClientProcess:
             return None if process is None else process.returncode
         status = process.poll()
         if status is not None:
-            self.signal_group(signal.SIGKILL)  # what the environment left running
+            self.kill()  # what the environment left running
         return status
 
     def stderr(self) -> str:
@@ -97,19 +103,22 @@ class ClientProcess:
         lines = self._tail.decode(errors="replace").splitlines()
         return "\n".join(lines[-_LINES:])
 
-    def signal_group(self, number: signal.Signals) -> None:
-        """Send a signal to the process and those that it started."""
+    def terminate(self) -> None:
+        """Ask the process and those that it started to end."""
+        self._signal_group(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """Kill the process and those that it started."""
+        self._signal_group(signal.SIGKILL)
+
+    def wait(self, until: float) -> bool:
+        """Wait for the end of the process: see `ClientHandle.wait`."""
+        return self._process is None or super().wait(until)
+
+    def _signal_group(self, number: signal.Signals) -> None:
         if self._process is not None:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(self._process.pid, number)
-
-    def wait(self, until: float) -> bool:
-        """Wait for the end of the process; return whether it ended before `until`, monotonic s."""
-        while self._process is not None and self.exit_status() is None:
-            if time.monotonic() >= until:
-                return False
-            time.sleep(0.005)
-        return True
 
     def _keep_tail(self, stream: IO[bytes]) -> None:
         with stream:
@@ -117,40 +126,72 @@ class ClientProcess:
                 self._tail = (self._tail + chunk)[-_TAIL:]
 
 
-def stop(processes: Iterable[ClientProcess], patience: float) -> None:
-    """End processes and all that they started; none is left when this returns.
+class SubprocessLauncher(Launcher):
+    """Starts each client as a process on this machine."""
+
+    def __init__(self, *, affinity: bool = False) -> None:
+        """Keep how processes are started.
+
+        Args:
+            affinity: Bind each client to one of the processor cores that this process may use, in
+                turn. It helps where as many clients as cores keep busy, and harms where the
+                environments use several threads.
+
+        Raises:
+            ConfigError: This operating system cannot do so.
+        """
+        self._cores: list[int] = []
+        if affinity:
+            if not hasattr(os, "sched_setaffinity"):
+                raise ConfigError(
+                    f"affinity: processes cannot be bound to processor cores on {sys.platform}."
+                )
+            self._cores = sorted(os.sched_getaffinity(0))
+
+    def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
+        """Start the processes: see `Launcher.launch`."""
+        started: list[ClientHandle] = []
+        try:
+            for number in instances:
+                core = self._cores[(number - 1) % len(self._cores)] if self._cores else None
+                process = ClientProcess(number, address, token, core)
+                started.append(process)
+                process.start()
+        except BaseException:
+            stop(started, 0.0)
+            raise
+        return started
+
+
+class ManualLauncher(Launcher):
+    """Starts nothing: people do, with ``physx client``, on this machine or another."""
+
+    by_hand = True
+
+    def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
+        """Start nothing; the server says where clients can connect."""
+        return []
+
+
+def stop(clients: Iterable[ClientHandle], patience: float) -> None:
+    """End clients and all that they started; none is left when this returns.
 
     Args:
-        processes: What to end.
+        clients: What to end.
         patience: Time in s for which they may end on their own.
     """
-    running = list(processes)
+    running = list(clients)
     try:
         running = _still_running(running, patience)
-        for process in running:
-            process.signal_group(signal.SIGTERM)
+        for client in running:
+            client.terminate()
         running = _still_running(running, _TERMINATE_TIME)
     finally:
-        for process in running:
-            process.signal_group(signal.SIGKILL)
+        for client in running:
+            client.kill()
         _still_running(running, 10.0)
 
 
-def _still_running(processes: list[ClientProcess], patience: float) -> list[ClientProcess]:
+def _still_running(clients: list[ClientHandle], patience: float) -> list[ClientHandle]:
     until = time.monotonic() + patience
-    return [process for process in processes if not process.wait(until)]
-
-
-def ending(status: int) -> str:
-    """Return an exit status in words.
-
-    Args:
-        status: Exit status, negative for a signal.
-    """
-    if status >= 0:
-        return f"ended with exit status {status}"
-    try:
-        name = signal.Signals(-status).name
-    except ValueError:
-        name = "unknown"
-    return f"was killed by signal {-status} ({name})"
+    return [client for client in clients if not client.wait(until)]

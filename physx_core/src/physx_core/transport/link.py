@@ -9,19 +9,23 @@ import signal
 import socket
 import threading
 from collections import deque
+from typing import Any
 
-from physx_core.errors import ConnectionRefusedByPeerError
+from physx_core.transport.descendants import kill_descendants
 from physx_core.transport.failures import decode_error
-from physx_core.transport.frames import Frame, FrameReader, Kind, pack
-from physx_core.transport.handshake import introduce
+from physx_core.transport.frames import Frame, FrameReader, Kind
+from physx_core.transport.values import decode, pack_value
 
-_CONNECT_TIME = 10.0
 _CLEANUP_TIME = 1.0
 _HANGUP = getattr(select, "POLLRDHUP", 0)
 
 
 class RunEnded(BaseException):
     """The server ended the run, or is gone: unwinds the environment's step."""
+
+
+class ServerGone(RunEnded):
+    """The connection to the server has ended."""
 
 
 class Link:
@@ -56,7 +60,7 @@ class Link:
         try:
             self._connection.sendall(message)
         except OSError as error:
-            raise RunEnded from error
+            raise ServerGone from error
 
     def receive(self) -> Frame:
         """Wait for the next message.
@@ -66,19 +70,32 @@ class Link:
         """
         return self._postponed.popleft() if self._postponed else self._next()
 
+    def put_back(self, frame: Frame) -> None:
+        """Have `receive` return a message again that came too early."""
+        self._postponed.appendleft(frame)
+
     def has_message(self) -> bool:
         """Return whether `receive` would find a message at once."""
         return bool(self._postponed or self._reader.has_buffered or self._poll.poll(0))
 
-    def ask(self, kind: Kind, payload: bytes) -> bytearray:
+    def ask(self, kind: Kind, value: Any, what: str) -> Any:
         """Send a request and wait for the answer.
+
+        Args:
+            kind: What is asked.
+            value: What goes with it.
+            what: Name of the value for error messages.
+
+        Returns:
+            The value that the server answers.
 
         Raises:
             RunEnded: The server ended the run instead.
-            PhysxError: The request was refused.
+            PhysxError: The request was refused, or the value cannot travel.
         """
+        message = pack_value(kind, value, what, self._requests + 1)
         self._requests += 1
-        self.send(pack(kind, payload, self._requests))
+        self.send(message)
         while True:
             frame = self._next()
             if frame.kind is Kind.CLOSE:
@@ -88,7 +105,7 @@ class Link:
             elif frame.number == self._requests:
                 if frame.kind is Kind.REFUSAL:
                     raise decode_error(frame.payload)
-                return frame.payload
+                return decode(frame.payload)
 
     def close(self) -> None:
         """Close the connection."""
@@ -101,9 +118,9 @@ class Link:
         try:
             frame = self._reader.read(self._connection)
         except (EOFError, OSError) as error:
-            raise RunEnded from error
+            raise ServerGone from error
         if frame is None:  # a blocking socket has no such case
-            raise RunEnded
+            raise ServerGone
         return frame
 
     def _watch(self) -> None:
@@ -112,38 +129,7 @@ class Link:
         poll.poll()
         if self._over.wait(_CLEANUP_TIME):
             return
-        if os.getpgrp() == os.getpid():  # a group of its own: what the environment started too
+        if os.getsid(0) == os.getpid():  # it was launched: a group of its own
             os.killpg(os.getpid(), signal.SIGKILL)
+        kill_descendants()
         os._exit(1)
-
-
-def connect(address: str, token: str, instance: int) -> Link:
-    """Connect to a server.
-
-    Args:
-        address: ``HOST:PORT``.
-        token: Token of the run.
-        instance: Number of the instance to run, 0 for any that is free.
-
-    Raises:
-        ConnectionRefusedByPeerError: Nothing answers at the address, or not a server with this
-            token.
-    """
-    host, _, port = address.rpartition(":")
-    try:
-        place = (host.strip("[]"), int(port))
-        connection = socket.create_connection(place, timeout=_CONNECT_TIME)
-    except (OSError, ValueError, OverflowError) as error:
-        raise ConnectionRefusedByPeerError(
-            f'No server can be reached at "{address}": {error}. Give the HOST:PORT at which the '
-            "run listens."
-        ) from error
-    try:
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        reader = introduce(connection, token, instance)
-        connection.settimeout(None)
-    except BaseException:
-        connection.close()
-        raise
-    return Link(connection, reader)

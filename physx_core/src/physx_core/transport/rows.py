@@ -17,19 +17,20 @@ def row_bytes(fields: Sequence[Field]) -> int:
     return sum(field.nbytes for field in fields)
 
 
-def pack_rows(block: Batch, count: int) -> bytes:
+def pack_rows(block: Batch, count: int, kind: Kind = Kind.ROWS) -> bytes:
     """Return the message that carries a block of rows.
 
     Args:
         block: Field name to contiguous array of shape (count, *field shape).
         count: How many rows.
+        kind: What rows they are.
 
     Raises:
         UsageError: The block is longer than a message may be.
     """
     arrays = list(block.values())
     length = sum(array.nbytes for array in arrays)
-    return b"".join([header(Kind.ROWS, length, count), *(array.data for array in arrays)])
+    return b"".join([header(kind, length, count), *(array.data for array in arrays)])
 
 
 def unpack_rows(payload: bytearray, fields: Sequence[Field], count: int) -> Batch:
@@ -43,16 +44,17 @@ def unpack_rows(payload: bytearray, fields: Sequence[Field], count: int) -> Batc
     Raises:
         ConnectionRefusedByPeerError: It has another length than that many rows.
     """
-    if len(payload) != count * row_bytes(fields):
+    sizes = [field.nbytes for field in fields]
+    if len(payload) != count * sum(sizes):
         raise ConnectionRefusedByPeerError(
-            f"A client sent {len(payload)} bytes for {count} rows of {row_bytes(fields)} bytes."
+            f"A client sent {len(payload)} bytes for {count} rows of {sum(sizes)} bytes."
         )
     block: Batch = {}
     start = 0
-    for field in fields:
+    for field, size in zip(fields, sizes, strict=True):
         shape = (count, *(field.shape or ()))
         block[field.name] = np.ndarray(shape, field.dtype, buffer=payload, offset=start)
-        start += count * field.nbytes
+        start += count * size
     return block
 
 
@@ -103,3 +105,35 @@ class RowQueue:
             moved += size
             self.count -= size
         return moved
+
+
+class RefusedRows:
+    """Rows of one client that `check_sample` refused, in the order of their steps.
+
+    Attributes:
+        count: How many arrived in all.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._blocks: deque[Batch] = deque()
+
+    def append(self, block: Batch, count: int) -> None:
+        """Add a block of rows behind the others."""
+        self._blocks.append(block)
+        self.count += count
+
+    def take(self, end: int | None) -> list[Batch]:
+        """Return the rows of steps below `end`, or all if it is None, and forget them."""
+        taken = []
+        while self._blocks:
+            block = self._blocks[0]
+            steps = block["step"]
+            size = len(steps) if end is None else int(np.searchsorted(steps, end))
+            if size:
+                taken.append({name: values[:size] for name, values in block.items()})
+            if size < len(steps):
+                self._blocks[0] = {name: values[size:] for name, values in block.items()}
+                break
+            self._blocks.popleft()
+        return taken

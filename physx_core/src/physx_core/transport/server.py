@@ -7,20 +7,32 @@ import selectors
 import socket
 import time
 from collections.abc import Callable, Iterable
-from typing import Any
 
-from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
-from physx_core.fields import Field
+from physx_core.errors import (
+    ConfigError,
+    ConnectionRefusedByPeerError,
+    PhysxError,
+    SampleError,
+)
 from physx_core.interfaces.environment import Services
 from physx_core.transport.answers import Answers
+from physx_core.transport.claims import (
+    check_environment_fields,
+    check_row_fields,
+    check_rows,
+    declared_fields,
+)
 from physx_core.transport.failures import decode_error, encode_error
 from physx_core.transport.frames import MAX_PAYLOAD, Frame, Kind, pack
+from physx_core.transport.journal import Journal
 from physx_core.transport.peer import Peer
 from physx_core.transport.rows import unpack_rows
-from physx_core.transport.values import decode
 
 _HANDSHAKE_TIME = 5.0
-_MAX_STRANGERS = 32
+_MAX_STRANGERS = 128
+_ACCEPTED_AT_ONCE = 16
+_TURNS = 64
+_LONG = 1 << 16
 
 
 class Server:
@@ -28,7 +40,7 @@ class Server:
 
     Attributes:
         peers: Instance number to the connection of its client.
-        token: Random secret of the run.
+        token: Secret of the run.
     """
 
     def __init__(
@@ -37,8 +49,9 @@ class Server:
         port: int,
         instance_nb: int,
         services: Services,
-        setup: Callable[[int], bytes],
-        token: str | None = None,
+        setup: Callable[[Peer], bytes],
+        token: str,
+        replaces: Callable[[int, PhysxError | None], bool] = lambda number, error: False,
     ) -> None:
         """Keep where to listen and what to tell clients.
 
@@ -48,23 +61,27 @@ class Server:
             instance_nb: How many instances run.
             services: What the environments may ask of the run.
             setup: Makes the payload that tells an instance's client what to run.
-            token: Secret of the run; None: a random one.
+            token: Secret of the run.
+            replaces: Whether an instance's client that fails with an error, or leaves without one,
+                makes room for another.
         """
         self.peers: dict[int, Peer] = {}
-        self.token = secrets.token_hex(32) if token is None else token
+        self.token = token
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
         self._answers = Answers(services)
-        self._setup = setup
-        self._ending = False
+        self._setup, self._replaces = setup, replaces
+        self._ending = self._has_news = False
         self._strangers: list[Peer] = []
         self._selector = selectors.DefaultSelector()
         self._listener: socket.socket | None = None
         self._dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
-            Kind.READY: self._ready,
-            Kind.FIELDS: self._fields,
-            Kind.ROWS: self._rows,
-            Kind.ERROR: self._error,
+            Kind.READY: _ready,
+            Kind.FIELDS: _fields,
+            Kind.ROWS: _rows,
+            Kind.WRONG: _wrong,
+            Kind.ERROR: _error,
             Kind.BYE: self._bye,
+            Kind.AGAIN: _again,
             **dict.fromkeys((Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW), self._answers.take),
         }
 
@@ -98,18 +115,33 @@ class Server:
         return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
     def pump(self, timeout: float) -> None:
-        """Do what there is to do; wait up to `timeout` s for the first of it."""
+        """Do what there is to do; wait up to `timeout` s for the first of it.
+
+        As long as all that happens is that predictions are asked for and answered, and for no
+        longer than `timeout`, it goes on.
+        """
+        until = time.monotonic() + timeout
+        while self._answer_at_once(timeout) and time.monotonic() < until:
+            continue
+        self._watch()
+
+    def _answer_at_once(self, timeout: float) -> bool:
+        """Do what there is to do; return whether it was to answer requests and nothing else."""
+        self._has_news = False
         for key, events in self._selector.select(timeout):
             if key.data is None:
                 self._accept()
+                self._has_news = True
                 continue
             if events & selectors.EVENT_WRITE:
                 key.data.flush()
+                self._has_news = True
             if events & selectors.EVENT_READ:
                 self._read(key.data)
-        if self._answers.asking and not self._expects_more_requests():
-            self._answers.predict()
-        self._watch()
+        asked = self._answers.count
+        if not asked or (asked < self._instance_nb and self._expects_more_requests()):
+            return False
+        return self._answers.predict() and not self._has_news
 
     @property
     def asking(self) -> set[int]:
@@ -122,10 +154,20 @@ class Server:
         for peer in self.peers.values():
             peer.send(pack(Kind.CLOSE))
 
+    def vacate(self, number: int) -> None:
+        """Have the next client of an instance go on where the present one failed or left."""
+        peer = self.peers.get(number)
+        if peer is not None:
+            self._drop(peer)
+            self._answers.forget(peer)
+            peer.vacant, peer.failure, peer.heard = True, None, time.monotonic()
+
     def close(self) -> None:
         """Close all connections; calling it again does nothing."""
         for peer in [*self._strangers, *self.peers.values()]:
             self._drop(peer)
+            if peer.journal is not None:
+                peer.journal.close()
         if self._listener is not None:
             self._listener.close()
             self._listener = None
@@ -147,25 +189,40 @@ class Server:
         a batch depends on the environments, and not on how fast each of them happens to be: the
         rounding of a network's result may depend on the size of the batch.
         """
-        batches = self._answers.batches and not self._ending
-        return batches and bool(self._at_work() - self.asking)
+        if self._ending or not self._answers.batches:
+            return False
+        numbers, asking = range(1, self._instance_nb + 1), self._answers.asking
+        return any(n not in asking and self._is_at_work(n) for n in numbers)
 
     def _at_work(self) -> set[int]:
-        numbers = range(1, self._instance_nb + 1)
-        return {n for n in numbers if n not in self.peers or self.peers[n].is_at_work}
+        return {n for n in range(1, self._instance_nb + 1) if self._is_at_work(n)}
+
+    def _is_at_work(self, number: int) -> bool:
+        peer = self.peers.get(number)
+        if peer is None or not peer.is_at_work:
+            return peer is None
+        return peer.vacant or not peer.is_lost or self._replaces(number, peer.failure)
 
     def _accept(self) -> None:
-        if self._listener is None:
-            return
-        try:
-            connection, _ = self._listener.accept()
-            peer = Peer(connection, self.token)
-        except OSError:  # it was gone before it was accepted
-            return
-        if len(self._strangers) >= _MAX_STRANGERS:
-            self._drop(self._strangers[0])
-        self._strangers.append(peer)
-        self._selector.register(connection, selectors.EVENT_READ, peer)
+        """Take some of the connections that wait; a flood of them must not keep the run waiting.
+
+        Where strangers are too many one of them is dropped, by chance: whoever keeps places busy
+        cannot keep a client out that tries again.
+        """
+        for _ in range(_ACCEPTED_AT_ONCE):
+            if self._listener is None:
+                return
+            try:
+                connection, _ = self._listener.accept()
+                peer = Peer(connection, self.token)
+            except BlockingIOError:
+                return
+            except OSError:  # it was gone before it was accepted
+                continue
+            if len(self._strangers) >= _MAX_STRANGERS:
+                self._drop(secrets.choice(self._strangers))
+            self._strangers.append(peer)
+            self._selector.register(connection, selectors.EVENT_READ, peer)
 
     def _watch(self) -> None:
         """Drop strangers that keep silent; have the selector look for what is to be sent."""
@@ -179,30 +236,40 @@ class Server:
                 self._selector.modify(peer.connection, events, peer)
 
     def _read(self, peer: Peer) -> None:
+        turns = 0
         try:
             while not peer.gone:
+                turns += 1
                 frame = peer.reader.read(peer.connection)
-                if peer.handshake is None:
+                if peer.handshake is None and (frame is not None or peer.reader.has_large):
                     peer.heard = time.monotonic()
                 if frame is not None:
                     self._take(peer, frame)
                 if frame is None or not peer.reader.may_have_more:
                     return
+                enough = turns >= _TURNS or len(frame.payload) > _LONG
+                if enough and not peer.reader.has_buffered:
+                    # Others want to be heard too; the selector finds what is left. And rows are
+                    # moved to their places while they are in the processor's cache.
+                    return
         except EOFError:
             self._drop(peer)
         except ConnectionRefusedByPeerError as error:
-            if peer.handshake is None:
-                peer.failure = peer.failure or error
+            peer.offense = str(error)
+            self._drop(peer)
+        except SampleError as error:
+            peer.failure, peer.failed_row = peer.failure or error, peer.received
             self._drop(peer)
 
     def _take(self, peer: Peer, frame: Frame) -> None:
         if peer.handshake is not None:
             self._greet(peer, frame)
         elif frame.kind in self._dispatch:
+            self._has_news |= frame.kind is not Kind.PREDICT
             self._dispatch[frame.kind](peer, frame)
         else:
             raise ConnectionRefusedByPeerError(
-                f"Client {peer.instance_id} sent {frame.kind.name}, which only a server sends."
+                f"It sent {frame.kind.name}, which is not for a client to send now."
             )
 
     def _greet(self, peer: Peer, frame: Frame) -> None:
@@ -213,7 +280,8 @@ class Server:
         wanted = handshake.instance_id
         if wanted is None:
             return
-        free = [n for n in range(1, self._instance_nb + 1) if n not in self.peers]
+        numbers = range(1, self._instance_nb + 1)
+        free = [n for n in numbers if n not in self.peers or self.peers[n].vacant]
         if not free or (wanted and wanted not in free):
             refusal = ConnectionRefusedByPeerError(
                 f"The server has no place for instance {wanted or 'of any number'}: of its "
@@ -225,13 +293,18 @@ class Server:
         peer.instance_id = wanted or free[0]
         peer.reader.limit = MAX_PAYLOAD
         self._strangers.remove(peer)
+        former = self.peers.get(peer.instance_id)
         self.peers[peer.instance_id] = peer
-        peer.send(pack(Kind.SETUP, self._setup(peer.instance_id)))
+        if former is not None:
+            peer.succeed(former)
+        elif self._replaces(peer.instance_id, None):
+            peer.journal = Journal()
+        peer.send(pack(Kind.SETUP, self._setup(peer)))
 
     def _drop(self, peer: Peer) -> None:
         if peer.gone:
             return
-        peer.gone = True
+        peer.gone = self._has_news = True
         self._selector.unregister(peer.connection)
         peer.connection.close()
         if peer in self._strangers:
@@ -239,28 +312,54 @@ class Server:
 
     # What clients say -----------------------------------------------------------------------
 
-    def _ready(self, peer: Peer, frame: Frame) -> None:
-        peer.fields = _decode_fields(frame)
-
-    def _fields(self, peer: Peer, frame: Frame) -> None:
-        peer.row_fields = _decode_fields(frame)
-
-    def _rows(self, peer: Peer, frame: Frame) -> None:
-        count = frame.number
-        if not peer.row_fields or peer.received + count > peer.granted:
-            raise ConnectionRefusedByPeerError(
-                f"Client {peer.instance_id} sent rows that nobody asked for."
-            )
-        peer.rows.append(unpack_rows(frame.payload, peer.row_fields, count), count)
-        peer.received += count
-
-    def _error(self, peer: Peer, frame: Frame) -> None:
-        peer.failure, peer.failed_row = decode_error(frame.payload), frame.number
-
     def _bye(self, peer: Peer, frame: Frame) -> None:
-        peer.finished = True
+        if not (self._ending or peer.failure):
+            raise ConnectionRefusedByPeerError("It said that it is done, but nobody ended the run.")
+        peer.finished = peer.failure is None
 
 
-def _decode_fields(frame: Frame) -> list[Field]:
-    plain: list[dict[str, Any]] = decode(frame.payload)
-    return [Field.from_dict(one) for one in plain]
+def _ready(peer: Peer, frame: Frame) -> None:
+    fields = declared_fields(frame.payload)
+    if peer.fields:
+        raise ConnectionRefusedByPeerError("It defined its fields twice.")
+    check_environment_fields(fields)
+    peer.fields = fields
+
+
+def _fields(peer: Peer, frame: Frame) -> None:
+    fields = declared_fields(frame.payload)
+    if peer.has_told_fields:
+        raise ConnectionRefusedByPeerError("It told the fields of its rows twice.")
+    check_row_fields(fields, peer.fields)
+    if peer.row_fields and fields != peer.row_fields:
+        raise ConnectionRefusedByPeerError(
+            "Its rows have other fields than those of the client before it."
+        )
+    peer.row_fields, peer.has_told_fields = fields, True
+
+
+def _rows(peer: Peer, frame: Frame) -> None:
+    count = frame.number
+    if not peer.row_fields or not 0 < count <= peer.granted - peer.received:
+        raise ConnectionRefusedByPeerError(f"It sent {count} rows that nobody asked for.")
+    block = unpack_rows(frame.payload, peer.row_fields, count)
+    peer.last_step = check_rows(block, peer.instance_id, peer.last_step)
+    peer.rows.append(block, count)
+    peer.received += count
+
+
+def _wrong(peer: Peer, frame: Frame) -> None:
+    count = frame.number
+    if not peer.row_fields or not 0 < count <= peer.refusable - peer.refused.count:
+        raise ConnectionRefusedByPeerError(f"It sent {count} refused rows that nobody asked for.")
+    block = unpack_rows(frame.payload, peer.row_fields, count)
+    check_rows(block, peer.instance_id, peer.last_step)
+    peer.refused.append(block, count)
+
+
+def _again(peer: Peer, frame: Frame) -> None:
+    """Nothing is to be done: the client is heard of while it has no rows to send."""
+
+
+def _error(peer: Peer, frame: Frame) -> None:
+    peer.failure, peer.failed_row = decode_error(frame.payload), frame.number

@@ -1,0 +1,344 @@
+"""Clients over TCP against raw sockets, bare loops and interpreters: every claim of their speed.
+
+Samples of 48 B hold 6 numbers, samples of 48 kB hold 6000, of float64 in two fields. What runs in
+turn with its baseline does as much in each round; clients are started anew for each round wherever
+they run ahead, so that none of their work is done in another's time. Starting them does not count
+but in the line that is about it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from measure import claim, finish, rates, report
+from raw_tcp import raw_answers, raw_client, raw_stream
+from transport_environments import Asking, Rows, Sleeping, Working, compute
+
+from physx_core import DataGeneration, Dataset, EnvironmentConfig, Field, NetworkConfig
+from physx_core.fields import Batch
+from physx_core.observers import Observers
+from physx_core.pipelines.learner import Learner
+from physx_core.pipelines.services import RunServices
+from physx_core.sources.clients import ClientSource
+from physx_core.sources.local import LocalSource
+
+ROUNDS = 7
+SEED = [0, 0, 0]
+SIZES = {"48 B": 6, "48 kB": 6000}
+
+Work = Callable[[], int | Iterator[int]]
+
+
+def times_as_long(measured: dict[str, list[float]], name: str, baseline: str) -> float:
+    """Print how long each candidate takes; return how many times as long as another one does."""
+    for candidate, each in measured.items():
+        print(f"  {candidate:28} {1e6 / statistics.median(each):12,.1f} µs")
+    pairs = zip(measured[name], measured[baseline], strict=True)
+    return statistics.median(base / mine for mine, base in pairs)
+
+
+# Predictions ------------------------------------------------------------------------------------
+
+
+def unchanged(batch: Batch) -> Batch:
+    """Return what a network that does nothing predicts."""
+    return batch
+
+
+def predictions_over_tcp(root: Path, title: str, cores: list[int]) -> float:
+    """Compare `get_prediction` of a client with a raw ping-pong of the same bytes.
+
+    Args:
+        root: Folder for what is written.
+        title: Size of a sample.
+        cores: Processor cores of this process and of the clients, one each; empty: any.
+
+    Returns:
+        How many times as long `get_prediction` takes.
+    """
+    values, count = SIZES[title], 4000 if cores else 8000
+    core = cores[1] if cores else None
+    services = RunServices(root, Observers([]), unchanged)
+    arguments = {"values": values, "asks": count, "core": core}
+    config = EnvironmentConfig(Asking, env_kwargs=arguments, seed=0)
+    with (
+        on_core(cores[0] if cores else None),
+        raw_client(8 * values, "ask", core) as connection,
+        ClientSource(config, services, SEED, run_ahead=0) as source,
+    ):
+
+        def get_prediction() -> int:
+            source.batch(1)
+            return count
+
+        candidates: dict[str, Work] = {
+            "raw TCP ping-pong": lambda: raw_answers(connection, 8 * values, 2 * count),
+            "get_prediction": get_prediction,
+        }
+        measured = rates(candidates, ROUNDS)
+    where = "each process on a core of its own" if cores else "on cores of the kernel's choice"
+    print(f"get_prediction over TCP with a network that does nothing, {title}, {where}")
+    return times_as_long(measured, "get_prediction", "raw TCP ping-pong")
+
+
+@contextlib.contextmanager
+def on_core(core: int | None) -> Iterator[None]:
+    """Have this process use one processor core only; None: any."""
+    if core is None:
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {core})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def all_predictions_over_tcp(root: Path) -> list[bool]:
+    """Compare both sizes of samples; on cores of their own, where the claim is about.
+
+    In a run server and clients work at the same time and so on different cores. Where nothing else
+    runs the kernel puts both ends of a ping-pong on one core instead: there a message takes just
+    8 µs, about as long as Python takes to call its functions a hundred times.
+    """
+    met = []
+    has_cores = hasattr(os, "sched_setaffinity")
+    cores = sorted(os.sched_getaffinity(0))[:2] if has_cores else []
+    for title in SIZES:
+        if len(cores) > 1:
+            ratio = predictions_over_tcp(root, title, [])
+            print(f"  get_prediction takes {ratio:.2f} times as long there, without a target\n")
+        ratio = predictions_over_tcp(root, title, cores if len(cores) > 1 else [])
+        met.append(claim("get_prediction takes as many times as long", ratio, at_most=1.9))
+    return met
+
+
+def predictions_in_process(root: Path) -> bool:
+    """Compare `get_prediction` in one process with a bare forward call and its conversions."""
+    count = 6000
+    network = {"layers": [5, 5, 5, 1], "net_fields": "x", "opt_fields": "y"}
+    config = NetworkConfig("torch/fc", network, loss="MSELoss", optimizer="Adam", lr=1e-3)
+    learner = Learner(config, trains=True)
+    learner.bind({"x": Field("x", (5,)), "y": Field("y", (1,))}, {})
+    learner.network.set_train()
+    services = RunServices(root, Observers([]), learner.predict_in_training)
+    layers: torch.nn.Sequential = learner.network.layers  # type: ignore[attr-defined]
+    sample = np.zeros(5)
+
+    def forward() -> int:
+        for _ in range(count):
+            with torch.no_grad():
+                inputs = torch.from_numpy(sample[np.newaxis]).to(torch.float32)
+                layers(inputs).numpy()[0]
+        return count
+
+    environment = EnvironmentConfig(Asking, env_kwargs={"values": 6, "asks": count}, seed=0)
+    with LocalSource(environment, services, SEED) as source:
+
+        def get_prediction() -> int:
+            source.batch(1)
+            return count
+
+        measured = rates({"forward": forward, "get_prediction": get_prediction}, ROUNDS)
+    print("get_prediction in one process, torch/fc [5, 5, 5, 1]; the forward call with conversions")
+    ratio = times_as_long(measured, "get_prediction", "forward")
+    return claim("get_prediction takes as many times as long", ratio, at_most=2)
+
+
+# Generation -------------------------------------------------------------------------------------
+
+_NAMES = itertools.count()
+
+
+def generation(
+    root: Path,
+    environment: type[Any],
+    arguments: dict[str, Any],
+    rows: int,
+    batch: int,
+    clients: int,
+) -> Iterator[int]:
+    """Make and store so many rows with clients that are started before the time is taken."""
+    pipeline = DataGeneration(
+        EnvironmentConfig(environment, env_kwargs=arguments, num_clients=clients, seed=0),
+        session_dir=str(root),
+        session_name=f"generation_{next(_NAMES)}",
+        batch_nb=rows // batch,
+        batch_size=batch,
+    )
+    with pipeline:
+        yield 0
+        for _ in range(rows // batch):
+            pipeline.batch_begin()
+            pipeline.batch_produce()
+            pipeline.batch_count()
+            pipeline.batch_end()
+        yield rows
+    shutil.rmtree(pipeline.session.path)
+
+
+def generation_small(root: Path) -> bool:
+    """Compare streaming to disk with asking for each sample and waiting for it."""
+    rows, few = 200_000, 5000
+    arguments = {"values": SIZES["48 B"]}
+    config = EnvironmentConfig(Rows, env_kwargs=arguments, seed=0)
+
+    def one_by_one() -> Iterator[int]:
+        services = RunServices(root, Observers([]), None)
+        folder = root / f"synchronous_{next(_NAMES)}"
+        with (
+            Dataset.create(folder) as dataset,
+            ClientSource(config, services, SEED, run_ahead=0) as source,
+        ):
+            source.batch(1)
+            yield 0
+            for _ in range(few):
+                row = source.batch(1)
+                dataset.append_sample("training", {name: values[0] for name, values in row.items()})
+            dataset.flush()
+            yield few
+        shutil.rmtree(folder)
+
+    def streamed() -> Iterator[int]:
+        return generation(root, Rows, arguments, rows, 1000, 1)
+
+    candidates: dict[str, Work] = {"each asked for": one_by_one, "streamed": streamed}
+    measured = rates(candidates, ROUNDS)
+    heading = "Generation of 48 B samples with 1 client, to disk"
+    return report(heading, "samples", measured, "each asked for", 10, "streamed")
+
+
+def generation_large(root: Path) -> bool:
+    """Compare streaming of large samples to disk with a raw stream that nobody keeps."""
+    values, rows = SIZES["48 kB"], 6000
+
+    def streamed() -> Iterator[int]:
+        return generation(root, Rows, {"values": values}, rows, 20, 1)
+
+    with raw_client(8 * values, "stream") as connection:
+        candidates: dict[str, Work] = {
+            "raw TCP stream": lambda: raw_stream(connection, 8 * values, 2 * rows),
+            "streamed to disk": streamed,
+        }
+        measured = rates(candidates, ROUNDS)
+    in_mb = {name: [rate * 8e-6 * values for rate in each] for name, each in measured.items()}
+    heading = "Generation of 48 kB samples with 1 client, to disk"
+    return report(heading, "MB", in_mb, "raw TCP stream", 0.45, "streamed to disk")
+
+
+def generation_working(root: Path, milliseconds: float, target: float) -> bool:
+    """Compare a client whose steps compute for a while with the computing alone."""
+    units, seconds = 20_000, []
+    for _ in range(9):
+        begin = time.perf_counter()
+        compute(units)
+        seconds.append(time.perf_counter() - begin)
+    work = round(units * 1e-3 * milliseconds / min(seconds))
+    rows = 10 * round(100 / milliseconds)
+
+    def alone() -> int:
+        for _ in range(rows):
+            compute(work)
+        return rows
+
+    def with_client() -> Iterator[int]:
+        return generation(root, Working, {"work": work}, rows, rows // 10, 1)
+
+    measured = rates({"simulation alone": alone, "1 client": with_client}, ROUNDS)
+    heading = f"{milliseconds:g} ms of simulation per sample, 1 client"
+    return report(heading, "samples", measured, "simulation alone", target, "1 client")
+
+
+def generation_sleeping(root: Path) -> bool:
+    """Compare 8 clients whose steps sleep with one."""
+    rows = 80
+
+    def clients(number: int) -> Work:
+        return lambda: generation(
+            root, Sleeping, {"seconds": 5e-3}, number * rows, number * rows // 8, number
+        )
+
+    measured = rates({"1 client": clients(1), "8 clients": clients(8)}, ROUNDS)
+    heading = "5 ms of sleep per sample"
+    return report(heading, "samples", measured, "1 client", 7.5, "8 clients")
+
+
+# Set-up and the server's own time ---------------------------------------------------------------
+
+
+def setting_up(root: Path) -> bool:
+    """Compare 8 clients until their first samples with 8 interpreters that import NumPy."""
+
+    def interpreters() -> int:
+        # In sessions of their own, as clients are: the kernel shares processors among sessions.
+        command = [sys.executable, "-c", "import numpy"]
+        started = [subprocess.Popen(command, start_new_session=True) for _ in range(8)]
+        for process in started:
+            process.wait()
+        return 1
+
+    def clients() -> Iterator[int]:
+        services = RunServices(root, Observers([]), None)
+        config = EnvironmentConfig("toy/spring", num_clients=8, seed=0)
+        yield 0
+        with ClientSource(config, services, SEED) as source:
+            source.batch(8)
+            yield 1
+
+    measured = rates({"8 interpreters": interpreters, "8 clients": clients}, ROUNDS)
+    print("Set-up: 8 clients of toy/spring, from start to the first sample of each")
+    ratio = times_as_long(measured, "8 clients", "8 interpreters")
+    return claim("setting up takes as many times as long", ratio, at_most=2)
+
+
+def server_time(root: Path) -> None:
+    """Print the processor time that the server takes for each sample."""
+    print("Processor time of the server for each sample of 48 B, stored in blocks of 1000")
+    medians, rows = {}, 200_000
+    for clients in (1, 8, 32):
+        seconds = []
+        for _ in range(3):
+            steps = generation(root, Rows, {"values": SIZES["48 B"]}, rows, 1000, clients)
+            next(steps)
+            begin = time.process_time()
+            done = next(steps)
+            seconds.append((time.process_time() - begin) / done)
+            next(steps, None)
+        medians[clients] = statistics.median(seconds)
+        print(f"  {clients:2} clients {1e6 * medians[clients]:12.2f} µs")
+    print(f"  growth from 1 to 32 clients: {medians[32] / medians[1]:.2f} times\n")
+
+
+def main() -> None:
+    """Measure and print."""
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        met = all_predictions_over_tcp(root)
+        met.append(predictions_in_process(root))
+        met.append(generation_small(root))
+        met.append(generation_large(root))
+        met.append(generation_working(root, 0.5, 0.9))
+        met.append(generation_working(root, 5, 0.98))
+        met.append(generation_sleeping(root))
+        met.append(setting_up(root))
+        server_time(root)
+    finish(met)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""The environments of transport.py, in a file of their own that clients import quickly."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from typing import Any
+
+import numpy as np
+
+from physx_core import Environment, Field
+
+
+class Rows(Environment):
+    """Gives the same two arrays in each step: as fast as samples can be."""
+
+    def __init__(self, *, values: int, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.x, self.y = np.zeros(values - values // 6), np.zeros(values // 6)
+
+    def create(self) -> None:
+        """Nothing is simulated."""
+
+    def init_database(self) -> None:
+        """Define two fields."""
+        self.define_training_fields([Field("x", self.x.shape), Field("y", self.y.shape)])
+
+    def step(self) -> None:
+        """Give the arrays."""
+        self.set_training_data(x=self.x, y=self.y)
+
+
+class Asking(Rows):
+    """Asks for many predictions in each step, on a processor core of its own if it gets one."""
+
+    def __init__(self, *, asks: int, core: int | None = None, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.asks = asks
+        if core is not None:
+            os.sched_setaffinity(0, {core})
+
+    def step(self) -> None:
+        """Ask, and then give the arrays."""
+        for _ in range(self.asks):
+            self.get_prediction(x=self.x, y=self.y)
+        super().step()
+
+
+class Working(Rows):
+    """Computes for a while in each step."""
+
+    def __init__(self, *, work: int, **kwargs: Any) -> None:
+        super().__init__(values=6, **kwargs)
+        self.work = work
+
+    def step(self) -> None:
+        """Compute, and then give the arrays."""
+        compute(self.work)
+        super().step()
+
+
+class Sleeping(Rows):
+    """Sleeps in each step."""
+
+    def __init__(self, *, seconds: float, **kwargs: Any) -> None:
+        super().__init__(values=6, **kwargs)
+        self.seconds = seconds
+
+    def step(self) -> None:
+        """Sleep, and then give the arrays."""
+        time.sleep(self.seconds)
+        super().step()
+
+
+def compute(work: int) -> float:
+    """Do so many units of work that need nothing but the processor."""
+    value = 0.5
+    for _ in range(work):
+        value = math.cos(value)
+    return value

@@ -1,0 +1,14 @@
+"""The plugin ``physx``: what the core itself brings, through the same hooks as any plugin."""
+
+from __future__ import annotations
+
+from physx_core.plugins.hookspecs import Components, hookimpl
+
+
+@hookimpl
+def physx_launchers() -> Components:
+    """Return the launchers; they are imported when clients are started."""
+    return {
+        "subprocess": "physx_core.transport.launcher:SubprocessLauncher",
+        "manual": "physx_core.transport.launcher:ManualLauncher",
+    }

@@ -1,0 +1,33 @@
+"""Descendants: the processes that this one started, and those that they started."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+from pathlib import Path
+
+
+def kill_descendants() -> None:
+    """Kill all processes that this one started, and all that those did, where /proc tells them.
+
+    A client that a person started may share its process group with the person's other programs, so
+    that it cannot clear away the group as a launched one can.
+    """
+    while descendants := _descendants(os.getpid()):
+        for number in descendants:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(number, signal.SIGKILL)
+
+
+def _descendants(ancestor: int) -> list[int]:
+    children: dict[int, list[int]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            state, parent = stat.read_text().rpartition(")")[2].split()[:2]
+            if state not in "ZX":  # those are dead already
+                children.setdefault(int(parent), []).append(int(stat.parent.name))
+    found = children.get(ancestor, [])
+    for number in found:  # grows while it is read
+        found += children.get(number, [])
+    return found

@@ -1,0 +1,379 @@
+"""Clients that people start with ``physx client``, here and on other machines, and strangers."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from physx_core.errors import ClientError, ConfigError
+from physx_core.transport.frames import Kind, pack
+
+ENVS = Path(__file__).with_name("transport_envs.py")
+WANDERER = f"{Path(__file__).with_name('restart_envs.py')}:Wanderer"
+TOKEN = "a token for these tests"
+CLIENT = [sys.executable, "-m", "physx_core", "client"]
+
+
+@pytest.fixture
+def token(monkeypatch):
+    monkeypatch.setenv("PHYSX_TOKEN", TOKEN)
+
+
+@pytest.fixture
+def by_hand(clients, token, port):
+    """Return a source that waits at the port for clients that know the token."""
+
+    def make(environment="Plain", **options):
+        options = {"launcher": "physx/manual", "port": port, "timeout": 20.0, **options}
+        return clients(environment, **options)
+
+    return make
+
+
+@pytest.fixture
+def join(port, token, nothing_stays_behind):
+    """Return a function that starts ``physx client`` for the port."""
+    with contextlib.ExitStack() as stack:
+
+        def start(*words, prefix=(), address=f"127.0.0.1:{port}", **options):
+            process = subprocess.Popen(
+                [*prefix, *CLIENT, "--connect", address, *words],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                **options,
+            )
+            stack.callback(process.communicate)
+            stack.callback(process.kill)
+            return process
+
+        yield start
+
+
+def warnings(caplog):
+    return [record.getMessage() for record in caplog.records if record.name == "physx"]
+
+
+def alive(number):
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+def gone_after(numbers, seconds):
+    deadline = time.monotonic() + seconds
+    while any(map(alive, numbers)) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return not any(map(alive, numbers))
+
+
+# Joining, leaving, taking over ------------------------------------------------------------------
+
+
+def test_clients_join_a_waiting_run_and_say_what_they_do(by_hand, join, port, caplog):
+    ours = [join("--instance", "2"), join()]  # nothing listens yet
+    with by_hand(num_clients=2) as source:
+        batch = {name: values.copy() for name, values in source.batch(6).items()}
+    said = [process.communicate(timeout=20)[0].splitlines() for process in ours]
+    assert [process.returncode for process in ours] == [0, 0]
+    assert batch["env_id"].tolist() == [1, 2] * 3
+    assert said[0][0] == f"physx client: looks for the server at 127.0.0.1:{port}"
+    assert said[0][1].endswith("transport_envs.py:Plain, instance 2 of 2")
+    assert said[0][-1] == "physx client: the run has ended"
+    assert said[1][1].endswith("instance 1 of 2")
+    first = warnings(caplog)[0]
+    assert (
+        f"The run waits for 2 clients. Start each with: physx client --connect 127.0.0.1:{port}"
+        in first
+    )
+    assert TOKEN not in caplog.text
+
+
+def test_the_server_says_now_and_then_what_it_waits_for(by_hand, join, caplog, monkeypatch):
+    monkeypatch.setattr("physx_core.transport.group._SAY_EVERY", 0.2)
+    with (
+        pytest.raises(ClientError, match=r"Client 1 did not connect for 3 s"),
+        by_hand(num_clients=2, timeout=3.0),
+    ):
+        pass
+    texts = warnings(caplog)
+    assert "waits for a client to run instance 1, 2, since 0 s" in texts[1]
+    assert "waits for a client to run instance 1, 2, since 3 s" in texts[-1]
+
+
+def test_another_client_takes_the_place_of_one_that_leaves(local, by_hand, join, caplog):
+    settings = {"num_clients": 2, "env_kwargs": {"pace": 0.002, "asks": True}}
+    with local(WANDERER, **settings) as source:
+        expected = source.batch(60)
+    leaver, late = join(), None
+    join()
+    with by_hand(WANDERER, run_ahead=2, **settings) as source:
+        rows = []
+        for row in range(60):
+            if row == 20:
+                leaver.send_signal(signal.SIGINT)
+                leaver.wait(10)
+                late = join()
+            rows.append(source.batch(1)["position"][0].copy())
+    assert [row.tobytes() for row in rows] == [row.tobytes() for row in expected["position"]]
+    assert leaver.returncode == 130
+    said = late.communicate(timeout=20)[0]
+    assert "rows are there and are made again" in said
+    (text,) = [text for text in warnings(caplog) if "closed the connection" in text]
+    assert "The run waits up to 20 s for another client to go on in its place" in text
+
+
+def test_a_place_that_nobody_takes_ends_the_run(by_hand, join):
+    client = join()
+    assert "looks for the server" in client.stdout.readline()
+    with (
+        pytest.raises(ClientError, match=r"Client 1 was lost after \d+ rows, and none .* for 3 s"),
+        by_hand(timeout=3.0) as source,
+    ):
+        source.batch(1)
+        client.kill()
+        while True:
+            source.batch(1)
+
+
+def test_a_client_too_many_is_told_so(by_hand, join):
+    join("--instance", "1")
+    with by_hand() as source:
+        rest = [join(), join("--instance", "1"), join("--instance", "2")]
+        while any(process.poll() is None for process in rest):
+            source.batch(1)
+            time.sleep(0.011)
+    for process in rest:
+        assert process.returncode == 1
+        assert "The server has no place for instance" in process.stderr.read()
+
+
+def test_an_environment_that_fails_is_told_on_both_sides(by_hand, join):
+    client = join()
+    kwargs = {"fault": "fail", "who": 1}
+    with pytest.raises(Exception, match="no more beans"), by_hand(WANDERER, env_kwargs=kwargs) as s:
+        s.batch(30)
+    said = client.communicate(timeout=20)[0]
+    assert client.returncode == 1
+    assert "EnvironmentFailedError: Instance 1 raised in step() at step 5" in said
+
+
+def test_a_client_gives_up_after_a_while(join):
+    began = time.monotonic()
+    client = join("--patience", "0.5")
+    error = client.communicate(timeout=30)[1]
+    assert client.returncode == 1
+    assert "No server can be reached" in error
+    assert time.monotonic() - began > 0.5
+
+
+# Tokens -----------------------------------------------------------------------------------------
+
+
+def test_the_token_may_come_from_a_file(clients, join, port, tmp_path, monkeypatch):
+    monkeypatch.delenv("PHYSX_TOKEN")
+    file = tmp_path / "token"
+    file.write_text(f"{TOKEN}\n")
+    file.chmod(0o600)
+    client = join("--token-file", str(file))
+    options = {"launcher": "physx/manual", "port": port, "token_file": str(file)}
+    with clients(**options) as source:
+        source.batch(1)
+    assert client.wait(20) == 0
+
+
+@pytest.mark.parametrize(
+    ("content", "mode", "text"),
+    [
+        (TOKEN, 0o640, "Others than you may read or write the token file .*chmod 600"),
+        (TOKEN, 0o604, "Others than you"),
+        ("short", 0o600, "has 5 characters: it must have at least 16"),
+        (None, 0, "cannot be read"),
+    ],
+)
+def test_an_unfit_token_file_is_refused(clients, join, tmp_path, content, mode, text):
+    file = tmp_path / "token"
+    if content is not None:
+        file.write_text(content)
+        file.chmod(mode)
+    with pytest.raises(ConfigError, match=text), clients(token_file=str(file)):
+        pass
+    client = join("--token-file", str(file))
+    assert text[:10] in client.communicate(timeout=30)[1].replace("\n", " ")
+    assert client.returncode == 1
+
+
+def test_clients_by_hand_and_addresses_that_others_reach_need_a_token(clients, monkeypatch):
+    monkeypatch.delenv("PHYSX_TOKEN", raising=False)
+    with pytest.raises(ConfigError, match="PHYSX_TOKEN"), clients(launcher="physx/manual"):
+        pass
+    with (
+        pytest.raises(ConfigError, match=r"Others can reach .*PHYSX_TOKEN"),
+        clients(ip_address="0.0.0.0"),
+    ):
+        pass
+    with clients(ip_address="localhost") as source:
+        source.batch(1)
+
+
+def test_a_client_without_a_token_is_told_so(monkeypatch, port):
+    environment = {name: value for name, value in os.environ.items() if name != "PHYSX_TOKEN"}
+    command = [*CLIENT, "--connect", f"127.0.0.1:{port}"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "--token-file" in done.stderr
+
+
+# Strangers --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["silent", "talkative", "quick"])
+def test_a_flood_of_strangers_does_not_keep_a_late_client_out(by_hand, join, port, kind):
+    """Connections are opened as fast as it goes, and kept or closed at once."""
+    over = threading.Event()
+    opened = []
+
+    def flood():
+        kept = []
+        while not over.is_set():
+            try:
+                kept.append(socket.create_connection(("127.0.0.1", port), timeout=1))
+                opened.append(1)
+                if kind == "talkative":
+                    kept[-1].sendall(pack(Kind.HELLO, b"physxtcp" + secrets.token_bytes(36)))
+                if kind == "quick" or len(kept) > 200:
+                    kept.pop(0).close()
+            except OSError:
+                over.wait(0.01)
+        for connection in kept:
+            connection.close()
+
+    crowd = [threading.Thread(target=flood) for _ in range(2)]
+    join()
+    try:
+        with by_hand(num_clients=1) as source:
+            source.batch(1)
+        for thread in crowd:
+            thread.start()
+        clients = [join("--patience", "30") for _ in range(2)]
+        with by_hand(num_clients=2, timeout=40.0) as source:
+            steps = [step for _ in range(20) for step in source.batch(2)["step"].tolist()]
+        assert [client.wait(20) for client in clients] == [0, 0]
+    finally:
+        over.set()
+        for thread in crowd:
+            thread.join()
+    assert steps == [step // 2 for step in range(40)]
+    assert len(opened) > 200
+
+
+# The server's death -----------------------------------------------------------------------------
+
+SERVER = f"""
+import sys
+from pathlib import Path
+from physx_core.config import EnvironmentConfig
+from physx_core.sources.clients import ClientSource
+
+class Services:
+    def load_parameters(self, instance_id): return {{}}
+    def save_parameters(self, instance_id, values): pass
+
+config = EnvironmentConfig(
+    {WANDERER!r}, env_kwargs={{"fault": "fail", "place": "never", "pace": float(sys.argv[2])}},
+    num_clients=2, port=int(sys.argv[1]), launcher="physx/manual",
+)
+with ClientSource(config, Services(), [0]) as source:
+    source.batch(2)
+    Path("ready").touch()
+    while True:
+        source.batch(2)
+"""
+
+
+@pytest.mark.parametrize("pace", [0.01, 30.0])
+def test_clients_by_hand_leave_when_the_server_is_killed(join, port, pace):
+    """The environments sleep for most of the time, and each has started a process."""
+    started = [join(), join(start_new_session=True)]
+    server = subprocess.Popen([sys.executable, "-c", SERVER, str(port), str(pace)])
+    try:
+        deadline = time.monotonic() + 30
+        numbers = []
+        while len(numbers) < 4 and time.monotonic() < deadline:
+            time.sleep(0.05)
+            numbers = [n for one in started for n in (one.pid, *children_of(one.pid))]
+        assert len(numbers) == 4
+        time.sleep(0.5)  # in the middle of steps
+    finally:
+        server.kill()
+        server.wait()
+    assert gone_after(numbers, 2.0)
+    assert [process.wait(1) for process in started] != [0, 0]
+
+
+def children_of(parent):
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            if int(stat.read_text().rpartition(")")[2].split()[1]) == parent:
+                found.append(int(stat.parent.name))
+    return found
+
+
+# Another machine --------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def elsewhere():
+    """A network namespace with an address of its own: its prefix for commands, and our address."""
+    if shutil.which("ip") is None:
+        pytest.skip("the command ip (iproute2) is not installed")
+    name, net = f"physx{os.getpid() % 10000}", f"10.203.{os.getpid() % 250}"
+    steps = [
+        f"ip netns add {name}",
+        f"ip link add {name}a type veth peer name {name}b netns {name}",
+        f"ip addr add {net}.1/24 dev {name}a",
+        f"ip link set {name}a up",
+        f"ip -n {name} addr add {net}.2/24 dev {name}b",
+        f"ip -n {name} link set {name}b up",
+    ]
+    try:
+        for step in steps:
+            done = subprocess.run(step.split(), capture_output=True, text=True, check=False)
+            if done.returncode:
+                pytest.skip(f"{step}: {done.stderr.strip()}")
+        yield ["ip", "netns", "exec", name], f"{net}.1"
+    finally:
+        subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+
+
+def test_a_client_on_another_machine_joins_with_the_token_and_not_without(
+    by_hand, join, port, elsewhere
+):
+    prefix, address = elsewhere
+    where = {"prefix": prefix, "address": f"{address}:{port}"}
+    strangers = {**os.environ, "PHYSX_TOKEN": "another token than that"}
+    loopback = join("--patience", "1", prefix=prefix, address=f"127.0.0.1:{port}")
+    friend = join("--instance", "1", **where)
+    with by_hand(ip_address=address) as source:
+        stranger = join(env=strangers, **where)
+        while stranger.poll() is None:
+            source.batch(1)
+            time.sleep(0.011)
+        assert source.batch(1)["env_id"] == [1]
+    assert friend.wait(20) == 0
+    assert stranger.returncode == 1
+    assert "does not know this client's token" in stranger.stderr.read()
+    assert loopback.wait(20) == 1  # it is a machine of its own

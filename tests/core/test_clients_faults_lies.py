@@ -1,0 +1,243 @@
+"""ClientSource: clients that know the token, and lie about what they send.
+
+The liar is a thread that joins with the public handshake. It sends two good rows, or none, before
+it lies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from physx_core import Dataset, Field
+from physx_core.columns import ROW_FIELDS
+from physx_core.errors import ClientError, NotFiniteError
+from physx_core.transport.frames import HEADER, Kind, pack
+from physx_core.transport.handshake import introduce
+from physx_core.transport.values import encode
+
+TOKEN = "a token for this test"
+DEFINED = [Field("x", shape=(2,)), Field("flag", shape=(), dtype="bool")]
+
+
+def fields(kind, listed):
+    return pack(kind, encode([field.to_dict() for field in listed]))
+
+
+def plain_fields(kind, *listed):
+    return pack(kind, encode(list(listed)))
+
+
+def rows(*steps, x=1.0, width=2, flag=1, env_id=1, count=None):
+    size = len(steps)
+    payload = (
+        np.full((size, width), x).tobytes()
+        + bytes([flag]) * size
+        + np.full(size, env_id, "<i4").tobytes()
+        + np.zeros(size, "<i8").tobytes()
+        + np.array(steps, "<i8").tobytes()
+    )
+    return HEADER.pack(len(payload), Kind.ROWS, 0, size if count is None else count) + payload
+
+
+def changed(position, **changes):
+    """The fields of the rows as they should be, with one of them changed."""
+    listed = [field.to_dict() for field in (*DEFINED, *ROW_FIELDS)]
+    listed[position].update(changes)
+    return plain_fields(Kind.FIELDS, *listed)
+
+
+READY = fields(Kind.READY, DEFINED)
+FIELDS = fields(Kind.FIELDS, [*DEFINED, *ROW_FIELDS])
+X = DEFINED[0].to_dict()
+
+
+@pytest.fixture
+def lied_to(clients, monkeypatch, port, folder):
+    """Have a liar send messages, and return the error that the run ends with and what it stored."""
+    monkeypatch.setenv("PHYSX_TOKEN", TOKEN)
+
+    def lie(messages, until):
+        with contextlib.suppress(OSError, EOFError), connected(port) as connection:
+            reader = introduce(connection, TOKEN, 1)
+            granted = 0
+            for needed, message in messages:
+                while granted < needed:
+                    frame = reader.read(connection)
+                    granted = frame.number if frame.kind is Kind.CREDIT else granted
+                connection.sendall(message)
+            until.wait(20)
+            while connection.recv(1 << 16):
+                pass
+
+    def run(*messages, deaf=False):
+        until = threading.Event()  # it reads nothing before
+        if not deaf:
+            until.set()
+        thread = threading.Thread(target=lie, args=(messages, until))
+        thread.start()
+        settings = {"launcher": "physx/manual", "port": port, "timeout": 20.0}
+        try:
+            with (
+                Dataset.create(folder) as dataset,
+                pytest.raises((ClientError, NotFiniteError)) as caught,
+                clients(run_ahead=0, **settings) as source,
+            ):
+                for size in (2, 1, 1):
+                    batch = source.batch(size)
+                    dataset.define_fields("training", source.fields)
+                    dataset.append("training", batch)
+        finally:
+            until.set()
+            thread.join()
+        with Dataset.open(folder) as dataset:
+            assert dataset.verify() == []
+            return caught.value, dataset.num_samples("training") if dataset.modes else 0
+
+    return run
+
+
+def connected(port):
+    """Connect to a server that will listen soon."""
+    until = time.monotonic() + 10
+    while True:
+        try:
+            return socket.create_connection(("127.0.0.1", port), timeout=10)
+        except OSError:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+
+
+LATER = {
+    "more rows than granted": (rows(2, 3, 4), "3 rows that nobody asked for"),
+    "no rows": (rows(), "0 rows that nobody asked for"),
+    "as many rows as a number can tell": (rows(2, count=2**64 - 1), "nobody asked for"),
+    "fewer bytes than rows": (pack(Kind.ROWS, b"", 1), "0 bytes for 1 rows of 37 bytes"),
+    "wider rows": (rows(2, width=3), "45 bytes for 1 rows of 37 bytes"),
+    "rows of another instance": (rows(2, env_id=2), "rows of another instance"),
+    "rows that were there": (rows(1), "steps do not rise"),
+    "rows before the first": (rows(-5), "steps do not rise"),
+    "neither true nor false": (rows(2, flag=7), '"flag" is neither true nor false'),
+    "refused rows": (pack(Kind.WRONG, rows(2)[HEADER.size :], 1), "nobody asked for"),
+    "fields again": (FIELDS, "fields of its rows twice"),
+    "ready again": (READY, "defined its fields twice"),
+    "an answer to nobody": (pack(Kind.ANSWER, encode({}), 1), "ANSWER, which is not for a client"),
+    "a refusal": (pack(Kind.REFUSAL, b"", 2**64 - 1), "REFUSAL, which is not for a client"),
+    "credit": (pack(Kind.CREDIT, number=9), "CREDIT, which is not for a client"),
+    "hello again": (pack(Kind.HELLO, bytes(44)), "HELLO, which is not for a client"),
+    "proof again": (pack(Kind.PROOF, bytes(32), 1), "PROOF, which is not for a client"),
+    "the end": (pack(Kind.BYE), "nobody ended the run"),
+    "an unknown kind": (HEADER.pack(0, 999, 0, 0), "no message of physx"),
+    "a longer message than there can be": (HEADER.pack(2**32 - 1, 8, 0, 1), "no message of physx"),
+    "a spare that is used": (HEADER.pack(0, 8, 1, 0), "no message of physx"),
+    "a request out of turn": (pack(Kind.LOAD, number=7), "numbered its requests wrongly"),
+    "a damaged request": (pack(Kind.PREDICT, b"x", 1), "damaged"),
+    "a request of no names": (pack(Kind.PREDICT, encode([1]), 1), "no dictionary of names"),
+    "parameters without names": (pack(Kind.SAVE, encode({1: 2}), 1), "no dictionary of names"),
+    "a deep request": (pack(Kind.SAVE, b"\x40\x0d\x03\0" + b"[" * 200_000, 1), "damaged"),
+    "drawing nothing": (pack(Kind.SHOW, encode([("add", "mesh")]), 1), "events that are none"),
+    "drawing otherwise": (
+        pack(Kind.SHOW, encode([("eval", "mesh", "a", {})]), 1),
+        "events that are none",
+    ),
+    "an error that is none": (pack(Kind.ERROR, encode({"classes": ["PhysxError"]})), "as an error"),
+    "an error with a strange note": (
+        pack(
+            Kind.ERROR,
+            encode(
+                {
+                    "classes": [],
+                    "message": "",
+                    "attributes": {"__notes__": [1]},
+                    "traceback": "",
+                }
+            ),
+        ),
+        "as an error",
+    ),
+}
+
+FIRST = {
+    "another type": (changed(0, dtype="<f4"), "but it defined"),
+    "another name": (changed(0, name="y"), "but it defined"),
+    "another shape": (changed(0, shape=[3]), "but it defined"),
+    "another unit": (changed(0, unit="m"), "but it defined"),
+    "another role": (changed(0, role="additional"), "but it defined"),
+    "a larger number of the instance": (changed(2, dtype="<i8"), "but it defined"),
+    "fewer fields": (fields(Kind.FIELDS, DEFINED), "2 fields, but it defined 5"),
+    "rows of unknown fields": (rows(0, 1), "2 rows that nobody asked for"),
+}
+
+BEFORE = {
+    "fields before all": (FIELDS, "5 fields, but it defined 3"),
+    "no fields": (plain_fields(Kind.READY), "no fields, or one twice"),
+    "fields that are no list": (pack(Kind.READY, encode(1)), "in an unknown way"),
+    "a field that is none": (plain_fields(Kind.READY, 1), "in an unknown way"),
+    "a field twice": (plain_fields(Kind.READY, X, X), "no fields, or one twice"),
+    "a field of physx": (plain_fields(Kind.READY, {**X, "name": "step"}), 'field "step"'),
+    "a name that is none": (plain_fields(Kind.READY, {**X, "name": "a b"}), "identifier"),
+    "objects": (plain_fields(Kind.READY, {**X, "dtype": "|O"}), "in an unknown way"),
+    "a type in parts": (plain_fields(Kind.READY, {**X, "dtype": "f8,f8"}), "in an unknown way"),
+    "a type that is none": (plain_fields(Kind.READY, {**X, "dtype": "<f5"}), "no NumPy type"),
+    "a negative shape": (plain_fields(Kind.READY, {**X, "shape": [-1]}), "no shape"),
+    "a shape in words": (plain_fields(Kind.READY, {**X, "shape": "2"}), "in an unknown way"),
+}
+
+
+@pytest.mark.parametrize("lie", LATER)
+def test_a_lie_after_good_rows_is_named(lied_to, lie):
+    message, text = LATER[lie]
+    error, stored = lied_to((0, READY), (1, FIELDS), (2, rows(0, 1)), (3, message))
+    assert type(error) is ClientError
+    assert error.instance_id == 1
+    assert str(error).startswith("Client 1 was cut off after 2 rows. ")
+    assert text in str(error)
+    assert isinstance(error.exit_status, type(None))
+    assert stored == 2
+
+
+@pytest.mark.parametrize("lie", FIRST)
+def test_a_lie_about_the_fields_of_rows_is_named(lied_to, lie):
+    message, text = FIRST[lie]
+    error, stored = lied_to((0, READY), (2, message))
+    assert str(error).startswith("Client 1 was cut off after 0 rows. ")
+    assert text in str(error)
+    assert stored == 0
+
+
+@pytest.mark.parametrize("lie", BEFORE)
+def test_a_lie_before_the_environment_lives_is_named(lied_to, lie):
+    message, text = BEFORE[lie]
+    error, stored = lied_to((0, message))
+    assert str(error).startswith("Client 1 was cut off after 0 rows. ")
+    assert text in str(error)
+    assert stored == 0
+
+
+@pytest.mark.parametrize("sizes", [[2**31, 2**31, 2**31], [2**62, 4], [2**28]])
+def test_rows_beyond_all_bounds_are_refused_before_anything_is_allocated(lied_to, sizes):
+    open_shape = plain_fields(Kind.READY, {k: v for k, v in X.items() if k != "shape"})
+    listed = [{**X, "shape": sizes}, *(field.to_dict() for field in ROW_FIELDS)]
+    error, stored = lied_to((0, open_shape), (2, plain_fields(Kind.FIELDS, *listed)))
+    assert "bytes; 1073741824 are taken" in str(error)
+    assert stored == 0
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_rows_that_are_not_finite_are_not_stored(lied_to, value):
+    error, stored = lied_to((0, READY), (1, FIELDS), (2, rows(0, 1)), (3, rows(2, x=value)))
+    assert type(error) is NotFiniteError
+    assert (error.instance_id, error.field, error.step) == (1, "x", 2)
+    assert stored == 2
+
+
+def test_a_client_that_reads_no_answers_is_cut_off(lied_to, services):
+    services.kept[1] = {"large": np.zeros(1 << 21)}
+    requests = b"".join(pack(Kind.LOAD, encode(None), number) for number in range(1, 20))
+    error, _ = lied_to((0, READY), (1, requests), deaf=True)
+    assert "does not read the answers" in str(error)

@@ -1,0 +1,171 @@
+"""What starts clients: the launchers of the core, and those of others."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from physx_core import ClientHandle, Environment, Launcher, plugins
+from physx_core.errors import ClientError, ComponentNotFoundError, ConfigError
+from physx_core.transport.launcher import ClientProcess, ManualLauncher, SubprocessLauncher, stop
+
+HERE = Path(__file__)
+
+
+# A launcher like that of a plugin ---------------------------------------------------------------
+
+
+class CommandHandle(ClientHandle):
+    def __init__(self, instance_id, process):
+        self.instance_id, self.process = instance_id, process
+
+    def exit_status(self):
+        return self.process.poll()
+
+    def terminate(self):
+        os.killpg(self.process.pid, signal.SIGTERM)
+
+    def kill(self):
+        os.killpg(self.process.pid, signal.SIGKILL)
+
+
+class CommandLauncher(Launcher):
+    """Starts ``physx client``, with the token in a file, and notes what it was asked for."""
+
+    def __init__(self, *, notes):
+        self.notes = Path(notes)
+
+    def launch(self, instances, address, token):
+        file = self.notes / "token"
+        file.touch(mode=0o600)
+        file.write_text(token)
+        (self.notes / f"{time.monotonic_ns()}.launch").write_text(f"{list(instances)}")
+        return [CommandHandle(number, self.start(number, address, file)) for number in instances]
+
+    def start(self, number, address, file):
+        words = ["--connect", address, "--instance", str(number), "--token-file", str(file)]
+        return subprocess.Popen(
+            [sys.executable, "-m", "physx_core", "client", *words],
+            stdout=(self.notes / f"{number}.out").open("a"),
+            start_new_session=True,
+        )
+
+
+class ForgetfulLauncher(Launcher):
+    """Returns no handles, but does not say that people start the clients."""
+
+    def launch(self, instances, address, token):
+        return []
+
+
+class NoLauncher:
+    """A class of another kind."""
+
+
+class Bound(Environment):
+    """Tells the processor cores that it may use."""
+
+    def create(self):
+        self.save_parameters(cores=sorted(os.sched_getaffinity(0)))
+
+    def init_database(self):
+        self.define_training_fields(("x", float))
+
+    def step(self):
+        self.set_training_data(x=0.0)
+
+
+@pytest.fixture
+def notes(tmp_path):
+    folder = tmp_path / "notes"
+    folder.mkdir()
+    return folder
+
+
+@pytest.mark.parametrize("reference", [CommandLauncher, f"{HERE}:CommandLauncher"])
+def test_a_launcher_of_ones_own_starts_the_clients(clients, notes, reference):
+    settings = {"launcher": reference, "launcher_kwargs": {"notes": str(notes)}}
+    with clients(num_clients=2, **settings) as source:
+        assert source.batch(4)["env_id"].tolist() == [1, 2, 1, 2]
+    assert [file.read_text() for file in notes.glob("*.launch")] == ["[1, 2]"]
+    said = (notes / "2.out").read_text()
+    assert "transport_envs.py:Plain, instance 2 of 2" in said
+    assert said.endswith("the run has ended\n")
+
+
+def test_a_launcher_of_ones_own_starts_a_client_again(clients, notes):
+    settings = {"launcher": CommandLauncher, "launcher_kwargs": {"notes": str(notes)}}
+    kwargs = {"fault": "fail", "at": 3}
+    wanderer = f"{HERE.with_name('restart_envs.py')}:Wanderer"
+    with clients(wanderer, num_clients=2, restarts=1, env_kwargs=kwargs, **settings) as source:
+        assert source.batch(20)["step"].tolist() == [step // 2 for step in range(20)]
+    launches = [file.read_text() for file in sorted(notes.glob("*.launch"))]
+    assert launches == ["[1, 2]", "[2]"]
+
+
+def test_a_launcher_that_forgets_its_handles_is_named(clients):
+    with (
+        pytest.raises(ClientError, match=r"ForgetfulLauncher\.launch\(\) returned no handle"),
+        clients(launcher=ForgetfulLauncher),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "text"),
+    [
+        ({"launcher": NoLauncher}, ConfigError, "NoLauncher is no Launcher"),
+        ({"launcher_kwargs": {"speed": 3}}, ConfigError, "unexpected keyword argument 'speed'"),
+        ({"launcher": "physx/manuel"}, ComponentNotFoundError, 'Did you mean "manual"'),
+    ],
+)
+def test_an_unfit_launcher_is_named(clients, settings, error, text):
+    with pytest.raises(error, match=text), clients(**settings):
+        pass
+
+
+def test_the_launchers_of_the_core_come_through_the_hook():
+    assert plugins.resolve("launcher", "physx/subprocess") is SubprocessLauncher
+    assert plugins.resolve("launcher", "physx/manual") is ManualLauncher
+    assert plugins.KINDS["launcher"] == "physx_launchers"
+    assert plugins.available()["physx"].module == "physx_core.plugins.builtin"
+
+
+# Processes --------------------------------------------------------------------------------------
+
+
+def test_clients_are_bound_to_processor_cores_in_turn(clients, services):
+    cores = sorted(os.sched_getaffinity(0))
+    settings = {"num_clients": 3, "launcher_kwargs": {"affinity": True}}
+    with clients(f"{HERE}:Bound", **settings) as source:
+        source.batch(3)
+        bound = [services.kept[number]["cores"] for number in (1, 2, 3)]
+    assert bound == [[cores[number % len(cores)]] for number in range(3)]
+    assert sorted(os.sched_getaffinity(0)) == cores
+
+
+def test_a_process_that_cannot_be_started_leaves_none_behind(clients, monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/nonexistent/python")
+    with pytest.raises(ClientError, match="Client 1 could not be started"), clients(num_clients=2):
+        pass
+
+
+def test_the_token_is_where_only_the_owner_reads_it():
+    token = "a token that nobody sees"
+    process = ClientProcess(1, "127.0.0.1:1", token)
+    process.start()
+    try:
+        entry = Path(f"/proc/{process.pid}")
+        command, mode = (entry / "cmdline").read_bytes(), (entry / "environ").stat().st_mode
+        status = (entry / "status").read_text()
+    finally:
+        stop([process], 0.0)
+    assert token.encode() not in command
+    assert token not in status
+    assert not mode & 0o077

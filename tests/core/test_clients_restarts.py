@@ -1,0 +1,324 @@
+"""ClientSource: clients that fail and are started again; the rows are those without the failure."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import random
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physx_core import DataGeneration, Dataset, EnvironmentConfig
+from physx_core.errors import ClientError, EnvironmentFailedError, SampleError
+from physx_core.transport.frames import Kind, pack
+from physx_core.transport.journal import Journal
+
+ENVS = Path(__file__).with_name("restart_envs.py")
+WANDERER = f"{ENVS}:Wanderer"
+
+
+@pytest.fixture
+def batch_services(services):
+    """The services, predicting several samples at once."""
+    services.sizes = []
+
+    def predict_batch(batch):
+        services.sizes.append(len(batch["x"]))
+        return {"y": 2 * batch["x"]}
+
+    services.predict_batch = predict_batch
+    return services
+
+
+@pytest.fixture
+def fresh_notes():
+    """Return a function that removes what environments noted in the folder, and tells how much."""
+
+    def clear():
+        found = [*Path().glob("broke-*"), *Path().glob("started-*")]
+        for note in found:
+            note.unlink()
+        return sum(note.name.startswith("started") for note in found)
+
+    return clear
+
+
+def digest(batches):
+    """Return a hash of rows by field, whatever the sizes of the batches."""
+    found = hashlib.sha256()
+    for name in sorted(batches[0]):
+        for batch in batches:
+            found.update(np.ascontiguousarray(batch[name]).tobytes())
+    return found.hexdigest()
+
+
+def run(source, sizes, *, apply=False, kill=False):
+    """Return copies of batches; each is applied to the environments, or a client is killed."""
+    batches = []
+    with source:
+        if kill:
+            killer = threading.Timer(random.random() * 0.5, kill_one)
+            killer.start()
+        for size in sizes:
+            batch = source.batch(size)
+            batches.append({name: values.copy() for name, values in batch.items()})
+            if apply:
+                source.apply({"y": batch["position"][:, :1] / 10})
+        if kill:
+            killer.join()
+    return batches
+
+
+def kill_one():
+    os.kill(random.choice(list(process_ids().values())), signal.SIGKILL)
+
+
+def process_ids():
+    """Instance number to process id, from the command lines of this process's clients."""
+    found = {}
+    for command in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = command.read_bytes().split(b"\0")
+            parent = (command.parent / "stat").read_text().rpartition(")")[2].split()[1]
+        except OSError:
+            continue
+        if b"--instance" in words and int(parent) == os.getpid():
+            found[int(words[words.index(b"--instance") + 1])] = int(command.parent.name)
+    return found
+
+
+# The same rows, whatever happens ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("asks", [False, True])
+def test_rows_depend_on_the_seed_alone(clients, batch_services, asks):
+    """Five runs with delays by chance, and two in which a client is killed by chance."""
+    ahead, sizes = (0, [1, 7, 9, 13]) if asks else (None, [1, 40, 50, 60])
+    delay = 0.02 if asks else 0.01
+    hashes = set()
+    for attempt in range(7):
+        source = clients(
+            WANDERER,
+            num_clients=3,
+            env_kwargs={"asks": asks, "delay": delay, "refuse": 4},
+            run_ahead=ahead,
+            restarts=int(attempt >= 5),
+        )
+        hashes.add(digest(run(source, sizes, apply=asks, kill=attempt >= 5)))
+    assert len(hashes) == 1
+
+
+@pytest.mark.parametrize(
+    ("fault", "place"),
+    [
+        ("fail", "create"),
+        ("leave", "init_database"),
+        ("kill", "step"),
+        ("fail", "step"),
+        ("stop", "step"),
+        ("garble", "step"),
+        ("disconnect", "prediction"),
+        ("kill", "prediction"),
+        ("leave", "apply_prediction"),
+        ("kill", "close"),
+        ("fail", "close"),
+    ],
+)
+def test_a_client_that_breaks_is_started_again(
+    local, clients, batch_services, fresh_notes, caplog, fault, place
+):
+    settings = {"num_clients": 2, "env_kwargs": {"asks": True, "refuse": 3}}
+    sizes = [3, 9, 1, 6]
+    expected = digest(run(local(WANDERER, **settings), sizes, apply=True))
+    fresh_notes()
+    settings["env_kwargs"] |= {"fault": fault, "place": place, "at": 7}
+    source = clients(WANDERER, run_ahead=0, restarts=1, timeout=4.0, **settings)
+    assert digest(run(source, sizes, apply=True)) == expected
+    (warning,) = [record for record in caplog.records if record.name == "physx"]
+    assert warning.levelname == "WARNING"
+    assert ("Client 2" if fault != "fail" else "Instance 2") in warning.getMessage()
+    if place == "close":
+        assert "all rows are there" in warning.getMessage()
+    else:
+        assert "Restart 1 of 1" in warning.getMessage()
+    assert fresh_notes() == (2 if place == "close" else 3)
+
+
+def test_several_restarts_of_several_clients(local, clients, fresh_notes, caplog):
+    settings = {"num_clients": 3, "env_kwargs": {"pace": 0.003}}
+    with local(WANDERER, **settings) as source:
+        expected = digest([source.batch(30)])
+    fresh_notes()
+    victims = [1, 3, 1]
+    batches = []
+    with clients(WANDERER, restarts=2, run_ahead=2, **settings) as source:
+        while victims or len(batches) < 30:
+            batches.append({name: values.copy() for name, values in source.batch(1).items()})
+            if victims and victims[0] in process_ids():
+                os.kill(process_ids()[victims.pop(0)], signal.SIGKILL)
+                time.sleep(0.05)
+    assert digest(batches[:30]) == expected
+    texts = [record.getMessage() for record in caplog.records if record.name == "physx"]
+    assert [text.split(" was ")[0] for text in texts] == ["Client 1", "Client 3", "Client 1"]
+    assert "Restart 2 of 2" in texts[2]
+
+
+def test_requests_go_through_the_network_in_the_batches_of_a_run_without_failure(
+    clients, batch_services, fresh_notes
+):
+    asked = []
+    for fault in ("", "kill", "fail"):
+        batch_services.sizes.clear()
+        kwargs = {"asks": True, "fault": fault, "place": "step", "at": 4}
+        with clients(WANDERER, num_clients=3, env_kwargs=kwargs, run_ahead=0, restarts=1) as source:
+            for _ in range(4):
+                source.batch(6)
+        asked.append(batch_services.sizes.copy())
+        fresh_notes()
+    assert asked[1] == asked[0]
+    assert asked[2] == asked[0]
+
+
+def test_what_was_drawn_and_kept_is_not_repeated(clients, services, fresh_notes):
+    seen = []
+    for fault in ("", "kill"):
+        services.shown.clear()
+        services.kept.clear()
+        kwargs = {"fault": fault, "place": "step", "at": 6}
+        settings = {"num_clients": 2, "visualizer": "any", "restarts": 1}
+        with clients(WANDERER, env_kwargs=kwargs, total=20, **settings) as source:
+            source.batch(20)
+        drawn = sorted((i, step, str(events)) for i, step, events in services.shown)
+        seen.append((drawn, {number: kept["drawn"] for number, kept in services.kept.items()}))
+        fresh_notes()
+    assert len(seen[0][0]) == 22
+    assert seen[1] == seen[0]
+    assert seen[0][1] == {1: 1, 2: 1}
+
+
+def test_refused_rows_are_those_of_a_run_without_failure(clients, fresh_notes):
+    seen = []
+    for fault in ("", "kill", "leave"):
+        kwargs = {"refuse": 3, "fault": fault, "at": 11, "pace": 0.002}
+        settings = {"num_clients": 2, "record_wrong_samples": True, "restarts": 1}
+        refused = []
+        with clients(WANDERER, env_kwargs=kwargs, **settings) as source:
+            for size in (5, 20, 11):
+                source.batch(size)
+                refused.append(source.take_refused())
+        seen.append(digest([batch for batch in refused if batch]))
+        fresh_notes()
+    assert len(set(seen)) == 1
+
+
+def test_stored_rows_are_sent_again(clients, fresh_notes):
+    stored = [{"position": np.arange(12.0).reshape(6, 2) * k} for k in (1, 2, 3)]
+    seen = []
+    for fault in ("", "kill"):
+        kwargs = {"fault": fault, "at": 6}
+        with clients(WANDERER, num_clients=2, env_kwargs=kwargs, run_ahead=0, restarts=1) as source:
+            rows = []
+            for part in stored:
+                rows.append({n: v.copy() for n, v in source.batch(6, part).items()})
+                source.apply({"y": part["position"][:, :1]})
+        seen.append(digest(rows))
+        fresh_notes()
+    assert seen[0] == seen[1]
+
+
+def test_making_rows_again_is_not_taken_for_silence(clients, caplog):
+    """Twelve steps of 0.3 s are made again, where a client may be silent for 2.5 s."""
+    kwargs = {"pace": 0.3, "fault": "kill", "at": 12, "who": 1}
+    with clients(WANDERER, env_kwargs=kwargs, run_ahead=0, restarts=1, timeout=2.5) as source:
+        for row in range(14):
+            assert source.batch(1)["step"] == [row]
+    assert len([record for record in caplog.records if record.name == "physx"]) == 1
+
+
+def test_a_pipeline_goes_on(fresh_notes):
+    sums = []
+    for fault in ("", "kill"):
+        config = EnvironmentConfig(
+            WANDERER,
+            env_kwargs={"fault": fault, "at": 30, "pace": 0.001},
+            num_clients=2,
+            restarts=1,
+            seed=3,
+        )
+        generation = DataGeneration(config, batch_nb=10, batch_size=20)
+        generation.execute()
+        with Dataset.open(generation.session.path) as dataset:
+            assert dataset.num_samples("training") == 200
+            fields = dataset.fields("training")
+            sums.append(digest([{name: dataset["training"][name][:] for name in fields}]))
+        fresh_notes()
+    assert sums[0] == sums[1]
+
+
+# Limits -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"), [("kill", ClientError), ("fail", EnvironmentFailedError)]
+)
+def test_a_client_that_fails_too_often_ends_the_run(clients, caplog, fresh_notes, fault, error):
+    kwargs = {"fault": fault, "at": 3, "times": 9}
+    with (
+        pytest.raises(error, match="SIGKILL|no more beans"),
+        clients(WANDERER, num_clients=2, env_kwargs=kwargs, restarts=2) as source,
+    ):
+        source.batch(20)
+    texts = [record.getMessage() for record in caplog.records if record.name == "physx"]
+    assert ["Restart 1 of 2" in texts[0], "Restart 2 of 2" in texts[1]] == [True, True]
+    assert len(texts) == 2
+    assert fresh_notes() == 4
+
+
+def test_what_would_come_again_is_raised_at_once(clients, caplog, fresh_notes):
+    kwargs = {"fault": "refuse_rows", "at": 3, "times": 9}
+    with (
+        pytest.raises(SampleError, match="this would come again"),
+        clients(WANDERER, num_clients=2, env_kwargs=kwargs, restarts=2) as source,
+    ):
+        source.batch(20)
+    assert not [record for record in caplog.records if record.name == "physx"]
+    assert fresh_notes() == 2
+
+
+# The journal ------------------------------------------------------------------------------------
+
+
+def test_a_journal_tells_again_what_was_told():
+    journal = Journal()
+    told = [
+        pack(Kind.CREDIT, number=2),
+        pack(Kind.ANSWER, b"first", 1),
+        pack(Kind.CREDIT, number=3),
+        pack(Kind.APPLY, b"three" * 3_000_000, 1),
+        pack(Kind.CREDIT, number=4),
+        pack(Kind.REFUSAL, b"third", 3),
+        pack(Kind.STORED, b"four", 1),
+        pack(Kind.APPLY, b"four", 1),
+        pack(Kind.CLOSE),
+        pack(Kind.CREDIT, number=5),
+    ]
+    assert [journal.record(message) for message in told] == [1, 0, 1, 1, 1, 0, 1, 1, 0, 1]
+    orders = [told[2], told[3], told[4], told[6], told[7]]
+    assert [journal.order(index) for index in range(6)] == [*orders, None]
+    assert journal.credit == told[9]
+    assert [journal.answer(number) for number in (1, 2, 3, 4)] == [told[1], None, told[5], None]
+    journal.close()
+
+
+def test_a_journal_of_credit_alone_does_not_grow():
+    journal = Journal()
+    for number in range(1000):
+        journal.record(pack(Kind.CREDIT, number=number))
+    assert journal.order(0) is None
+    assert journal.credit == pack(Kind.CREDIT, number=999)
+    journal.close()

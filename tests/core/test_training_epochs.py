@@ -1,0 +1,286 @@
+"""Validation, early stopping, the best checkpoint, and what is recorded of an epoch."""
+
+import csv
+import math
+import statistics
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physx_core import (
+    Dataset,
+    DatasetConfig,
+    EnvironmentConfig,
+    NetworkConfig,
+    Observer,
+    Prediction,
+    Training,
+)
+from physx_core.checkpoint import read
+from physx_core.errors import CheckpointError, ConfigError, UnknownOptionError
+from physx_core.interfaces.group import Group
+from physx_core.toy import LeastSquares, Linear
+
+DATA = DatasetConfig(existing_dir="data")
+
+
+class Scripted(LeastSquares):
+    """Reports losses that were given, one for each epoch, and a learning rate."""
+
+    def __init__(self, losses, validation=None):
+        self.losses, self.epoch, self.judged = losses, 0, []
+        self.validation = validation or losses
+
+    def transform_loss(self, loss, data):
+        now = self.losses if len(data["state"]) == 5 else self.validation
+        return {"loss": now[self.epoch], "rows": len(data["state"])}
+
+    def learning_rate(self):
+        return 0.5**self.epoch
+
+    def epoch_end(self, loss):
+        self.judged.append(loss)
+        self.epoch += 1
+
+
+@pytest.fixture
+def data():
+    """Ten samples to learn from."""
+    rng = np.random.default_rng(0)
+    with Dataset.create("data") as dataset:
+        dataset.append("training", fields(rng, 10))
+    return rng
+
+
+@pytest.fixture
+def validated(data):
+    """Six samples to validate with, beside those of `data`."""
+    with Dataset.open("data", writable=True, session="data") as dataset:
+        dataset.append("validation", fields(data, 6))
+
+
+def fields(rng, rows):
+    return {"state": rng.random((rows, 2)), "next_state": rng.random((rows, 2))}
+
+
+def training(losses, validation=None, *, network=None, **options):
+    config = NetworkConfig(
+        Linear,
+        optimization=Scripted,
+        optimization_kwargs={"losses": losses, "validation": validation},
+        **(network or {}),
+    )
+    options = {"epoch_nb": len(losses), "batch_size": 5, "seed": 0, **options}
+    return Training(config, DATA, **options)
+
+
+def recorded(session="training"):
+    """Return the numbers of a session as {name: [values]}."""
+    found = {}
+    with Path(f"sessions/{session}/stats/scalars.csv").open() as stream:
+        for row in csv.DictReader(stream):
+            found.setdefault(row["name"], []).append(float(row["value"]))
+    return found
+
+
+def checkpoints(session="training"):
+    return sorted(p.name for p in Path(f"sessions/{session}/network").iterdir())
+
+
+# What is recorded -------------------------------------------------------------------------------
+
+
+def test_all_entries_of_the_loss_are_recorded_by_batch_epoch_and_validation(validated):
+    training([3.0, 2.0], [5.0, 4.0]).execute()
+    found = recorded()
+    assert found["loss/batch"] == [3, 3, 2, 2]
+    assert found["loss/training"] == [3, 2] and found["loss/validation"] == [5, 4]
+    assert found["rows/batch"] == [5] * 4 and found["rows/training"] == [5, 5]
+    assert found["rows/validation"] == [6, 6]
+    assert found["learning_rate"] == [1, 0.5]
+
+
+def test_the_variance_is_that_of_the_last_fifty_batches(data):
+    rng = np.random.default_rng(1)
+
+    class Random(Scripted):
+        def transform_loss(self, loss, data):
+            return {"loss": float(rng.random())}
+
+    config = NetworkConfig(Linear, optimization=Random, optimization_kwargs={"losses": []})
+    Training(config, DATA, epoch_nb=35, batch_size=5, seed=0).execute()
+    found = recorded()
+    losses = found["loss/batch"]
+    assert len(losses) == 70 and found["loss/variance"][0] == 0
+    for count in (2, 7, 50, 51, 70):
+        window = losses[max(0, count - 50) : count]
+        assert math.isclose(found["loss/mean"][count - 1], statistics.fmean(window))
+        assert math.isclose(found["loss/variance"][count - 1], statistics.variance(window))
+
+
+def test_validation_every_k_epochs(validated):
+    pipeline = training([4.0, 3.0, 2.0, 1.0, 0.5], validation_every=2)
+    with pipeline:
+        pipeline.execute()
+        judged = pipeline.learner.optimization.judged
+    assert recorded()["loss/validation"] == [3, 1]
+    assert pipeline.validation_loss == 1
+    assert [math.isnan(loss) for loss in judged] == [True, False, True, False, True]
+
+
+def test_without_validation_epochs_are_judged_by_their_training_loss(data):
+    pipeline = training([2.0, 1.0])
+    with pipeline:
+        pipeline.execute()
+        assert pipeline.learner.optimization.judged == [2, 1]
+
+
+def test_histograms_of_weights_come_every_k_epochs(data):
+    seen = []
+
+    class Sees(Observer):
+        def histograms(self, values, step, timeline):
+            seen.append((step, timeline, {name: value.shape for name, value in values.items()}))
+
+    training([1.0] * 4, statistics=[Sees], histograms_every=2).execute()
+    assert seen == [(2, "epoch", {"weights/weights": (3, 2)}), (4, "epoch", seen[0][2])]
+
+
+def test_statistics_go_where_they_were_sent_with_their_arguments(data):
+    made = []
+
+    class Sees(Observer):
+        def __init__(self, size=0):
+            self.size, self.names = size, set()
+            made.append(self)
+
+        def scalars(self, values, step, timeline):
+            self.names |= values.keys()
+
+    training([1.0], statistics=[Sees], statistics_kwargs={str(Sees): {"size": 3}}).execute()
+    assert made[0].size == 3 and {"loss/batch", "loss/training"} <= made[0].names
+    with pytest.raises(UnknownOptionError, match="rerum"):
+        training([1.0], statistics="rerun", statistics_kwargs={"rerum": {}}).execute()
+
+
+# Early stopping ---------------------------------------------------------------------------------
+
+
+def test_a_training_stops_when_nothing_improves_and_says_why(validated, capfd):
+    pipeline = training([9.0] * 8, [5, 4, 3, 3.5, 3, 3, 1, 1], patience=3)
+    pipeline.execute()
+    assert pipeline.epoch_id == 6
+    assert "did not improve 3 times in a row" in pipeline.stopped
+    assert "smallest was 3, after epoch 3" in pipeline.stopped
+    assert pipeline.stopped in Path("sessions/training/info.txt").read_text()
+    assert pipeline.stopped in capfd.readouterr().err
+
+
+def test_small_improvements_do_not_count_but_add_up(data):
+    losses = [1.0, 0.96, 0.92, 0.88, 0.84, 0.80]
+    assert finished_epochs(losses, patience=1, min_improvement=0.05) == 2
+    assert finished_epochs(losses, patience=2, min_improvement=0.05) == 6
+
+
+def finished_epochs(losses, **options):
+    pipeline = training(losses, **options)
+    pipeline.execute()
+    return pipeline.epoch_id
+
+
+def test_patience_counts_validations(validated):
+    assert finished_epochs([1.0] * 9, patience=2, validation_every=2) == 6
+
+
+def test_a_loss_that_is_not_a_number_is_no_improvement(data):
+    assert finished_epochs([math.nan] * 9, patience=2) == 2
+
+
+def test_a_training_that_reaches_its_last_epoch_did_not_stop(data):
+    pipeline = training([1.0] * 3, patience=2)
+    pipeline.execute()
+    assert pipeline.epoch_id == 3 and pipeline.stopped == ""
+
+
+def test_a_stopped_training_writes_no_checkpoint_twice(data):
+    training([1.0] * 9, patience=2, network={"save_each_epoch": True}).execute()
+    assert checkpoints() == ["network_0", "network_1", "network_2", "network_best"]
+
+
+# The best checkpoint ----------------------------------------------------------------------------
+
+
+def test_the_best_network_is_that_of_the_smallest_validation_loss(validated):
+    pipeline = training([9.0, 8, 7, 6], [4, 2, 3, 5], network={"save_each_epoch": True})
+    pipeline.execute()
+    assert (pipeline.best.loss, pipeline.best.epoch) == (2, 2)
+    network = Path("sessions/training/network")
+    assert read(network / "network_best").progress.epoch == 2
+    names = ["network_1", "network_2", "network_best"]
+    second, third, best = ((network / n / "parameters.npz").read_bytes() for n in names)
+    assert best == second != third
+
+
+def test_the_best_network_can_be_chosen_and_leaves_the_numbers_alone(data):
+    training([1.0, 0.5], network={"save_best": True}).execute()
+    assert checkpoints() == ["network_0", "network_best"]
+    best = {"network_dir": "sessions/training", "which_network": "best"}
+    training([1.0], network=best, session_name="from_best").execute()
+    spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)
+    config = NetworkConfig(which_network="best")
+    Prediction(config, spring, session_name="training", step_nb=2).execute()
+    training([1.0], new_session=False).execute()
+    assert checkpoints() == ["network_0", "network_1", "network_best"]
+
+
+def test_a_missing_best_network_is_named(data):
+    training([1.0]).execute()
+    training([1.0], network={"save_best": False}, patience=1, session_name="other").execute()
+    assert checkpoints() == checkpoints("other") == ["network_0"]
+    best = {"network_dir": "sessions/training", "which_network": "best"}
+    with pytest.raises(CheckpointError, match='"network_best".*There are: network_0'):
+        training([1.0], network=best).execute()
+    with pytest.raises(ConfigError, match="which_network"):
+        NetworkConfig(which_network="worst")
+
+
+# Several processes ------------------------------------------------------------------------------
+
+
+def test_a_share_of_each_batch(monkeypatch):
+    batch = {"x": np.arange(7), "y": np.arange(14).reshape(7, 2)}
+    group = Group()
+    group.size, seen, weights = 3, [], 0
+    for rank in range(3):
+        group.rank = rank
+        share, weight = group.share_of(batch)
+        assert np.array_equal(share["y"], batch["y"][share["x"]])
+        seen += share["x"].tolist()
+        weights += weight
+    assert seen == list(range(7)) and math.isclose(weights, 1)
+    group.rank = 0
+    share, weight = group.share_of({"x": np.arange(2)})
+    assert (len(share["x"]), weight) == (1, 0)
+
+
+def test_what_cannot_be_trained_by_several_processes(data, monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(ConfigError, match="Linear cannot be trained by several processes"):
+        training([1.0]).execute()
+
+    class Pair(Group):
+        size = 2
+
+    class Joins(Linear):
+        @classmethod
+        def join_group(cls, device):
+            return Pair()
+
+    options = {"epoch_nb": 1, "batch_nb": 1, "batch_size": 2}
+    spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)
+    with pytest.raises(ConfigError, match="train on stored samples only"):
+        Training(NetworkConfig(Joins), None, spring, **options).execute()
+    with pytest.raises(ConfigError, match="LeastSquares cannot work in several processes"):
+        Training(NetworkConfig(Joins), DATA, **options).execute()
+    assert not Path("sessions/training").exists()
