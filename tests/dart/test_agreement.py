@@ -15,6 +15,10 @@ ROBOTS = {
     "a1": ("a1_description/urdf/a1.urdf", False),  # links without inertia
     "z1": ("z1_description/urdf/z1.urdf", True),  # root link `world`, joint friction
     "allegro": ("allegro_hand_description/urdf/allegro_left_hand.urdf", True),  # a tree
+    "ur5": ("ur_description/urdf/ur5_robot.urdf", True),
+    "go2": ("go2_description/urdf/go2.urdf", False),
+    "talos": ("talos_data/robots/talos_reduced.urdf", False),
+    "g1": ("g1_description/urdf/g1_29dof_rev_1_0.urdf", False),  # links without inertia
     "double pendulum": (None, True),
 }
 
@@ -105,6 +109,26 @@ def test_joints_pushed_into_their_limits_agree(dart, pinocchio, example):
         at_limit = np.abs(one.positions() - one.layout.upper) < 1e-8
         assert at_limit.sum() >= 5
         assert (one.positions() < one.layout.upper + 1e-8).all()
+
+
+def test_a_double_pendulum_goes_the_same_way_for_a_thousand_steps(dart, pinocchio):
+    with dart.build(World([Robot(URDF)])) as one, pinocchio.build(World([Robot(URDF)])) as other:
+        for simulation in (one, other):
+            simulation.set_state([1.0, 0.5], [0.0, 0.0])
+            simulation.step(1000)
+        np.testing.assert_allclose(one.positions(), other.positions(), atol=1e-10)
+
+
+def test_a_quadruped_tumbles_the_same_way_for_a_second(dart, pinocchio, example):
+    world = World([Robot(example("go2_description/urdf/go2.urdf"), fixed_base=False)])
+    with dart.build(world) as one, pinocchio.build(world) as other:
+        for simulation in (one, other):
+            q = simulation.positions()
+            q[7:] = np.tile([0.0, 0.9, -1.8], 4)
+            simulation.set_state(q, [*np.zeros(3), 2.0, -3.0, 1.0, *np.full(12, 0.2)])
+            simulation.step(1000)
+        np.testing.assert_allclose(one.positions()[7:], other.positions()[7:], atol=1e-8)
+        np.testing.assert_allclose(one.positions()[:7], other.positions()[:7], atol=1e-8)
 
 
 @pytest.mark.parametrize("name", ["arm", "double-pendulum"])

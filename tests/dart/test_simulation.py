@@ -115,7 +115,7 @@ def test_torques_are_cut_at_the_effort_limit(backend, bar):
         simulation.set_torques([-100.0])
         simulation.step(60)
         np.testing.assert_allclose(simulation.velocities(), [-4 / 0.6 * 0.06], rtol=1e-8)
-        np.testing.assert_array_equal(simulation.snapshot().torques, [-4.0])
+        np.testing.assert_array_equal(simulation.snapshot().commands, [-4.0])
 
 
 def test_torques_are_held_until_changed(backend, bar):

@@ -1,11 +1,15 @@
-"""Joint limits and Coulomb friction as impulses, after the engine's free motion is known."""
+"""Joint limits, motors and Coulomb friction as impulses, once the free motion is known."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from physx_core.interfaces.backend import Vector
+from physx_dart.urdf import Joint
 
 _REGULARIZATION = 1e-9
 """Share that is added to the diagonal, as DART's solver does."""
@@ -14,21 +18,65 @@ _FASTEST_RETURN = 10.0
 
 
 class JointConstraints:
-    """Limits of position and velocity, and Coulomb friction, of a robot's joints.
+    """Limits of position and velocity, motors, and Coulomb friction, of a robot's joints.
 
     A joint may not leave its limits in the next step, nor move faster than its velocity limit; one
     that is outside comes back, whatever its velocity limit. Friction stops a joint if it can within
-    its bounds.
+    its bounds; a motor brings it to its velocity likewise. A motor without bounds does so whatever
+    the limits are.
+
+    Attributes:
+        targets: Velocities that the motors aim at, shape (n,), in rad/s or m/s.
+        acts: Whether anything but limits acts.
+        limits: Whether any joint has limits.
     """
 
-    def __init__(
-        self, lower: Vector, upper: Vector, max_velocity: Vector, friction: Vector, period: float
-    ) -> None:
-        """Keep the bounds of all degrees of freedom, each of shape (n,), and the period in s."""
-        self._lower, self._upper, self._fastest = lower, upper, max_velocity
-        self._friction = friction * period
-        self._rubs = bool(friction.any())
+    def __init__(self, joints: Sequence[Joint], period: float) -> None:
+        """Keep the bounds of all joints, and the period in s."""
+        modes = np.array([joint.settings.mode for joint in joints], dtype=object)
+        self._lower = np.array([joint.lower for joint in joints])
+        self._upper = np.array([joint.upper for joint in joints])
+        self._fastest = np.array([joint.max_velocity for joint in joints])
+        self._friction = period * np.array([joint.friction for joint in joints])
+        self._motors = modes != "force"
+        free = modes == "velocity"
+        self._lower[free], self._upper[free], self._fastest[free] = -np.inf, np.inf, np.inf
+        self._friction[free] = 0.0
+        strength = np.array([joint.max_torque for joint in joints])
+        self._strength = np.where(free, np.inf, period * strength)
+        self._rubs = bool(self._friction.any())
         self._period = period
+        self.targets = np.zeros(len(joints))
+        self.acts = self._rubs or bool(self._motors.any())
+        limits = np.concatenate([self._lower, self._upper, self._fastest])
+        self.limits = bool(np.isfinite(limits).any())
+        self._ranges = [
+            (place, float(lower), float(upper))
+            for place, (lower, upper) in enumerate(zip(self._lower, self._upper, strict=True))
+            if lower > -math.inf or upper < math.inf
+        ]
+        self._slowest_limit = float(self._fastest.min(initial=np.inf))
+
+    def safe(self, positions: Vector, velocities: Vector) -> tuple[int, float]:
+        """Return for how many steps no limit can act while the speed stays below a bound.
+
+        Args:
+            positions: Shape (n,).
+            velocities: Likewise.
+
+        Returns:
+            The number of steps and the bound of the square of the velocities' length.
+        """
+        if not self.limits:
+            return 2**30, math.inf
+        square = float(velocities.dot(velocities))
+        bound = min(self._slowest_limit, max(2 * math.sqrt(square), 1.0))
+        slack, places = math.inf, positions.tolist()
+        for place, lower, upper in self._ranges:
+            slack = min(slack, places[place] - lower, upper - places[place])
+        if not slack > 0 or not square < bound * bound:
+            return 0, 0.0
+        return int(min(slack / (bound * self._period), 2**30)), bound * bound
 
     def impulses(
         self, positions: Vector, velocities: Vector
@@ -43,7 +91,7 @@ class JointConstraints:
             Four vectors of one length: which degrees of freedom (one may be there twice), by how
             much their velocities shall change, and the smallest and the largest impulse on them.
         """
-        if not self._rubs and self._allows(positions, velocities):
+        if not self.acts and self._allows(positions, velocities):
             return None
         below, above = positions < self._lower, positions > self._upper
         to_lower = (self._lower - positions) / self._period
@@ -55,14 +103,16 @@ class JointConstraints:
         fastest = np.maximum(fastest, -_FASTEST_RETURN)
         low = below | ((velocities < slowest) & ~outside)
         high = above | ((velocities > fastest) & ~outside & ~low)
-        rubs = (self._friction > 0) & (velocities != 0)
-        index = np.concatenate([np.flatnonzero(rows) for rows in (low, high, rubs)])
+        rubs, motors = (self._friction > 0) & (velocities != 0), self._motors
+        index = np.concatenate([np.flatnonzero(rows) for rows in (low, high, rubs, motors)])
         if not len(index):
             return None
         nothing, friction = np.zeros(len(velocities)), self._friction
-        target = np.concatenate([slowest[low], fastest[high], nothing[rubs]])
-        least = np.concatenate([nothing[low], nothing[high] - np.inf, -friction[rubs]])
-        most = np.concatenate([nothing[low] + np.inf, nothing[high], friction[rubs]])
+        strength = self._strength[motors]
+        aims = [slowest[low], fastest[high], nothing[rubs], self.targets[motors]]
+        target = np.concatenate(aims)
+        least = np.concatenate([nothing[low], nothing[high] - np.inf, -friction[rubs], -strength])
+        most = np.concatenate([nothing[low] + np.inf, nothing[high], friction[rubs], strength])
         return index, target - velocities[index], least, most
 
     def _allows(self, positions: Vector, velocities: Vector) -> bool:

@@ -8,10 +8,49 @@ from pathlib import Path
 from urllib.parse import unquote, urlparse
 from xml.etree import ElementTree
 
-from physx_core.errors import MissingMeshesError, ModelError
+from physx_core.errors import MissingMeshesError, ModelError, nearest
 
 EXAMPLE_DATA = "example-robot-data"
 """Distribution with many robots, and the package that their mesh names begin with."""
+OWN_ROBOTS = Path(__file__).parent / "robots"
+"""Folder of the robots that come with physx."""
+
+
+def find_robot(urdf: str | Path) -> Path:
+    """Return the URDF file of a robot.
+
+    Args:
+        urdf: A path; or the name of an own robot, as in ``"cartpole"``, or of one of
+            ``example-robot-data``, as in ``"a1/a1"``; ``physx robots`` lists them.
+
+    Raises:
+        ModelError: It is no path of a URDF file, and there is no robot of that name.
+    """
+    path = Path(urdf).absolute()
+    if isinstance(urdf, Path) or urdf.lower().endswith(".urdf") or path.is_file():
+        return path
+    own = OWN_ROBOTS / f"{urdf}.urdf"
+    if own.is_file() and "/" not in urdf:
+        return own
+    known = named_robots()
+    if urdf not in known:
+        raise ModelError(
+            f'There is no URDF file {path}, and no robot has the name "{urdf}".'
+            f"{nearest(urdf, known)} The command  physx robots  lists their names."
+        )
+    return known[urdf]
+
+
+def named_robots() -> dict[str, Path]:
+    """Return the files of all robots that have a name: own ones, then installed ones."""
+    found = {path.stem: path for path in sorted(OWN_ROBOTS.glob("*.urdf"))}
+    folder = example_data_dir()
+    if folder is not None:
+        root = folder / "robots"
+        for path in sorted(root.glob("**/*.urdf")):
+            family = path.relative_to(root).parts[0].removesuffix("_description")
+            found[f"{family}/{path.stem}"] = path
+    return found
 
 
 def example_data_dir() -> Path | None:

@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from physx_core.interfaces.backend import Vector
 
 
-def quaternion_from_vector(rotation: Vector) -> Vector:
-    """Return the quaternion, shape (4,), of a rotation vector (3,) in rad."""
-    angle = math.sqrt(rotation[0] ** 2 + rotation[1] ** 2 + rotation[2] ** 2)
+def quaternion_of(x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """Return the quaternion x, y, z, w, with w not negative, of a rotation vector in rad."""
+    angle = math.sqrt(x * x + y * y + z * z)
     half = 0.5 * angle
-    scale = math.sin(half) / angle if angle > 1e-8 else 0.5
-    x, y, z = rotation
-    return np.array([scale * x, scale * y, scale * z, math.cos(half)])
+    scale, w = math.sin(half) / angle if angle > 1e-8 else 0.5, math.cos(half)
+    if w < 0:
+        scale, w = -scale, -w
+    return scale * x, scale * y, scale * z, w
+
+
+def turned_back(
+    quaternion: Sequence[float], a: float, b: float, c: float
+) -> tuple[float, float, float]:
+    """Return a vector of the outer frame along the axes that a unit quaternion turns it to."""
+    x, y, z, w = quaternion
+    s, t, u = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
+    return a + w * s + (t * z - u * y), b + w * t + (u * x - s * z), c + w * u + (s * y - t * x)
 
 
 def vector_from_quaternion(quaternion: Vector) -> Vector:
@@ -37,21 +48,6 @@ def matrix_from_quaternion(quaternion: Vector) -> Vector:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-def product(left: Vector, right: Vector) -> Vector:
-    """Return the unit quaternion of the rotation `right` followed by `left`."""
-    a, b, c, d = (float(part) for part in left)
-    x, y, z, w = (float(part) for part in right)
-    result = np.array(
-        [
-            d * x + a * w + b * z - c * y,
-            d * y - a * z + b * w + c * x,
-            d * z + a * y - b * x + c * w,
-            d * w - a * x - b * y - c * z,
-        ]
-    )
-    return result / math.sqrt(result.dot(result))
 
 
 def poses_from_matrices(transforms: Vector) -> Vector:

@@ -3,7 +3,7 @@
 Both engines load the same text, rebuilt from the file: links with their inertia, joints with their
 place and axis. Everything else is read here, so that it means the same in both:
 
-- Shapes are left out, since no contact is simulated, but their meshes must exist.
+- Shapes are left out; `physx_dart.shapes` reads those for collisions. All meshes must exist.
 - A link without inertia, or of mass 0, gets 1e-9 kg and 1e-12 kg m².
 - Mimic joints are joints like any other.
 - A position limit whose ends are equal or absent, and a velocity or effort limit that is 0 or
@@ -13,19 +13,24 @@ place and axis. Everything else is read here, so that it means the same in both:
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import Element
+from xml.sax.saxutils import quoteattr
 
-from physx_core.errors import ModelError, listed
-from physx_core.world import Robot
-from physx_dart.robot_files import check_meshes
+from physx_core.errors import ModelError, listed, nearest
+from physx_core.world import JointSettings, Robot
+from physx_dart.robot_files import check_meshes, find_robot
+from physx_dart.shapes import Shape, shapes_of_robot
 
 _MOVING = ("revolute", "continuous", "prismatic")
-_UNLIMITED = {"lower": "-1e9", "upper": "1e9", "effort": "1e9", "velocity": "1e9"}
-_NEGLIGIBLE = dict.fromkeys(("ixx", "iyy", "izz"), "1e-12") | dict.fromkeys(
-    ("ixy", "ixz", "iyz"), "0"
+_UNLIMITED = '<limit lower="-1e9" upper="1e9" effort="1e9" velocity="1e9"/>'
+_MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+_NEGLIGIBLE = (
+    '<inertial><mass value="1e-9"/><inertia ixx="1e-12" iyy="1e-12" izz="1e-12" '
+    'ixy="0" ixz="0" iyz="0"/></inertial>'
 )
 
 
@@ -41,6 +46,7 @@ class Joint:
         max_torque: Limit of the torque, in N m or N.
         damping: Torque against the motion for each unit of velocity, in N m s/rad or N s/m.
         friction: Coulomb friction, in N m or N.
+        settings: What else the world says of it.
     """
 
     name: str
@@ -50,6 +56,7 @@ class Joint:
     max_torque: float
     damping: float
     friction: float
+    settings: JointSettings
 
 
 @dataclass(frozen=True)
@@ -61,38 +68,62 @@ class RobotModel:
         text: URDF text for the engines.
         links: Names of all links, parents before children, in the order of the tree.
         joints: The joints of one degree of freedom, in the order of the tree.
+        shapes: What touches other things; none where nothing can be touched.
     """
 
     path: Path
     text: str
     links: tuple[str, ...]
     joints: tuple[Joint, ...]
+    shapes: tuple[Shape, ...] = ()
 
 
-def read_robot(robot: Robot) -> RobotModel:
+def read_robot(robot: Robot, *, touching: bool = False) -> RobotModel:
     """Read a robot's URDF file.
 
     The tree is walked depth first, the children of a link in the order of their joints' names.
+
+    Args:
+        robot: The robot's description.
+        touching: Whether its collision shapes are wanted.
 
     Raises:
         ModelError: The file is missing or is no URDF, or its links form no tree.
         MissingMeshesError: Mesh files that it names do not exist.
     """
-    path = Path(robot.urdf).absolute()
-    root = _parse(path)
+    path = find_robot(robot.urdf)
+    root = parse_urdf(path)
     check_meshes(path, root, robot.package_dirs)
     try:
         tree = _Tree(root)
         if not robot.fixed_base and tree.links[0] == "world":
             raise ModelError("its root link is the world, which cannot float; use fixed_base=True")
-        joints = tuple(_joint(joint) for joint in tree.joints if joint.get("type") in _MOVING)
+        moving = [joint for joint in tree.joints if joint.get("type") in _MOVING]
+        joints = tuple(_joint(joint, robot.joints) for joint in moving)
+        _check_settings(robot, joints)
         text = _engine_text(tree)
+        shapes = shapes_of_robot(robot, path, tree.elements) if touching else ()
     except (ModelError, ValueError) as error:
         raise ModelError(f'Robot "{robot.name}", {path}: {error}.') from error
-    return RobotModel(path, text, tuple(tree.links), joints)
+    return RobotModel(path, text, tuple(tree.links), joints, shapes)
 
 
-def _parse(path: Path) -> Element:
+def _check_settings(robot: Robot, joints: tuple[Joint, ...]) -> None:
+    known = [joint.name for joint in joints]
+    for name in robot.joints:
+        if name not in known:
+            raise ModelError(
+                f'joints has settings for "{name}", which is no joint that moves.'
+                f"{nearest(name, known)} Joints: {listed(known)}"
+            )
+
+
+def parse_urdf(path: Path) -> Element:
+    """Return the root element of a URDF file.
+
+    Raises:
+        ModelError: The file is missing or is no URDF.
+    """
     try:
         text = path.read_bytes()
     except FileNotFoundError:
@@ -181,20 +212,23 @@ def _by_name(root: Element, tag: str) -> dict[str, Element]:
     return named
 
 
-def _joint(joint: Element) -> Joint:
+def _joint(joint: Element, all_settings: Mapping[str, JointSettings]) -> Joint:
     lower, upper = _number(joint, "limit", "lower"), _number(joint, "limit", "upper")
     name = joint.get("name", "")
     if lower > upper:
         raise ModelError(f'joint "{name}" has the lower limit {lower} above the upper {upper}')
     limited = joint.get("type") != "continuous" and lower < upper
+    settings = all_settings.get(name, JointSettings())
+    damping, friction = settings.damping, settings.friction
     return Joint(
         name,
         lower if limited else -math.inf,
         upper if limited else math.inf,
         _number(joint, "limit", "velocity") or math.inf,
         _number(joint, "limit", "effort") or math.inf,
-        _number(joint, "dynamics", "damping"),
-        _number(joint, "dynamics", "friction"),
+        _number(joint, "dynamics", "damping") if damping is None else damping,
+        _number(joint, "dynamics", "friction") if friction is None else friction,
+        settings,
     )
 
 
@@ -213,33 +247,58 @@ def _number(joint: Element, tag: str, attribute: str) -> float:
 
 
 def _engine_text(tree: _Tree) -> str:
-    robot = Element("robot", name="robot")
+    parts = ['<robot name="robot">']
     for name in tree.links:
-        link = SubElement(robot, "link", name=name)
-        link.append(_inertial(tree.elements[name]))
+        link = _inertial(name, tree.elements[name])
+        parts.append(f"<link name={quoteattr(name)}>{link}</link>")
     for joint in tree.joints:
         moving = joint.get("type") in _MOVING
         kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
-        copy = SubElement(
-            robot, "joint", name=joint.get("name", ""), type=kind if moving else "fixed"
-        )
-        for tag in ("origin", "parent", "child"):
-            copy.extend(joint.findall(tag)[:1])
+        name = joint.get("name", "")
+        parts.append(f'<joint name={quoteattr(name)} type="{kind if moving else "fixed"}">')
+        parts.append(_origin(f'joint "{name}"', joint))
+        for tag in ("parent", "child"):
+            parts.append(f"<{tag} link={quoteattr(link_of(joint, tag))}/>")
         if moving:
-            SubElement(copy, "axis", xyz=_axis(joint))
-            SubElement(copy, "limit", _UNLIMITED)
-    return ElementTree.tostring(robot, encoding="unicode")
+            parts.append(f'<axis xyz="{_axis(joint)}"/>{_UNLIMITED}')
+        parts.append("</joint>")
+    return "".join([*parts, "</robot>"])
 
 
-def _inertial(link: Element) -> Element:
-    given = link.find("inertial")
+def _inertial(name: str, link: Element) -> str:
+    """Return the text of what is known of a link's inertia, each number checked."""
+    given, where = link.find("inertial"), f'link "{name}"'
     mass = None if given is None else given.find("mass")
-    if given is not None and mass is not None and float(mass.get("value", "0")) > 0:
-        return given
-    inertial = Element("inertial")
-    SubElement(inertial, "mass", value="1e-9")
-    SubElement(inertial, "inertia", _NEGLIGIBLE)
-    return inertial
+    if given is None or mass is None or _checked(where, mass, "value", "0", 1) == "0":
+        return _NEGLIGIBLE
+    if float(mass.get("value", "0")) < 0:
+        raise ModelError(f'{where} has the mass "{mass.get("value")}"')
+    inertia = given.find("inertia")
+    found = Element("none") if inertia is None else inertia
+    moments = " ".join(f'{key}="{_checked(where, found, key, "0", 1)}"' for key in _MOMENTS)
+    value = mass.get("value", "")
+    origin = _origin(where, given)
+    return f'<inertial>{origin}<mass value="{value}"/><inertia {moments}/></inertial>'
+
+
+def _origin(where: str, given: Element) -> str:
+    origin = given.find("origin")
+    if origin is None:
+        return ""
+    xyz, rpy = (_checked(where, origin, key, "0 0 0", 3) for key in ("xyz", "rpy"))
+    return f'<origin xyz="{xyz}" rpy="{rpy}"/>'
+
+
+def _checked(where: str, element: Element, attribute: str, default: str, count: int) -> str:
+    """Return an attribute's text as it is, "0" for one that is zero; it must be finite numbers."""
+    text = element.get(attribute, default)
+    try:
+        numbers = [float(part) for part in text.split()]
+    except ValueError:
+        numbers = [math.nan]
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise ModelError(f'{where} has {attribute}="{text}"')
+    return text if any(numbers) or count > 1 else "0"
 
 
 def _axis(joint: Element) -> str:

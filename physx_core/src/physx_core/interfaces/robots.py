@@ -1,0 +1,30 @@
+"""What a backend says of the robots that it knows by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class RobotInfo:
+    """A robot that a world may name instead of a file, as in ``Robot("cartpole")``.
+
+    Attributes:
+        name: Name of the robot.
+        path: Its model file.
+        joints: Number of its joints' degrees of freedom; a floating base has 6 more.
+        mass: Of all its links, in kg.
+        collisions: What touches other things: ``"primitives"``, ``"meshes"``, ``"both"`` or
+            ``"none"``.
+        warning: What to know before using it; empty if there is nothing.
+        error: Why it cannot be loaded; empty if it can. The other values are then 0 and ``"none"``.
+    """
+
+    name: str
+    path: Path
+    joints: int = 0
+    mass: float = 0.0
+    collisions: str = "none"
+    warning: str = ""
+    error: str = ""

@@ -1,0 +1,25 @@
+"""World descriptions: plain, picklable data from which any backend builds its simulation."""
+
+from __future__ import annotations
+
+from physx_core.world.description import World
+from physx_core.world.ground import Ground, HeightField, Stairs
+from physx_core.world.objects import Box, Capsule, Cylinder, Mesh, Sphere, WorldObject
+from physx_core.world.robot import JointSettings, Robot
+from physx_core.world.wrench import Wrench
+
+__all__ = [
+    "Box",
+    "Capsule",
+    "Cylinder",
+    "Ground",
+    "HeightField",
+    "JointSettings",
+    "Mesh",
+    "Robot",
+    "Sphere",
+    "Stairs",
+    "World",
+    "WorldObject",
+    "Wrench",
+]

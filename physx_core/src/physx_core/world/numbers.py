@@ -1,0 +1,89 @@
+"""Checks of the numbers in a description; each error names the option."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from physx_core.errors import ConfigError
+
+
+def finite(option: str, value: Any) -> float:
+    """Return a value as a finite float.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ConfigError(f"{option} is {value!r} but must be a finite number.")
+    return number
+
+
+def positive(option: str, value: Any) -> float:
+    """Return a value as a finite float above 0.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    number = finite(option, value)
+    if not number > 0:
+        raise ConfigError(f"{option} is {value!r} but must be positive.")
+    return number
+
+
+def not_negative(option: str, value: Any) -> float:
+    """Return a value as a finite float that is not below 0.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    number = finite(option, value)
+    if number < 0:
+        raise ConfigError(f"{option} is {value!r} but cannot be negative.")
+    return number
+
+
+def vector(option: str, values: Any, length: int) -> tuple[float, ...]:
+    """Return values as a tuple of so many finite floats.
+
+    Raises:
+        ConfigError: They are none, or there are more or less of them.
+    """
+    try:
+        numbers = tuple(values)
+    except TypeError:
+        raise ConfigError(f"{option} is {values!r} but needs {length} numbers.") from None
+    if len(numbers) != length:
+        raise ConfigError(f"{option} has {len(numbers)} numbers but needs {length}.")
+    return tuple(finite(option, number) for number in numbers)
+
+
+def unit_quaternion(option: str, values: Sequence[float]) -> tuple[float, ...]:
+    """Return a quaternion x, y, z, w, scaled to length 1.
+
+    Raises:
+        ConfigError: It does not have four finite numbers, or its length is not 1 within 0.001.
+    """
+    quaternion = vector(option, values, 4)
+    length = math.sqrt(sum(part * part for part in quaternion))
+    if abs(length - 1.0) > 1e-3:
+        raise ConfigError(
+            f"{option}, a quaternion in the order x, y, z, w, has length {length:g}, not 1."
+        )
+    return tuple(part / length for part in quaternion)
+
+
+def name(kind: str, value: Any) -> str:
+    """Return a name: a text that is not empty and has no ``/``, which joins names in a state.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    if not isinstance(value, str) or not value or "/" in value:
+        raise ConfigError(f"The name of a {kind} is {value!r}; it must be a text without '/'.")
+    return value

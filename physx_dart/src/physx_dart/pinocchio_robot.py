@@ -1,0 +1,325 @@
+"""One robot or object, stepped with Pinocchio's algorithms.
+
+Pinocchio has no simulator, so the step is written here, as DART does it: semi-implicit Euler with
+implicit damping and springs; contacts, limits, servos and Coulomb friction by impulses; and a
+floating base whose position and rotation move with its velocities in the world frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio
+
+from physx_core.interfaces.backend import CONTACT, Records, Vector
+from physx_core.world import World
+from physx_dart.algorithms import MoverAlgorithms
+from physx_dart.engine import RobotEngine
+from physx_dart.limits import JointConstraints, solve
+from physx_dart.parts import Mover, Static
+from physx_dart.pinocchio_contacts import ContactFinder, Touching
+from physx_dart.pinocchio_models import frames_of, load_stepping_model
+from physx_dart.pinocchio_solver import ImpulseSolver
+from physx_dart.rotations import matrix_from_quaternion, turned_back
+
+_UNSEEN = 10
+"""Steps after which it is seen whether a limit might have acted."""
+
+
+class PinocchioRobot(RobotEngine):
+    """The state of one robot or object, and how it goes on.
+
+    Inside, the velocities of a floating base are those of `load_stepping_model`.
+    """
+
+    def __init__(
+        self,
+        mover: Mover,
+        world: World,
+        statics: Sequence[Static],
+        solver: ImpulseSolver,
+        features: Sequence[str],
+    ) -> None:
+        """Load the models.
+
+        Raises:
+            ModelError: Pinocchio cannot load the robot.
+            FeatureNotSupportedError: A collision shape is a mesh.
+        """
+        super().__init__(mover)
+        self._algorithms: MoverAlgorithms | None = None
+        self._gravity, self._period = world.gravity, world.period
+        resists, dt = self.resistance, world.period
+        implicit = resists.armature + dt * resists.damping + dt * dt * resists.stiffness
+        self._free = load_stepping_model(mover, world.gravity, armature=implicit)
+        self._free_data = self._free.createData()
+        # Constraints act on the robot without its dampers, as in DART.
+        self._model = load_stepping_model(mover, world.gravity, armature=resists.armature)
+        self._data = self._model.createData()
+        self._frames = frames_of(self._free, mover)
+        self._pushes = pinocchio.StdVec_Force()
+        self._pushes.extend(pinocchio.Force.Zero() for _ in range(self._free.njoints))
+        self._more: tuple[Any, ...] = ()  # the wrenches, while there are any
+        self._joints = JointConstraints(self.model.joints, dt)
+        self._contacts = ContactFinder(mover, statics, self._free, self._frames, features)
+        self._acted_on = bool(self._contacts) or self._joints.acts
+        self._solver = solver
+        self._rk4 = world.integrator == "rk4"
+        modes = [joint.settings.mode for joint in self.model.joints]
+        forces = np.array([mode == "force" for mode in modes], np.float64)
+        self._forces = None if forces.all() else forces
+        self._positions, self._velocities = np.zeros(self.nq), np.zeros(self.nv)
+        self._earlier, self._before = self._positions, self._velocities
+        self._safe_steps, self._bound = 0, 0.0
+        self._torques = np.zeros(self.nv)
+        self._smooth = bool(resists.damping.any() or resists.stiffness.any())
+        self._touching: Touching | None = None
+        self._impulses = np.zeros(0)
+
+    # Stepping -------------------------------------------------------------------------------
+
+    def run(self, n: int) -> None:
+        """Simulate n physics steps."""
+        if self._rk4:
+            for _ in range(n):
+                self._step_rk4()
+            return
+        while n > 0:
+            done = 0 if self._acted_on else self._run_free(n)
+            n -= done
+            if n > 0:
+                self._step()
+                self._safe_steps = 0
+                n -= 1
+
+    def _run_free(self, n: int) -> int:
+        """Simulate up to n steps while no limit can act; return how many.
+
+        Whether the joints stayed slow enough for that is seen every few steps; if they did not, the
+        last few are taken back.
+        """
+        if self._safe_steps <= 0:
+            base = self.base
+            q, v = self._positions[self.nq - self.nv + base :], self._velocities[base:]
+            self._safe_steps, self._bound = self._joints.safe(q, v)
+        steps, done = min(n, self._safe_steps), 0
+        while done < steps:
+            count = min(_UNSEEN, steps - done)
+            state = self._positions, self._velocities, self._earlier, self._before
+            if self._smooth:
+                for _ in range(count):
+                    self._step_free(1, self._resisted(self._positions, self._velocities))
+            else:
+                self._step_free(count, self._torques)
+            v = self._velocities[self.base :]
+            if not v.dot(v) < self._bound:
+                self._positions, self._velocities, self._earlier, self._before = state
+                self._safe_steps = 0
+                return done
+            done += count
+        self._safe_steps -= done
+        return done
+
+    def _step_free(self, count: int, torques: Vector) -> None:
+        """Simulate steps, at least one, in which nothing acts but torques and wrenches."""
+        model, data, dt, more = self._free, self._free_data, self._period, self._more
+        aba, integrate = pinocchio.aba, pinocchio.integrate
+        q, v = self._positions, self._velocities
+        earlier, before = q, v
+        for _ in range(count):
+            earlier, before = q, v
+            # An array of its own, in which the new velocities are made.
+            v = aba(model, data, q, v, torques, *more) if more else aba(model, data, q, v, torques)
+            v *= dt
+            v += before
+            q = integrate(model, q, dt * v)
+        self._positions, self._velocities = q, v
+        self._earlier, self._before = earlier, before
+
+    def _resisted(self, q: Vector, v: Vector) -> Vector:
+        """Return the held torques less those of dampers and of springs at the step's end."""
+        resists = self.resistance
+        torques = self._torques - resists.damping * v
+        ahead = q[self.nq - self.nv :] + self._period * v - resists.rest
+        return torques - np.where(resists.stiffness, resists.stiffness * ahead, 0.0)
+
+    def _step(self) -> None:
+        """Simulate one step in which anything may act."""
+        q, v, dt = self._positions, self._velocities, self._period
+        model, data = self._free, self._free_data
+        torques = self._resisted(q, v) if self._smooth else self._torques
+        a = pinocchio.aba(model, data, q, v, torques, *self._more)
+        self._earlier, self._before = q, v
+        self._velocities = after = self._constrained(q, v, v + dt * a)
+        self._positions = pinocchio.integrate(model, q, dt * after)
+
+    def _constrained(self, q: Vector, before: Vector, v: Vector) -> Vector:
+        """Return velocities (nv,) after the impulses of contacts, limits, servos and friction."""
+        base, dt = self.base, self._period
+        self._touching = None
+        if self._contacts:
+            self._touching = self._contacts.find(self._free_data, q, v, dt)
+        found = self._joints.impulses(q[self.nq - self.nv + base :], v[base:])
+        touching = self._touching
+        if found is None and touching is None:
+            return v
+        inverse = pinocchio.computeMinverse(self._model, self._data, q)
+        inverse = np.triu(inverse) + np.triu(inverse, 1).T
+        nothing = np.zeros(0)
+        index, change, least, most = found or (np.zeros(0, np.intp), nothing, nothing, nothing)
+        index = index + base
+        if touching is None:
+            impulses = solve(inverse[np.ix_(index, index)], change, least, most)
+            return v + inverse[:, index] @ impulses
+        rows = np.concatenate([touching.jacobian, np.eye(self.nv)[index]])
+        wanted = np.concatenate([-touching.bias(before, dt), change + v[index]])
+        spread = inverse @ rows.T
+        impulses = self._solver.solve(
+            rows @ spread, rows @ v - wanted, touching.friction, least, most
+        )
+        self._impulses = impulses[: 3 * len(touching.gaps)]
+        return v + spread @ impulses
+
+    def _step_rk4(self) -> None:
+        """Simulate one step with the classic method of fourth order."""
+        q, v, dt, model = self._positions, self._velocities, self._period, self._model
+        half = 0.5 * dt
+        a1 = self._acceleration(q, v)
+        v2 = v + half * a1
+        a2 = self._acceleration(pinocchio.integrate(model, q, half * v), v2)
+        v3 = v + half * a2
+        a3 = self._acceleration(pinocchio.integrate(model, q, half * v2), v3)
+        v4 = v + dt * a3
+        a4 = self._acceleration(pinocchio.integrate(model, q, dt * v3), v4)
+        self._earlier, self._before = q, v
+        self._positions = pinocchio.integrate(model, q, dt / 6 * (v + 2 * v2 + 2 * v3 + v4))
+        self._velocities = v + dt / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+
+    def _acceleration(self, q: Vector, v: Vector) -> Vector:
+        torques = self._torques - self.resistance.smooth(q, v)
+        return pinocchio.aba(self._model, self._data, q, v, torques, self._pushes)
+
+    def contacts(self, first: int, statics: int) -> Records:
+        """Return the contacts of the last step.
+
+        Args:
+            first: Place of the robot's first link in `Layout.names`.
+            statics: Place of the first static there.
+        """
+        touching = self._touching
+        if touching is None:
+            return np.zeros(0, CONTACT)
+        records = np.zeros(len(touching.gaps), CONTACT)
+        records["body_a"] = first + touching.links
+        records["body_b"] = statics + touching.statics
+        records["point"], records["normal"] = touching.points, touching.axes[:, 2]
+        forces = self._impulses.reshape(-1, 3) / self._period
+        records["force"] = np.einsum("kij,ki->kj", touching.axes, forces)
+        records["depth"] = np.maximum(-touching.gaps, 0.0)
+        return records
+
+    def hold(self, commands: Vector) -> None:
+        """Hold commands, shape (joints,), that are within their limits."""
+        self._joints.targets = commands
+        torques = commands if self._forces is None else commands * self._forces
+        if self.base:
+            self._torques[self.base :] = torques
+        else:
+            self._torques = torques
+
+    def can_move(self, link: int) -> bool:
+        """Return whether a link, by its place in the model, can move at all."""
+        return bool(self._free.frames[self._frames[link]].parentJoint > 0)
+
+    def push(self, link: int, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
+        """Add a wrench for the next steps until `release`."""
+        frame = self._free.frames[self._frames[link]]
+        joint, place = frame.parentJoint, frame.placement
+        if not local:
+            pinocchio.forwardKinematics(self._model, self._data, self._positions)
+            turn = (self._data.oMi[joint].rotation @ place.rotation).T
+            force, torque = turn @ force, turn @ torque
+        wrench = pinocchio.Force(force, torque + np.cross(point, force))
+        self._pushes[joint] = self._pushes[joint] + place.act(wrench)
+        self._more = (self._pushes,)
+
+    def release(self) -> None:
+        """End all wrenches."""
+        if self._more:
+            for joint in range(self._free.njoints):
+                self._pushes[joint] = pinocchio.Force.Zero()
+            self._more = ()
+
+    # State ----------------------------------------------------------------------------------
+
+    def positions(self) -> Vector:
+        """Return the present positions, shape (nq,), in a vector of its own."""
+        q = self._positions.copy()
+        if self.base and q[6] < 0:
+            q[3:7] *= -1
+        return q
+
+    def velocities(self) -> Vector:
+        """Return the present velocities, shape (nv,), in a vector of its own."""
+        v = self._velocities.copy()
+        if self.base:
+            v[:3] = turned_back(self._positions[3:7].tolist(), *v[:3].tolist())
+        return v
+
+    def accelerations(self) -> Vector:
+        """Return the accelerations of the last step, shape (nv,)."""
+        a = (self._velocities - self._before) / self._period
+        if self.base:
+            v = self.velocities()
+            before, now = (matrix_from_quaternion(q[3:7]) for q in (self._earlier, self._positions))
+            turning = now @ self._velocities[3:6] - before @ self._before[3:6]
+            a[:3] = a[:3] @ now - np.cross(v[3:6], v[:3])
+            a[3:6] = turning @ now / self._period
+        return a
+
+    def write(self, positions: Vector, velocities: Vector) -> None:
+        """Set the state."""
+        self._positions, self._velocities = positions.copy(), velocities.copy()
+        if self.base:
+            rotation = matrix_from_quaternion(positions[3:7])
+            self._velocities[:3] = rotation @ velocities[:3]
+        self._earlier, self._before = self._positions, self._velocities
+        self._touching, self._safe_steps = None, 0
+
+    def native(self) -> tuple[Vector, Vector]:
+        """Return the state as it is stepped, copied."""
+        return self._positions.copy(), self._velocities.copy()
+
+    def set_native(self, positions: Vector, velocities: Vector) -> None:
+        """Set the state to what `native` returned."""
+        self._positions, self._velocities = positions.copy(), velocities.copy()
+        self._earlier, self._before = self._positions, self._velocities
+        self._touching, self._safe_steps = None, 0
+
+    def speed(self) -> float:
+        """Return the length of the velocities; NaN or inf where the state is broken."""
+        speed = math.hypot(*self._velocities.tolist())
+        return speed if math.isfinite(sum(self._positions.tolist())) else math.nan
+
+    # Any state ------------------------------------------------------------------------------
+
+    @property
+    def _any(self) -> MoverAlgorithms:
+        if self._algorithms is None:
+            self._algorithms = MoverAlgorithms(self.mover, self._gravity)
+        return self._algorithms
+
+    def poses(self, positions: Vector) -> Vector:
+        """Return the poses of all links in positions, shape (links, 7)."""
+        return self._any.poses(positions)
+
+    def forward(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
+        """Return the accelerations that torques cause, resistance included."""
+        return self._any.forward(positions, velocities, torques)
+
+    def inverse(self, positions: Vector, velocities: Vector, accelerations: Vector) -> Vector:
+        """Return the torques that cause accelerations, resistance included."""
+        return self._any.inverse(positions, velocities, accelerations)

@@ -1,0 +1,45 @@
+"""What resists the motion of a robot's joints: damping, Coulomb friction and springs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physx_core.interfaces.backend import Vector
+from physx_dart.parts import Mover
+
+
+class Resistance:
+    """Damping, friction, springs and rotors of a robot, each of shape (nv,); 0 for its base.
+
+    Attributes:
+        damping: In N m s/rad or N s/m.
+        friction: In N m or N.
+        stiffness: Of the springs, in N m/rad or N/m.
+        rest: Where the springs are slack, in rad or m.
+        armature: Inertia of the rotors, in kg m² or kg.
+    """
+
+    def __init__(self, mover: Mover) -> None:
+        joints = mover.model.joints
+        nothing = [0.0] * (0 if mover.fixed_base else 6)
+        settings = [joint.settings for joint in joints]
+        self.damping = np.array([*nothing, *(joint.damping for joint in joints)])
+        self.friction = np.array([*nothing, *(joint.friction for joint in joints)])
+        self.stiffness = np.array([*nothing, *(each.stiffness for each in settings)])
+        self.rest = np.array([*nothing, *(each.rest for each in settings)])
+        self.armature = np.array([*nothing, *(each.armature for each in settings)])
+        self._smooth = bool(self.damping.any() or self.stiffness.any())
+        self._any = self._smooth or bool(self.friction.any())
+
+    def torques(self, positions: Vector, velocities: Vector) -> Vector | float:
+        """Return the torques against a motion, shape (..., nv), or 0."""
+        if not self._any:
+            return 0.0
+        return self.smooth(positions, velocities) + self.friction * np.sign(velocities)
+
+    def smooth(self, positions: Vector, velocities: Vector) -> Vector | float:
+        """Return the torques of damping and springs alone, shape (..., nv), or 0."""
+        if not self._smooth:
+            return 0.0
+        stretch = positions[..., positions.shape[-1] - velocities.shape[-1] :] - self.rest
+        return self.damping * velocities + np.where(self.stiffness, self.stiffness * stretch, 0.0)

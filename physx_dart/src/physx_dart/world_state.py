@@ -1,0 +1,233 @@
+"""Robots and objects as one state: reading it, and the dynamics of any state."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from physx_core.errors import SimulationError, listed, nearest
+from physx_core.interfaces.backend import Simulation, Vector
+from physx_dart.algorithms import Algorithms
+from physx_dart.batches import Batches
+from physx_dart.checks import joined, rows, vector
+from physx_dart.engine import RobotEngine
+from physx_dart.parts import Parts, layout_of
+
+
+class WorldState(Simulation):
+    """The state of a world, each robot and object in a `RobotEngine`."""
+
+    def __init__(self, parts: Parts, robots: Sequence[RobotEngine]) -> None:
+        """Keep the robots and put them at rest in their neutral configuration.
+
+        Args:
+            parts: All of the world.
+            robots: Of each mover of the world.
+        """
+        self.parts = parts
+        self.period = parts.world.period
+        self.layout = layout_of(parts)
+        self._robots = tuple(robots)
+        self._only = robots[0] if len(robots) == 1 else None
+        self._joint_count = len(self.layout.joints)
+        self._closed = False
+        places = self.layout.parts.values()
+        self._q = [place.positions for place in places]
+        self._v = [place.velocities for place in places]
+        self._joints = [place.joints for place in places]
+        self._bodies = {
+            name: (robot, link)
+            for robot, place in zip(robots, places, strict=True)
+            for link, name in enumerate(self.layout.bodies[place.bodies])
+        }
+        self._places = {name: i for i, name in enumerate(self.layout.names)}
+        self._static_poses = np.array(
+            [[*static.position, *static.orientation] for static in parts.statics], np.float64
+        ).reshape(-1, 7)
+        self._made_algorithms: Algorithms | None = None
+        self._made_batches: Batches | None = None
+        for robot in robots:
+            robot.write(robot.neutral(), np.zeros(robot.nv))
+
+    def positions(self, out: Vector | None = None) -> Vector:
+        """Return the positions, shape (nq,), written into `out` if it is given."""
+        if self._closed:
+            self._check_open()
+        if out is None and self._only is not None:
+            return self._only.positions()
+        return joined([robot.positions() for robot in self._robots], out)
+
+    def velocities(self, out: Vector | None = None) -> Vector:
+        """Return the velocities, shape (nv,), written into `out` if it is given."""
+        if self._closed:
+            self._check_open()
+        if out is None and self._only is not None:
+            return self._only.velocities()
+        return joined([robot.velocities() for robot in self._robots], out)
+
+    # Bodies and dynamics of any state -------------------------------------------------------
+
+    def body_poses(
+        self, names: Sequence[str] | None = None, positions: Vector | None = None
+    ) -> Vector:
+        """Return the poses of bodies, shape (names, 7): x, y, z and quaternion x, y, z, w."""
+        self._check_open()
+        q = self.positions() if positions is None else self._checked_positions(positions)
+        rows = joined([r.poses(q[part]) for r, part in zip(self._robots, self._q, strict=True)])
+        if names is None:
+            return rows
+        places = [self._place(name) for name in _names(names)]
+        return np.concatenate([rows, self._static_poses])[places]
+
+    def body_velocities(
+        self,
+        names: Sequence[str] | None = None,
+        positions: Vector | None = None,
+        velocities: Vector | None = None,
+    ) -> Vector:
+        """Return the velocities of bodies' origins, shape (names, 6): linear, angular."""
+        self._check_open()
+        q = self.positions() if positions is None else self._checked_positions(positions)
+        v = self.velocities()
+        if velocities is not None:
+            v = vector("velocities", velocities, self.layout.nv)
+        rows = self._algorithms.body_velocities(q, v)
+        if names is None:
+            return rows
+        places = [self._place(name) for name in _names(names)]
+        return np.concatenate([rows, np.zeros((len(self.layout.statics), 6))])[places]
+
+    def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
+        """Return the accelerations, shape (nv,), that torques (nv,) cause in a state."""
+        q, v, tau = self._dynamic_state(positions, velocities, "torques", torques)
+        return joined([r.forward(q[a], v[b], tau[b]) for r, a, b in self._slices()])
+
+    def inverse_dynamics(
+        self, positions: Vector, velocities: Vector, accelerations: Vector
+    ) -> Vector:
+        """Return the torques, shape (nv,), that cause accelerations (nv,) in a state."""
+        q, v, x = self._dynamic_state(positions, velocities, "accelerations", accelerations)
+        return joined([r.inverse(q[a], v[b], x[b]) for r, a, b in self._slices()])
+
+    def mass_matrix(self, positions: Vector) -> Vector:
+        """Return the mass matrix, shape (nv, nv)."""
+        self._check_open()
+        return self._algorithms.mass_matrix(self._checked_positions(positions))
+
+    def jacobian(
+        self, body: str, positions: Vector, point: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> Vector:
+        """Return the Jacobian, shape (6, nv), of a point of a link or object."""
+        self._check_open()
+        place = self._place(body)
+        at = vector("point", point, 3)
+        q = self._checked_positions(positions)
+        if place >= len(self.layout.bodies):
+            return np.zeros((6, self.layout.nv))
+        return self._algorithms.jacobian(place, q, at)
+
+    def forward_dynamics_derivatives(
+        self, positions: Vector, velocities: Vector, torques: Vector
+    ) -> tuple[Vector, Vector, Vector]:
+        """Return the derivatives of `forward_dynamics` by positions, velocities and torques."""
+        q, v, tau = self._dynamic_state(positions, velocities, "torques", torques)
+        return self._algorithms.forward_dynamics_derivatives(q, v, tau)
+
+    def forward_dynamics_batch(
+        self, positions: Vector, velocities: Vector, torques: Vector
+    ) -> Vector:
+        """Return `forward_dynamics` of many states, shape (n, nv), by Pinocchio's algorithms."""
+        return self._batches.forward(*self._many_states(positions, velocities, torques))
+
+    def forward_dynamics_derivatives_batch(
+        self, positions: Vector, velocities: Vector, torques: Vector
+    ) -> tuple[Vector, Vector]:
+        """Return accelerations of many states (n, nv), and their derivatives (3, n, nv, nv)."""
+        return self._batches.derivatives(*self._many_states(positions, velocities, torques))
+
+    @property
+    def _batches(self) -> Batches:
+        if self._made_batches is None:
+            self._made_batches = Batches(self._algorithms)
+        return self._made_batches
+
+    @property
+    def _algorithms(self) -> Algorithms:
+        if self._made_algorithms is None:
+            self._made_algorithms = Algorithms(self.parts)
+        return self._made_algorithms
+
+    # Checks ---------------------------------------------------------------------------------
+
+    def _slices(self) -> list[tuple[RobotEngine, slice, slice]]:
+        return list(zip(self._robots, self._q, self._v, strict=True))
+
+    def _dynamic_state(
+        self, positions: Any, velocities: Any, name: str, third: Any
+    ) -> tuple[Vector, Vector, Vector]:
+        self._check_open()
+        nv = self.layout.nv
+        q = self._checked_positions(positions)
+        return q, vector("velocities", velocities, nv), vector(name, third, nv)
+
+    def _place(self, name: Any) -> int:
+        place = self._places.get(name) if isinstance(name, str) else None
+        if place is None:
+            raise SimulationError(
+                f'There is no link "{name}".{nearest(str(name), self._places)} '
+                f"Links: {listed(self._places)}."
+            )
+        return place
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise SimulationError("The simulation is closed; build a new one.")
+
+    def _checked_positions(self, positions: Any) -> Vector:
+        q = vector("positions", positions, self.layout.nq)
+        for place in self.layout.parts.values():
+            if place.floating:
+                base = slice(place.positions.start + 3, place.positions.start + 7)
+                length = math.hypot(*q[base].tolist())
+                if not abs(length - 1.0) <= 1e-3:
+                    raise SimulationError(
+                        f'The quaternion of "{place.name}" (positions {base.start} to '
+                        f"{base.stop - 1}, in the order x, y, z, w) has length {length:g}, not 1."
+                    )
+                q[base] /= length
+        return q
+
+    def _many_states(
+        self, positions: Any, velocities: Any, torques: Any
+    ) -> tuple[Vector, Vector, Vector]:
+        self._check_open()
+        q, nv = rows("positions", positions, self.layout.nq), self.layout.nv
+        v, tau = rows("velocities", velocities, nv), rows("torques", torques, nv)
+        if not len(q) == len(v) == len(tau):
+            raise SimulationError(
+                f"There are {len(q)} positions, {len(v)} velocities and {len(tau)} torques; each "
+                "state needs one row of each."
+            )
+        for place in self.layout.parts.values():
+            if place.floating:
+                quaternions = q[:, place.positions.start + 3 : place.positions.start + 7]
+                lengths = np.sqrt((quaternions**2).sum(axis=1, keepdims=True))
+                if not (np.abs(lengths - 1.0) <= 1e-3).all():
+                    raise SimulationError(
+                        f'A quaternion of "{place.name}" (x, y, z, w) has length '
+                        f"{lengths[np.argmax(np.abs(lengths - 1.0))].item():g}, not 1."
+                    )
+                quaternions /= lengths
+        return q, v, tau
+
+
+def _names(names: Any) -> list[Any]:
+    if isinstance(names, str):
+        raise SimulationError(f'names is the text "{names}" but must be a list of names.')
+    try:
+        return list(names)
+    except TypeError:
+        raise SimulationError(f"names is {names!r} but must be a list of names.") from None
