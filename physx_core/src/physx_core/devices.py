@@ -1,0 +1,84 @@
+"""What motors and sensors have in common: their periods, and the names that they stand on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from physx_core.errors import ComponentNotFoundError, ConfigError, SimulationError
+from physx_core.interfaces.backend import Vector
+
+
+def steps_of(option: str, period: float | None, physics: float) -> int:
+    """Return how many physics steps a period has; None: one.
+
+    Args:
+        option: What to call the period in an error.
+        period: In s.
+        physics: The physics' period, in s.
+
+    Raises:
+        ConfigError: It is no multiple of the physics' period.
+    """
+    if period is None:
+        return 1
+    steps = round(period / physics)
+    if steps < 1 or abs(steps * physics - period) > 1e-9 * period:
+        raise ConfigError(
+            f"{option} is {period:g} s but must be a multiple of the physics' period, "
+            f"{physics:g} s."
+        )
+    return steps
+
+
+def places_of(kind: str, names: Iterable[str], known: Mapping[str, int] | Sequence[str]) -> Any:
+    """Return the places of joints or bodies as an array.
+
+    Args:
+        kind: ``"joint"`` or ``"body"``.
+        names: Names to look up.
+        known: All there are: places by name, or names in order.
+
+    Raises:
+        ComponentNotFoundError: One is not there.
+    """
+    places = known if isinstance(known, Mapping) else {name: i for i, name in enumerate(known)}
+    found = []
+    for name in names:
+        if name not in places:
+            raise ComponentNotFoundError(kind, str(name), "The simulation", places)
+        found.append(places[name])
+    return np.array(found, np.intp)
+
+
+def finite_vector(name: str, given: ArrayLike, length: int) -> Vector:
+    """Return finite numbers as a new vector of a length.
+
+    Raises:
+        SimulationError: They are none.
+    """
+    try:
+        numbers = np.array(given, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise SimulationError(f"{name} are no numbers: {error}.") from error
+    if numbers.shape != (length,):
+        raise SimulationError(f"{name} have the shape {numbers.shape} but need ({length},).")
+    if not np.isfinite(numbers).all():
+        raise SimulationError(f"{name} must be finite numbers, not {numbers}.")
+    return numbers
+
+
+def check_unique(kind: str, names: Sequence[str]) -> None:
+    """Check that names differ.
+
+    Raises:
+        ConfigError: Two are the same, or there are none.
+    """
+    if not names:
+        raise ConfigError(f"There is no {kind}.")
+    for name in names:
+        if names.count(name) > 1:
+            raise ConfigError(f'There are {names.count(name)} of {kind} "{name}".')
