@@ -14,13 +14,16 @@ from physx_torch import FC, TorchNetwork, TorchOptimization, TorchTransformation
 SHAPES = {"input": Field("input", (2,)), "ground_truth": Field("ground_truth", (1,))}
 
 
-def made(layers=(2, 8, 1), optimizer="Adam", options=None, **kwargs):
+def made(layers=(2, 8, 1), optimizer="Adam", options=None, scheduler=None, **kwargs):
     network = FC(list(layers))
     network.bind(SHAPES)
     network.set_train()
     optimization = TorchOptimization(**(options or {}))
     optimization.set_loss("MSELoss")
     optimization.set_optimizer(optimizer, network, **kwargs)
+    if scheduler is not None:
+        name, arguments = scheduler
+        optimization.set_scheduler(name, **arguments)
     return network, optimization
 
 
@@ -181,68 +184,64 @@ def test_calls_out_of_order(tmp_path):
 # Scheduler --------------------------------------------------------------------------------------
 
 
-def test_scheduler_from_the_options():
-    options = {"scheduler": "CosineAnnealingLR", "scheduler_kwargs": {"T_max": 10}}
-    network, optimization = made(options=options, lr=1.0)
+def test_scheduler_changes_the_rate_after_each_epoch():
+    network, optimization = made(scheduler=("CosineAnnealingLR", {"T_max": 10}), lr=1.0)
     data = network.numpy_to_tensor(regression(4))
     rates = []
     for _ in range(10):
         learn(network, optimization, data, 2)
-        rates.append(rate(optimization))
-        optimization.epoch_end()
+        rates.append(optimization.learning_rate())
+        optimization.epoch_end(1.0)
     expected = [(1 + np.cos(np.pi * epoch / 10)) / 2 for epoch in range(10)]
     np.testing.assert_allclose(rates, expected, atol=1e-12)
 
 
 def test_no_scheduler_keeps_the_rate():
     _, optimization = made(lr=0.125)
-    optimization.epoch_end()
+    optimization.epoch_end(1.0)
     assert rate(optimization) == 0.125
+    assert TorchOptimization().learning_rate() is None
 
 
-def test_plateau_looks_at_the_mean_training_loss():
-    network, optimization = made(optimizer="SGD", lr=1e-12)
-    optimization.set_scheduler("ReduceLROnPlateau", patience=0, factor=0.5, eps=0.0)
-    data = network.numpy_to_tensor(regression(4))
-    learn(network, optimization, data, 3)
-    optimization.epoch_end()
-    assert rate(optimization) == 1e-12
-    learn(network, optimization, data, 3)
-    optimization.epoch_end()  # no better than before
-    assert rate(optimization) == 5e-13
-    optimization.epoch_end()  # an epoch without steps changes nothing
-    assert rate(optimization) == 5e-13
+def test_plateau_looks_at_the_loss_of_the_epoch():
+    plateau = ("ReduceLROnPlateau", {"patience": 0, "factor": 0.5})
+    _, optimization = made(scheduler=plateau, lr=1.0)
+    rates = []
+    for loss in (3.0, 2.0, 2.5, 1.0, 1.0):
+        optimization.epoch_end(loss)
+        rates.append(rate(optimization))
+    assert rates == [1.0, 1.0, 0.5, 0.5, 0.25]
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("scheduler", "told"),
     [
-        ({"scheduler": "CosinAnnealingLR"}, 'Did you mean "CosineAnnealingLR"'),
-        ({"scheduler": "CosineAnnealingLR"}, "T_max"),
-        ({"scheduler": "StepLR", "scheduler_kwargs": {"steps": 3}}, "step_size"),
-        ({"scheduler": dict}, "refuses its arguments"),
-        ({"scheduler": id}, "not a scheduler"),
-        ({"scheduler_kwargs": {"T_max": 3}}, "without"),
+        (("CosinAnnealingLR", {}), 'Did you mean "CosineAnnealingLR"'),
+        (("CosineAnnealingLR", {}), "T_max"),
+        (("StepLR", {"steps": 3}), "step_size"),
+        ((dict, {}), "refuses its arguments"),
+        ((id, {}), "not a scheduler"),
     ],
 )
-def test_wrong_scheduler(options, told):
+def test_wrong_scheduler(scheduler, told):
     with pytest.raises(ConfigError, match=told):
-        made(options=options)
+        made(scheduler=scheduler)
 
 
 # State ------------------------------------------------------------------------------------------
 
 PLANS = {
-    "Adam": ("Adam", {}),
-    "momentum and cosine": (
-        "SGD",
-        {"scheduler": "CosineAnnealingLR", "scheduler_kwargs": {"T_max": 9}},
+    "Adam": ("Adam", None, {}),
+    "momentum and cosine": ("SGD", ("CosineAnnealingLR", {"T_max": 9}), {}),
+    "milestones": ("AdamW", ("MultiStepLR", {"milestones": [1, 3]}), {}),
+    "plateau": ("Adam", ("ReduceLROnPlateau", {"patience": 0}), {}),
+    "accumulated and clipped": (
+        "Adam",
+        ("StepLR", {"step_size": 2}),
+        {"accumulate": 2, "gradient_clip": 0.1},
     ),
-    "milestones": (
-        "AdamW",
-        {"scheduler": "MultiStepLR", "scheduler_kwargs": {"milestones": [1, 3]}},
-    ),
-    "plateau": ("Adam", {"scheduler": "ReduceLROnPlateau", "scheduler_kwargs": {"patience": 0}}),
+    "bfloat16": ("Adam", None, {"mixed_precision": "bfloat16"}),
+    "float16": ("Adam", None, {"mixed_precision": "float16", "gradient_clip": 1.0}),
 }
 
 
@@ -255,7 +254,7 @@ class Forgetful(FC):
 
 @pytest.mark.parametrize("plan", PLANS)
 def test_a_resumed_training_is_the_uninterrupted_one(tmp_path, plan):
-    optimizer, options = PLANS[plan]
+    optimizer, scheduler, options = PLANS[plan]
     arguments = {"lr": 1e-4, "momentum": 0.9} if optimizer == "SGD" else {"lr": 1e-2}
 
     def start():
@@ -263,24 +262,26 @@ def test_a_resumed_training_is_the_uninterrupted_one(tmp_path, plan):
         optimization = TorchOptimization(**options)
         optimization.set_loss("MSELoss")
         optimization.set_optimizer(optimizer, network, **arguments)
+        if scheduler is not None:
+            optimization.set_scheduler(scheduler[0], **scheduler[1])
         return network, optimization
 
     def epochs(network, optimization, number):
         data = network.numpy_to_tensor(regression(8))
         for _ in range(number):
-            learn(network, optimization, data, 3)
-            optimization.epoch_end()
+            losses = learn(network, optimization, data, 3)
+            optimization.epoch_end(losses[-1])
 
     first, optimization = start()
-    epochs(first, optimization, 2)
+    epochs(first, optimization, 3)
     first.save_parameters(tmp_path / "p")
     optimization.save_state(tmp_path / TorchOptimization.state_file)
-    epochs(first, optimization, 3)
+    epochs(first, optimization, 2)
 
     second, resumed = start()
     second.load_parameters(tmp_path / "p")
     resumed.load_state(tmp_path / TorchOptimization.state_file)
-    epochs(second, resumed, 3)
+    epochs(second, resumed, 2)
     assert rate(resumed) == rate(optimization)
     for one, other in zip(first.parameters(), second.parameters(), strict=True):
         assert torch.equal(one, other)
@@ -291,8 +292,7 @@ def test_state_of_another_optimizer_or_network(tmp_path):
     learn(network, optimization, network.numpy_to_tensor(regression(4)), 1)
     optimization.save_state(tmp_path / "s")
     with pytest.raises(CheckpointError, match="of Adam, not of SGD and StepLR"):
-        options = {"scheduler": "StepLR", "scheduler_kwargs": {"step_size": 1}}
-        made(optimizer="SGD", options=options)[1].load_state(tmp_path / "s")
+        made(optimizer="SGD", scheduler=("StepLR", {"step_size": 1}))[1].load_state(tmp_path / "s")
     with pytest.raises(CheckpointError, match="another network"):
         made([2, 8, 8, 1])[1].load_state(tmp_path / "s")
     network.save_parameters(tmp_path / "p")

@@ -11,30 +11,45 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from physx_torch.data import StoredDataset
+    from physx_torch.forward_dynamics import ForwardDynamics
     from physx_torch.module_network import ModuleNetwork
     from physx_torch.network import TorchNetwork
+    from physx_torch.networks.encoder_decoder import EncoderDecoder
     from physx_torch.networks.fc import FC
+    from physx_torch.networks.unet import UNet
+    from physx_torch.networks.unet_transformation import UNetTransformation
     from physx_torch.optimization import TorchOptimization
+    from physx_torch.tensorboard import TensorBoard
     from physx_torch.transformation import TorchTransformation
 
 __version__ = "0.1.0"
 
 _HOMES = {
+    "EncoderDecoder": "networks.encoder_decoder",
     "FC": "networks.fc",
+    "ForwardDynamics": "forward_dynamics",
     "ModuleNetwork": "module_network",
     "StoredDataset": "data",
+    "TensorBoard": "tensorboard",
     "TorchNetwork": "network",
     "TorchOptimization": "optimization",
     "TorchTransformation": "transformation",
+    "UNet": "networks.unet",
+    "UNetTransformation": "networks.unet_transformation",
 }
 
 __all__ = [
     "FC",
+    "EncoderDecoder",
+    "ForwardDynamics",
     "ModuleNetwork",
     "StoredDataset",
+    "TensorBoard",
     "TorchNetwork",
     "TorchOptimization",
     "TorchTransformation",
+    "UNet",
+    "UNetTransformation",
 ]
 
 

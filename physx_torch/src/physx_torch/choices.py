@@ -63,12 +63,14 @@ def make(what: str, factory: Callable[..., Any], *args: Any, **kwargs: Any) -> A
     except (TypeError, ValueError) as error:
         name = getattr(factory, "__name__", repr(factory))
         raise ConfigError(
-            f"The {what} {name} refuses its arguments: {error}. It takes: {_taken(factory)}."
+            f"The {what} {name} refuses its arguments: {error}. "
+            f"It takes: {', '.join(parameters_of(factory)) or 'what its documentation says'}."
         ) from error
 
 
-def _taken(factory: Callable[..., Any]) -> str:
+def parameters_of(factory: Callable[..., Any]) -> list[str]:
+    """Return the names of a callable's parameters; none where it does not tell them."""
     try:
-        return ", ".join(inspect.signature(factory).parameters) or "none"
-    except ValueError:  # some callables written in C have no signature
-        return "what its documentation says"
+        return list(inspect.signature(factory).parameters)
+    except (TypeError, ValueError):  # some callables written in C have no signature
+        return []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import torch
 
 from physx_core.errors import ConfigError
@@ -20,16 +22,18 @@ def find_device(name: str) -> torch.device:
 
     Args:
         name: ``"cpu"``, ``"cuda"``, ``"cuda:<index>"``, ``"mps"`` or ``"auto"``: the first CUDA
-            device if there is one, otherwise the processor.
+            device if there is one, otherwise the processor. Where torchrun started several
+            processes, ``"cuda"`` and ``"auto"`` are a device for each.
 
     Raises:
         ConfigError: The device does not exist on this machine.
     """
     existing = existing_devices()
+    own = int(os.environ.get("LOCAL_RANK", "0")) % max(1, torch.cuda.device_count())
     if name == "auto":
-        name = "cuda:0" if "cuda:0" in existing else "cpu"
+        name = f"cuda:{own}" if "cuda:0" in existing else "cpu"
     elif name == "cuda":
-        name = "cuda:0"
+        name = f"cuda:{own}"
     if name not in existing:
         raise ConfigError(
             f'There is no device "{name}" on this machine. Devices: {", ".join(existing)}, '

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
-from physx_core import Network
+from physx_core import Field, Network, Transformation
 from physx_core.errors import (
     ConfigError,
     FieldsMismatchError,
     MissingFieldError,
     UnknownOptionError,
+    UsageError,
     listed,
 )
 from physx_core.fields import Array, Batch
 from physx_core.interfaces.environment import options_of
+from physx_core.interfaces.group import Group
 from physx_core.interfaces.network import Tensors
+from physx_torch import parallel
 from physx_torch.devices import find_device
 from physx_torch.parameters import check_match, read_tensors, write_tensors
 
@@ -46,6 +49,7 @@ class TorchNetwork(torch.nn.Module, Network):
     parameters_file: ClassVar[str] = "parameters.safetensors"
     default_optimization: ClassVar[str] = "torch/default"
     default_transformation: ClassVar[str] = "torch/default"
+    export_forms: ClassVar[Sequence[str]] = ("onnx", "torchscript", "pt2")
 
     def __init__(
         self,
@@ -83,11 +87,21 @@ class TorchNetwork(torch.nn.Module, Network):
             )
         self.device = torch.device("cpu")
         self.data_type = torch.float32
+        self._training_forward: Callable[..., Any] | None = None
 
     @classmethod
     def set_seed(cls, seed: int) -> None:
         """Seed torch's random numbers, those of every device."""
         torch.manual_seed(seed)
+
+    @classmethod
+    def join_group(cls, device: str) -> Group:
+        """Join the processes that torchrun started to train this network together.
+
+        Raises:
+            ConfigError: The device does not exist, or the processes do not find each other.
+        """
+        return parallel.join(device)
 
     def predict(self, data: Tensors) -> Tensors:
         """Return ``{field: tensor}`` for `pred_fields` from the `net_fields` in `data`.
@@ -108,6 +122,30 @@ class TorchNetwork(torch.nn.Module, Network):
             return self._by_field(self(*inputs))
         with torch.no_grad():
             return self._by_field(self(*inputs))
+
+    def forward(self, *inputs: torch.Tensor) -> Any:
+        """Return the tensors of `pred_fields`; what a subclass implements.
+
+        Args:
+            inputs: The tensors of `net_fields` in that order, of shape (samples, *field shape).
+
+        Raises:
+            UsageError: The subclass does not implement it.
+        """
+        raise UsageError(f"{type(self).__name__} does not implement forward().")
+
+    def __call__(self, *inputs: Any) -> Any:
+        """Return what ``forward`` makes of the tensors of `net_fields`."""
+        if self.training and self._training_forward is not None:
+            return self._training_forward(*inputs)
+        return super().__call__(*inputs)
+
+    def set_training_forward(self, forward: Callable[..., Any] | None) -> None:
+        """Choose what takes the place of ``forward`` while the network is trained; None: nothing.
+
+        The optimization does so, to compile it or to compute in mixed precision.
+        """
+        self._training_forward = forward
 
     def _by_field(self, output: Any) -> Tensors:
         names = self.pred_fields
@@ -131,7 +169,8 @@ class TorchNetwork(torch.nn.Module, Network):
 
     def set_eval(self) -> None:
         """Get ready to predict: no gradients are recorded."""
-        self.eval()
+        if self.training:  # to look at every layer takes as long as a small network's prediction
+            self.eval()
 
     def set_device(self, device: str) -> None:
         """Move to ``"cpu"``, ``"cuda"``, ``"cuda:<index>"``, ``"mps"`` or ``"auto"``.
@@ -156,15 +195,34 @@ class TorchNetwork(torch.nn.Module, Network):
             raise ConfigError(f'data_type is "{data_type}" but must be {listed(DATA_TYPES)}.')
         _check_type(DATA_TYPES[data_type], self.device)
         self.data_type = DATA_TYPES[data_type]
-        self.to(self.data_type)
+        self._apply(lambda tensor: _in_precision(tensor, self.data_type))
 
     def get_parameters(self) -> dict[str, torch.Tensor]:
         """Return the parameters that are trained by name; they are the network's own."""
         return dict(self.named_parameters())
 
+    def get_gradients(self) -> dict[str, torch.Tensor]:
+        """Return the gradients of the last step by parameter; they are the network's own."""
+        named = self.named_parameters()
+        return {name: p.grad for name, p in named if p.grad is not None}
+
+    def set_gradients(self, gradients: Mapping[str, torch.Tensor]) -> None:
+        """Take over gradients that `get_gradients` returned; parameters without one get none.
+
+        Raises:
+            ValueError: A parameter is missing or has another shape.
+        """
+        own = self.get_parameters()
+        for name, gradient in gradients.items():
+            if name not in own or own[name].shape != gradient.shape:
+                raise ValueError(f"it has no parameter {name} of shape {tuple(gradient.shape)}")
+        for name, parameter in own.items():
+            found = gradients.get(name)
+            parameter.grad = None if found is None else found.to(parameter.device, parameter.dtype)
+
     def nb_parameters(self) -> int:
-        """Return how many numbers the parameters hold."""
-        return sum(parameter.numel() for parameter in self.parameters())
+        """Return how many real numbers the parameters hold; a complex one is two of them."""
+        return sum(p.numel() * (2 if p.is_complex() else 1) for p in self.parameters())
 
     def save_parameters(self, path: Path) -> None:
         """Write parameters and buffers to a safetensors file.
@@ -172,7 +230,7 @@ class TorchNetwork(torch.nn.Module, Network):
         Raises:
             CheckpointError: The file cannot be written, or the state holds more than tensors.
         """
-        write_tensors(path, self.state_dict())
+        write_tensors(path, self._state())
 
     def load_parameters(self, path: Path) -> None:
         """Read parameters and buffers that `save_parameters` wrote, in any floating type.
@@ -182,8 +240,36 @@ class TorchNetwork(torch.nn.Module, Network):
                 is unchanged then.
         """
         tensors, _ = read_tensors(path)
-        check_match(path, type(self).__name__, tensors, self.state_dict())
+        check_match(path, type(self).__name__, tensors, self._state())
         self.load_state_dict(tensors)
+
+    def _state(self) -> dict[str, Any]:
+        """Return parameters, buffers and extra states, without what a module notes about itself."""
+        return {
+            name: value
+            for name, value in self.state_dict().items()
+            if isinstance(value, torch.Tensor) or name.endswith("_extra_state")
+        }
+
+    def export(
+        self, path: Path, form: str, transformation: Transformation, fields: Mapping[str, Field]
+    ) -> None:
+        """Write network and transformation as ``"onnx"``, ``"torchscript"`` or ``"pt2"``.
+
+        The first axis of inputs and outputs is that of the samples, of any length. Floating inputs
+        have the network's data type. ONNX names inputs and outputs by the fields; the other two
+        take and return a dictionary of tensors by field. A field that is read and predicted is
+        given as ``predicted_<name>``.
+
+        Raises:
+            ConfigError: There is no such form, or the network cannot be written in it.
+            MissingLibraryError: ONNX needs the extra ``physx-torch[export]``.
+        """
+        if form not in self.export_forms:
+            super().export(path, form, transformation, fields)
+        from physx_torch import export
+
+        export.write(path, form, self, transformation, fields)
 
     def numpy_to_tensor(self, batch: Batch) -> Tensors:
         """Return arrays as tensors on the network's device.
@@ -209,8 +295,9 @@ class TorchNetwork(torch.nn.Module, Network):
 
 def _plain(array: Array) -> Array:
     # torch takes neither read-only memory, nor foreign byte orders, nor negative strides.
-    regular = array.flags.writeable and array.dtype.isnative
-    if regular and (array.flags.c_contiguous or min(array.strides) >= 0):
+    flags = array.flags
+    regular = flags.writeable and array.dtype.isnative
+    if regular and (flags.c_contiguous or min(array.strides) >= 0):
         return array
     return np.array(array, dtype=array.dtype.newbyteorder("="), order="C")
 
@@ -225,6 +312,13 @@ def _names(
             f"{option} is {chosen!r} but must be a field's name or several that differ."
         )
     return names
+
+
+def _in_precision(tensor: torch.Tensor, data_type: torch.dtype) -> torch.Tensor:
+    """Return floating and complex tensors in a precision, others as they are."""
+    if tensor.is_complex():
+        return tensor.to(data_type.to_complex())
+    return tensor.to(data_type) if tensor.is_floating_point() else tensor
 
 
 def _check_type(data_type: torch.dtype, device: torch.device) -> None:

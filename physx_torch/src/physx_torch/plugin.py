@@ -10,7 +10,9 @@ def physx_networks() -> dict[str, str]:
     """Return the networks by name."""
     return {
         "fc": "physx_torch.networks.fc:FC",
+        "encoder_decoder": "physx_torch.networks.encoder_decoder:EncoderDecoder",
         "module": "physx_torch.module_network:ModuleNetwork",
+        "unet": "physx_torch.networks.unet:UNet",
     }
 
 
@@ -23,4 +25,13 @@ def physx_optimizations() -> dict[str, str]:
 @hookimpl
 def physx_transformations() -> dict[str, str]:
     """Return the transformations by name."""
-    return {"default": "physx_torch.transformation:TorchTransformation"}
+    return {
+        "default": "physx_torch.transformation:TorchTransformation",
+        "unet": "physx_torch.networks.unet_transformation:UNetTransformation",
+    }
+
+
+@hookimpl
+def physx_visualizers() -> dict[str, str]:
+    """Return the observers by name."""
+    return {"tensorboard": "physx_torch.tensorboard:TensorBoard"}

@@ -53,20 +53,22 @@ class FC(TorchNetwork):
             ConfigError: A list has the wrong length or content, or there is no such activation.
         """
         super().__init__(**fields)
-        self.sizes = _sizes(layers)
-        self.layers = _stack(self.sizes, activation, _flags(biases, len(self.sizes) - 1))
+        self.sizes = layer_sizes(f"{type(self).__name__}.layers", layers)
+        flags = _flags(type(self).__name__, biases, len(self.sizes) - 1)
+        self.layers = _stack(self.sizes, activation, flags)
         self._shape = self._fixed_shape(output_shape)
         self._shapes = [self._shape or (self.sizes[-1],)]
 
     def _fixed_shape(self, given: int | Sequence[int] | None) -> tuple[int, ...] | None:
         if given is None:
             return None
+        own = type(self).__name__
         shape = (given,) if isinstance(given, int) else tuple(given)
         if len(self.pred_fields) > 1:
-            raise ConfigError("FC.output_shape is for one prediction field: leave it out.")
+            raise ConfigError(f"{own}.output_shape is for one prediction field: leave it out.")
         if math.prod(shape) != self.sizes[-1]:
             raise ConfigError(
-                f"FC.output_shape {shape} has {math.prod(shape)} values, but the last of layers "
+                f"{own}.output_shape {shape} has {math.prod(shape)} values, but the last of layers "
                 f"{list(self.sizes)} has {self.sizes[-1]}."
             )
         return shape
@@ -86,7 +88,9 @@ class FC(TorchNetwork):
         if self._shape is not None and shapes != [self._shape]:
             name = self.opt_fields[0]
             text = f"shape {shapes[0]}, but output_shape is {self._shape}"
-            raise FieldsMismatchError("FC does not fit the fields", {name: text})
+            raise FieldsMismatchError(
+                f"{type(self).__name__} does not fit the fields", {name: text}
+            )
         self._shapes = shapes
 
     def _check(self, which: str, size: int, fields: Mapping[str, Field]) -> None:
@@ -96,7 +100,7 @@ class FC(TorchNetwork):
             if field.shape is None
         }
         if unknown:
-            raise FieldsMismatchError("FC does not fit the fields", unknown)
+            raise FieldsMismatchError(f"{type(self).__name__} does not fit the fields", unknown)
         counts = {name: math.prod(field.shape or ()) for name, field in fields.items()}
         if sum(counts.values()) != size:
             differences = {
@@ -104,8 +108,8 @@ class FC(TorchNetwork):
                 for name, count in counts.items()
             }
             raise FieldsMismatchError(
-                f"The {which} of FC's layers {list(self.sizes)} must be {sum(counts.values())}, "
-                "the number of values of",
+                f"The {which} of {type(self).__name__}'s layers {list(self.sizes)} must be "
+                f"{sum(counts.values())}, the number of values of",
                 differences,
             )
 
@@ -115,14 +119,24 @@ class FC(TorchNetwork):
         Args:
             inputs: One tensor for each field, of shape (samples, *field shape).
         """
-        flat = [self._flat(tensor) for tensor in inputs]
-        output = self.layers(flat[0] if len(flat) == 1 else torch.cat(flat, dim=1))
+        return self.dealt_out(self.layers(self.joined(inputs)))
+
+    def joined(self, inputs: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Return the values of all fields of each sample behind one another.
+
+        Args:
+            inputs: One tensor for each field, of shape (samples, *field shape).
+        """
+        if len(inputs) == 1:
+            return self._flat(inputs[0])
+        return torch.cat([self._flat(tensor) for tensor in inputs], dim=1)
+
+    def dealt_out(self, output: torch.Tensor) -> torch.Tensor | list[torch.Tensor]:
+        """Return the prediction fields in their shapes, from outputs of shape (samples, number)."""
         if len(self._shapes) == 1:
-            shape = self._shapes[0]
-            return output if len(shape) == 1 else output.view(len(output), *shape)
+            return _shaped(output, self._shapes[0])
         parts = output.split([math.prod(shape) for shape in self._shapes], dim=1)
-        shaped = zip(parts, self._shapes, strict=True)
-        return [part.reshape(len(output), *shape) for part, shape in shaped]
+        return [_shaped(part, shape) for part, shape in zip(parts, self._shapes, strict=True)]
 
     def _flat(self, tensor: torch.Tensor) -> torch.Tensor:
         if not tensor.is_floating_point():
@@ -132,24 +146,42 @@ class FC(TorchNetwork):
         return tensor.unsqueeze(1) if tensor.dim() == 1 else tensor.flatten(1)
 
 
-def _sizes(given: Sequence[int]) -> tuple[int, ...]:
+def _shaped(output: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
+    if len(shape) == 1:
+        return output
+    return output.unflatten(1, shape) if shape else output.squeeze(1)
+
+
+def layer_sizes(
+    option: str, given: Sequence[int], example: str = "[27, 256, 256, 9]"
+) -> tuple[int, ...]:
+    """Return numbers of neurons as a user gave them.
+
+    Args:
+        option: What was given, for the message.
+        given: At least two positive integers.
+        example: How it may look.
+
+    Raises:
+        ConfigError: It is something else.
+    """
     sizes = () if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
     right = all(type(size) is int and size > 0 for size in sizes)
     if len(sizes) < 2 or not right:
         raise ConfigError(
-            f"FC.layers is {given!r} but must list the numbers of inputs, hidden neurons and "
-            "outputs, at least two positive integers, for example [27, 256, 256, 9]."
+            f"{option} is {given!r} but must list the numbers of inputs, hidden neurons and "
+            f"outputs, at least two positive integers, for example {example}."
         )
     return sizes
 
 
-def _flags(given: bool | Sequence[bool], number: int) -> list[bool]:
+def _flags(own: str, given: bool | Sequence[bool], number: int) -> list[bool]:
     if isinstance(given, bool):
         return [given] * number
     flags = list(given) if isinstance(given, (list, tuple)) else []
     if len(flags) != number or not all(isinstance(flag, bool) for flag in flags):
         raise ConfigError(
-            f"FC.biases is {given!r} but must be True, False or {number} of them, one for each "
+            f"{own}.biases is {given!r} but must be True, False or {number} of them, one for each "
             "layer after the inputs."
         )
     return flags

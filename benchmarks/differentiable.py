@@ -1,0 +1,98 @@
+"""The differentiable forward dynamics against a loop of Pinocchio's own calls.
+
+One unit of work is one state whose accelerations are computed, and through which a gradient goes
+back to its positions, velocities and torques. The loop is written out by hand: `pin.aba` going
+forward, the derivatives going back. Its gradients by the positions are those by small motions; the
+function of physx goes one step further, to those by the quaternion of the base.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pinocchio
+import torch
+from measure import finish, rates, report
+
+from physx_core import Robot, World, plugins
+from physx_dart.algorithms import Algorithms
+from physx_torch import ForwardDynamics
+
+STATES, ROUNDS, REPEATS = 256, 25, 4
+
+
+class Loop(torch.autograd.Function):
+    """Forward dynamics of each state in turn; with gradients in the tangent space."""
+
+    @staticmethod
+    def forward(ctx: Any, model: Any, *rows: torch.Tensor) -> torch.Tensor:
+        """Return the accelerations."""
+        data = model.createData()
+        ctx.model = model
+        ctx.save_for_backward(*rows)
+        states = zip(*(row.numpy() for row in rows), strict=True)
+        return torch.from_numpy(
+            np.array([pinocchio.aba(model, data, q, v, tau) for q, v, tau in states])
+        )
+
+    @staticmethod
+    def backward(ctx: Any, given: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        """Return the gradients."""
+        model, data = ctx.model, ctx.model.createData()
+        states = zip(*(row.numpy() for row in ctx.saved_tensors), strict=True)
+        found = np.empty((3, *given.shape, model.nv))
+        for i, (q, v, tau) in enumerate(states):
+            found[0, i], found[1, i], found[2, i] = pinocchio.computeABADerivatives(
+                model, data, q, v, tau
+            )
+        return gradients(torch.from_numpy(found), given)
+
+
+def gradients(found: torch.Tensor, given: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    """Return gradients from derivatives, those by the positions as wide as the positions."""
+    by_q, by_v, by_tau = (given[:, None] @ matrices for matrices in found)
+    by_q = torch.cat([by_q[:, 0], torch.zeros(len(given), 1)], dim=1)
+    return None, by_q, by_v[:, 0], by_tau[:, 0]
+
+
+def main() -> None:
+    """Measure and print."""
+    torch.set_num_threads(1)
+    world = World([Robot("a1/a1", fixed_base=False)])
+    simulation = plugins.resolve("backend", "pinocchio").build(world)
+    model = Algorithms.of(world).movers[0].model
+    rng = np.random.default_rng(0)
+    neutral, moves = pinocchio.neutral(model), rng.normal(size=(STATES, model.nv))
+    drawn = [pinocchio.integrate(model, neutral, move) for move in moves]
+    speeds, torques = rng.normal(size=(2, STATES, model.nv))
+    states = [torch.tensor(x, requires_grad=True) for x in (np.array(drawn), speeds, torques)]
+    weights = torch.tensor(rng.normal(size=(STATES, model.nv)))
+    dynamics = ForwardDynamics(simulation)
+
+    def through(function: Callable[..., torch.Tensor], *first: Any) -> Callable[[], int]:
+        def work() -> int:
+            for _ in range(REPEATS):
+                torch.autograd.grad(function(*first, *states), states, weights)
+            return REPEATS * STATES
+
+        return work
+
+    measured = rates(
+        {
+            "loop of aba and derivatives": through(Loop.apply, model),
+            "physx": through(dynamics),
+        },
+        ROUNDS,
+        time.process_time,
+    )
+    heading = f"Forward dynamics with gradients: batch of {STATES}, {model.nv} degrees of freedom"
+    met = report(heading, "states", measured, "loop of aba and derivatives", 1.5, "physx")
+    simulation.close()
+    finish([met])
+
+
+if __name__ == "__main__":
+    main()

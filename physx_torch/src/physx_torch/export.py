@@ -1,0 +1,179 @@
+"""Export: a network with its transformation as one file that runs without physx."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from physx_core import Field, Transformation
+from physx_core.errors import ConfigError, MissingLibraryError
+
+if TYPE_CHECKING:
+    from physx_torch.network import TorchNetwork
+
+Tensors = dict[str, torch.Tensor]
+
+
+class Exported(torch.nn.Module):
+    """Network and transformation as one module, from physical units to physical units.
+
+    Attributes:
+        network: The network.
+        inputs: Names of the fields that are read.
+        outputs: Names of the fields that are given; one that is read too is ``predicted_<name>``.
+    """
+
+    def __init__(self, network: TorchNetwork, transformation: Transformation) -> None:
+        super().__init__()
+        self.network = network
+        self.inputs = list(network.net_fields)
+        self.outputs = [
+            f"predicted_{name}" if name in self.inputs else name for name in network.pred_fields
+        ]
+        self._transformation = transformation
+
+    def forward(self, data: Tensors) -> Tensors:
+        """Return the predictions by name for tensors of the fields by name."""
+        prediction = self.network.predict(self._transformation.transform_before_prediction(data))
+        prediction = self._transformation.transform_before_apply(prediction)
+        names = zip(self.outputs, self.network.pred_fields, strict=True)
+        return {output: prediction[name] for output, name in names}
+
+
+def write(
+    path: Path,
+    form: str,
+    network: TorchNetwork,
+    transformation: Transformation,
+    fields: Mapping[str, Field],
+) -> None:
+    """Write a network: see `Network.export`.
+
+    Raises:
+        ConfigError: The network is not on the processor, or cannot be written in this form.
+        MissingLibraryError: A library that the form needs is not installed.
+    """
+    if network.device.type != "cpu":
+        raise ConfigError(
+            f'A network is exported from the processor, not from "{network.device}", so that the '
+            'file runs anywhere: restore it with device="cpu", as physx export-network does.'
+        )
+    samples = {name: _samples(fields[name], network) for name in network.net_fields}
+    try:
+        with _fixed(network), _quiet():
+            FORMS[form](Exported(network, transformation).eval(), samples, path)
+    except MissingLibraryError:
+        raise
+    except Exception as error:  # an exporter may fail in any way on what it does not know
+        name = type(network).__name__
+        raise ConfigError(f'{name} cannot be exported as "{form}": {_reason(error)}') from error
+
+
+def _reason(error: BaseException) -> str:
+    """Return the first line of the error that began a chain of errors."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+@contextlib.contextmanager
+def _fixed(network: TorchNetwork) -> Iterator[None]:
+    """Let a network predict only, with parameters that need no gradients, for a while."""
+    was_training = network.training
+    trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
+    network.set_eval()
+    network.requires_grad_(False)
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        for parameter in trained:
+            parameter.requires_grad_(True)
+        network.train(was_training)
+
+
+def _samples(field: Field, network: TorchNetwork) -> torch.Tensor:
+    """Return samples of a field for the exporters to follow through the network."""
+    zeros = np.zeros((2, *(field.shape or ())), field.dtype)
+    return network.numpy_to_tensor({field.name: zeros})[field.name]
+
+
+def _torchscript(module: Exported, samples: Tensors, path: Path) -> None:
+    traced = torch.jit.trace(module, (samples,), strict=False, check_trace=False)
+    buffer = io.BytesIO()
+    torch.jit.save(traced, buffer)
+    _replace(path, lambda partial: partial.write_bytes(buffer.getvalue()))
+
+
+def _axes(samples: Tensors) -> dict[str, Any]:
+    """Return which axes have any length, as the exporters take it: the samples'."""
+    axis = torch.export.Dim("samples")
+    return {"data": {name: {0: axis} for name in samples}}
+
+
+def _pt2(module: Exported, samples: Tensors, path: Path) -> None:
+    program = torch.export.export(module, (samples,), dynamic_shapes=_axes(samples))
+    _replace(path, lambda partial: torch.export.save(program, partial), ".pt2")
+
+
+def _onnx(module: Exported, samples: Tensors, path: Path) -> None:
+    for library in ("onnx", "onnxscript"):
+        try:
+            __import__(library)
+        except ImportError as error:
+            raise MissingLibraryError(
+                "Exporting to ONNX", library, "export", "physx-torch"
+            ) from error
+    written = torch.onnx.export(
+        module,
+        kwargs={"data": samples},
+        dynamic_shapes=_axes(samples),
+        input_names=module.inputs,
+        output_names=module.outputs,
+        dynamo=True,
+        verbose=False,
+    )
+    if written is None:
+        raise ConfigError("the exporter gave no program.")
+    _replace(path, lambda partial: written.save(partial, external_data=False))
+
+
+def _replace(path: Path, write_to: Callable[[Path], Any], suffix: str = ".partial") -> None:
+    """Let a file appear under its name only when it is complete."""
+    partial = path.with_name(f".{path.name}.partial").with_suffix(suffix)
+    try:
+        write_to(partial)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep to oneself what the exporters say of their own inner workings."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+FORMS: dict[str, Callable[[Exported, Tensors, Path], None]] = {
+    "onnx": _onnx,
+    "torchscript": _torchscript,
+    "pt2": _pt2,
+}
+"""The forms that a network can be written in."""

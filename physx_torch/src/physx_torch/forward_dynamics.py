@@ -1,0 +1,152 @@
+"""The forward dynamics of a simulation as a function that gradients go through."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from physx_core import Simulation
+from physx_core.errors import FeatureNotSupportedError, SimulationError
+from physx_core.interfaces.backend import Layout, Vector
+
+
+class ForwardDynamics:
+    """Accelerations that torques cause, differentiable by positions, velocities and torques.
+
+    Values are those of `Simulation.forward_dynamics`: damping, springs and Coulomb friction act,
+    contacts and limits do not. Gradients are from analytic derivatives, in double precision on the
+    CPU; Coulomb friction counts as constant. The quaternion of a floating base is normalized, and
+    its gradient is that of the normalized one. Second derivatives are not there.
+
+    Example:
+        >>> dynamics = ForwardDynamics(simulation)
+        >>> loss = (dynamics(q, v, network(q, v)) - wanted).square().mean()
+
+    Args:
+        simulation: Of any engine with the feature ``derivatives``; its state is neither used nor
+            changed. It must stay open.
+
+    Raises:
+        FeatureNotSupportedError: The simulation has no derivatives of its forward dynamics.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        if "derivatives" not in simulation.features:
+            raise FeatureNotSupportedError(simulation.engine, "derivatives", simulation.features)
+        self.simulation = simulation
+
+    def __call__(self, positions: Tensor, velocities: Tensor, torques: Tensor) -> Tensor:
+        """Return the accelerations, shape (..., nv), in the type and on the device of the input.
+
+        Args:
+            positions: Shape (..., nq), in the convention of `physx_core.interfaces.layout`.
+            velocities: Shape (..., nv).
+            torques: Shape (..., nv), in N m or N; a base's first six are a force and a torque on
+                it, along its own axes. The leading axes of the three are broadcast.
+
+        Raises:
+            SimulationError: A shape does not fit, a value is not finite, or a quaternion is not of
+                length 1 (within 0.001).
+        """
+        given = (positions, velocities, torques)
+        self._check(given)
+        dtype = torch.promote_types(positions.dtype, velocities.dtype)
+        dtype = torch.promote_types(dtype, torques.dtype)
+        leading = torch.broadcast_shapes(*(tensor.shape[:-1] for tensor in given))
+        rows = [_rows(tensor, leading) for tensor in given]
+        if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given):
+            found: Tensor = _Function.apply(self.simulation, *rows)
+        else:
+            arrays = [row.detach().numpy() for row in rows]
+            found = torch.from_numpy(self.simulation.forward_dynamics_batch(*arrays))
+        return found.reshape(*leading, velocities.shape[-1]).to(positions.device, dtype)
+
+    def _check(self, given: tuple[Tensor, ...]) -> None:
+        layout = self.simulation.layout
+        names = ("positions", "velocities", "torques")
+        for name, tensor, length in zip(
+            names, given, (layout.nq, layout.nv, layout.nv), strict=True
+        ):
+            if tensor.shape[-1:] != (length,):
+                shape = tuple(tensor.shape)
+                raise SimulationError(f"{name} have the shape {shape} but need (..., {length}).")
+
+
+def _rows(tensor: Tensor, leading: Sequence[int]) -> Tensor:
+    """Return a tensor as rows, shape (n, last), in double precision on the CPU."""
+    tensor = tensor.to("cpu", torch.float64)
+    if len(leading) == 1 and tensor.shape[:-1] == leading:
+        return tensor
+    return tensor.expand(*leading, -1).reshape(math.prod(leading), tensor.shape[-1])
+
+
+class _Function(torch.autograd.Function):
+    """Forward dynamics of rows of states."""
+
+    @staticmethod
+    def forward(ctx: Any, simulation: Simulation, *rows: Tensor) -> Tensor:
+        arrays = [row.detach().numpy() for row in rows]
+        accelerations, derivatives = simulation.forward_dynamics_derivatives_batch(*arrays)
+        ctx.layout, ctx.derivatives = simulation.layout, derivatives
+        ctx.save_for_backward(rows[0])
+        return torch.from_numpy(accelerations)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, given: Tensor) -> tuple[Tensor | None, ...]:
+        by_accelerations = given.numpy()[:, None]
+        found: list[Tensor | None] = [None]
+        for number, matrices in enumerate(ctx.derivatives):
+            if not ctx.needs_input_grad[number + 1]:
+                found.append(None)
+                continue
+            gradients = (by_accelerations @ matrices)[:, 0]
+            if number == 0:
+                gradients = _by_positions(ctx.layout, ctx.saved_tensors[0].numpy(), gradients)
+            found.append(torch.from_numpy(gradients))
+        return tuple(found)
+
+
+def _by_positions(layout: Layout, positions: Vector, by_motion: Vector) -> Vector:
+    """Return gradients by the numbers of the positions, (n, nq), from those by small motions."""
+    found = np.empty(positions.shape)
+    for part in layout.parts.values():
+        mine, along = found[:, part.positions], by_motion[:, part.velocities]
+        if part.floating:
+            _write_base(mine, positions[:, part.positions.start + 3 :][:, :4], along)
+            mine[:, 7:] = along[:, 6:]
+        else:
+            mine[:] = along
+    return found
+
+
+def _write_base(found: Vector, quaternion: Vector, by_motion: Vector) -> None:
+    """Write gradients by x, y, z and the quaternion x, y, z, w of a base into `found` (n, 7..).
+
+    A change dp of the position is R^T dp in the base's frame, and a change du of the quaternion u
+    is the rotation 2 Im(u* du) / |u|^2 there.
+
+    Args:
+        found: The first seven columns are written.
+        quaternion: Of the base, x, y, z, w, shape (n, 4).
+        by_motion: Gradients by translations along and rotations about its own axes, (n, 6..).
+    """
+    length = np.sqrt((quaternion**2).sum(axis=1, keepdims=True))
+    axis, w = quaternion[:, :3] / length, quaternion[:, 3:] / length
+    moved, turned = by_motion[:, :3], by_motion[:, 3:6]
+    across = 2 * _cross(axis, moved)
+    found[:, :3] = moved + w * across + _cross(axis, across)
+    found[:, 3:6] = 2 / length * (w * turned + _cross(axis, turned))
+    found[:, 6] = -2 / length[:, 0] * (axis * turned).sum(axis=1)
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    """Return the cross products of rows, several times faster than `numpy.cross`."""
+    ax, ay, az, bx, by, bz = *a.T, *b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)

@@ -1,0 +1,117 @@
+"""Grids: how values of a regular grid lie in a field, and how a grid is padded for a UNet."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+
+from physx_core import Field
+
+
+class Border(NamedTuple):
+    """How one axis of a grid is padded, and which part of the output belongs to it.
+
+    Attributes:
+        size: Points of the grid along the axis.
+        before: Points that are added in front.
+        after: Points that are added behind.
+        start: Point of the output that belongs to the first point of the grid.
+    """
+
+    size: int
+    before: int
+    after: int
+    start: int
+
+    @property
+    def padded(self) -> int:
+        """Points of the padded axis."""
+        return self.before + self.size + self.after
+
+
+def border(size: int, steps: int, sublayers: int, same: bool) -> Border:
+    """Return the least padding with which a UNet gives a value for each point of an axis.
+
+    Each of the `steps` halves the axis on the way down, which must be even there, and doubles it on
+    the way up. Without padding of their own (`same` is False), the `sublayers` convolutions of each
+    level take away one point at either end.
+
+    Args:
+        size: Points of the grid along the axis.
+        steps: How often the axis is halved.
+        sublayers: Convolutions in each level.
+        same: Whether convolutions keep the size.
+    """
+    factor = 2**steps
+    if same:
+        missing = -size % factor
+        return Border(size, missing // 2, missing - missing // 2, missing // 2)
+    lost = 2 * sublayers
+    deepest = -(-(size + lost * (factor - 1)) // factor)  # points that leave the lowest level
+    output = factor * deepest - lost * (factor - 1)
+    margin = ((factor * (deepest + lost) + lost * (factor - 1)) - output) // 2
+    surplus = output - size
+    start = surplus // 2
+    return Border(size, margin + start, margin + surplus - start, start)
+
+
+class Layout(NamedTuple):
+    """How a field holds the values of a grid.
+
+    Attributes:
+        shape: Shape of the field.
+        channels: Values at each point.
+    """
+
+    shape: tuple[int, ...]
+    channels: int
+
+
+def grid_size(shape: Sequence[int], nb_dims: int) -> tuple[int, ...] | None:
+    """Return the grid that a shape shows, with or without an axis of channels; None if none."""
+    return tuple(shape[:nb_dims]) if len(shape) in (nb_dims, nb_dims + 1) else None
+
+
+def layout(field: Field, size: tuple[int, ...]) -> Layout | None:
+    """Return how a field holds a grid; None where it does not.
+
+    A field has the axes of the grid, or one axis with all points in row-major order; an axis of
+    channels may follow.
+    """
+    shape = tuple(field.shape or ())
+    for points in (size, (math.prod(size),)):
+        if shape[: len(points)] == points and len(shape) - len(points) in (0, 1):
+            return Layout(shape, shape[-1] if len(shape) > len(points) else 1)
+    return None
+
+
+def to_grid(tensor: torch.Tensor, size: Sequence[int], channels: int) -> torch.Tensor:
+    """Return a field's tensor in the shape (samples, *size, channels)."""
+    return tensor.reshape(-1, *size, channels)
+
+
+def pad(tensor: torch.Tensor, borders: Sequence[Border]) -> torch.Tensor:
+    """Return a grid (samples, *size, channels) with zeros around it."""
+    widths = [0, 0]
+    for axis in reversed(borders):
+        widths += [axis.before, axis.after]
+    return torch.nn.functional.pad(tensor, widths) if any(widths) else tensor
+
+
+def crop(tensor: torch.Tensor, borders: Sequence[Border]) -> torch.Tensor:
+    """Return the part of an output (samples, *axes, channels) that belongs to the grid."""
+    for number, axis in enumerate(borders, 1):
+        tensor = tensor.narrow(number, axis.start, axis.size)
+    return tensor
+
+
+def misfits(fields: Mapping[str, Field], size: tuple[int, ...]) -> dict[str, str]:
+    """Return what is wrong with each field that does not hold a grid of this size."""
+    return {
+        name: f"shape {field.shape} is no grid of {' x '.join(map(str, size))} points"
+        for name, field in fields.items()
+        if layout(field, size) is None
+    }

@@ -1,0 +1,216 @@
+"""UNet: convolutions on a regular grid, from fine to coarse and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import torch
+
+from physx_core import Field
+from physx_core.errors import ConfigError, FieldsMismatchError
+from physx_torch.network import TorchNetwork
+from physx_torch.networks.grid import Border, Layout, border, grid_size, layout, misfits
+
+Modules = list[torch.nn.Module]
+
+
+class UNet(TorchNetwork):
+    """U-shaped convolutional network (Ronneberger et al., 2015) in two or three dimensions.
+
+    On the way down, each step convolves, keeps the result, and halves the grid, with twice as many
+    channels below; on the way up, each step doubles the grid, puts what was kept beside it, and
+    convolves. Convolutions have kernels of 3 points, and are followed by batch normalization and
+    ReLU.
+
+    A sample's field has the shape ``(*grid, channels)``, ``grid`` where there is one channel, or
+    ``(points, channels)`` with the points of the grid in row-major order. Several `net_fields` are
+    put behind one another as channels; the output's channels are dealt out to `pred_fields`.
+    `UNetTransformation` pads the grid to the least size that the network takes and cuts the
+    prediction out again; ``forward`` itself reads and returns padded grids.
+
+    Attributes:
+        size: Points of the grid along each axis; empty before `bind`.
+        borders: How each axis is padded; empty before `bind`.
+        layouts: How each field holds the grid, by name; empty before `bind`.
+        data_scale: What targets are multiplied by.
+    """
+
+    default_transformation: ClassVar[str] = "torch/unet"
+
+    def __init__(
+        self,
+        nb_dims: int,
+        *,
+        nb_input_channels: int = 1,
+        nb_output_channels: int = 3,
+        nb_first_layer_channels: int = 64,
+        nb_steps: int = 3,
+        two_sublayers: bool = True,
+        border_mode: str = "valid",
+        skip_merge: bool = False,
+        data_scale: float = 1.0,
+        input_size: Sequence[int] | None = None,
+        **fields: Any,
+    ) -> None:
+        """Make the layers.
+
+        Args:
+            nb_dims: 2 or 3 axes of the grid.
+            nb_input_channels: Values at each point that the network reads, of all fields.
+            nb_output_channels: Values at each point that it predicts, of all fields.
+            nb_first_layer_channels: Channels of the finest level; each further one has twice as
+                many.
+            nb_steps: How often the grid is halved.
+            two_sublayers: Two convolutions in each level, instead of one.
+            border_mode: ``"valid"``: convolutions take away the outermost points, so that no value
+                depends on what lies beyond the padded grid; ``"same"``: they keep the size, which
+                needs less padding.
+            skip_merge: Whether what was kept on the way down is left out on the way up: an
+                encoder and decoder of convolutions.
+            data_scale: What targets are multiplied by for the loss, and predictions divided by.
+            input_size: Points of the grid along each axis; None: taken from the fields' shapes.
+            fields: ``net_fields``, ``opt_fields`` and ``pred_fields`` as in `TorchNetwork`.
+
+        Raises:
+            ConfigError: An option is not what the network takes.
+        """
+        super().__init__(**fields)
+        numbers = {
+            "nb_input_channels": nb_input_channels,
+            "nb_output_channels": nb_output_channels,
+            "nb_first_layer_channels": nb_first_layer_channels,
+            "nb_steps": nb_steps,
+        }
+        for name, value in numbers.items():
+            _check(name, value, _positive(value), "a positive integer")
+        _check("nb_dims", nb_dims, nb_dims in (2, 3), "2 or 3")
+        _check("border_mode", border_mode, border_mode in ("valid", "same"), '"valid" or "same"')
+        _check("data_scale", data_scale, data_scale > 0, "positive")
+        _check("input_size", input_size, _is_size(input_size, nb_dims), f"{nb_dims} integers")
+        self.data_scale = float(data_scale)
+        self.size: tuple[int, ...] = ()
+        self.borders: list[Border] = []
+        self.layouts: dict[str, Layout] = {}
+        self._channels = (nb_input_channels, nb_output_channels)
+        self._given_size = None if input_size is None else tuple(input_size)
+        self._dims, self._steps, self._same = nb_dims, nb_steps, border_mode == "same"
+        self._sublayers = 2 if two_sublayers else 1
+        self._merges = not skip_merge
+        self._make_layers(nb_first_layer_channels)
+
+    def _make_layers(self, first: int) -> None:
+        dims, (inputs, outputs) = self._dims, self._channels
+        upwards = torch.nn.ConvTranspose2d if dims == 2 else torch.nn.ConvTranspose3d
+        last = torch.nn.Conv2d if dims == 2 else torch.nn.Conv3d
+        widths = [first * 2**level for level in range(self._steps + 1)]
+        befores = [inputs, *widths]
+        self.down = torch.nn.ModuleList(
+            self._level(before, width) for before, width in zip(befores, widths, strict=False)
+        )
+        self.pool = torch.nn.MaxPool2d(2) if dims == 2 else torch.nn.MaxPool3d(2)
+        below = list(reversed(widths))
+        self.up = torch.nn.ModuleList(
+            upwards(width, width // 2, kernel_size=2, stride=2) for width in below[:-1]
+        )
+        merged = 2 if self._merges else 1
+        self.join = torch.nn.ModuleList(self._level(merged * w, w) for w in below[1:])
+        self.last = last(first, outputs, kernel_size=1)
+
+    def _level(self, before: int, channels: int) -> torch.nn.Sequential:
+        """Return the convolutions of one level."""
+        flat = self._dims == 2
+        convolution = torch.nn.Conv2d if flat else torch.nn.Conv3d
+        normalization = torch.nn.BatchNorm2d if flat else torch.nn.BatchNorm3d
+        modules: Modules = []
+        for number in range(self._sublayers):
+            inputs = before if number == 0 else channels
+            modules += [
+                convolution(inputs, channels, kernel_size=3, padding=int(self._same)),
+                normalization(channels),
+                torch.nn.ReLU(),
+            ]
+        return torch.nn.Sequential(*modules)
+
+    def bind(self, fields: Mapping[str, Field]) -> None:
+        """Learn the grid from the fields before the first batch.
+
+        Raises:
+            FieldsMismatchError: A field is missing, holds another grid, or the fields have not as
+                many channels as the network.
+        """
+        super().bind(fields)
+        mine = {name: fields[name] for name in (*self.net_fields, *self.opt_fields)}
+        self.size = self._given_size or self._size_of(mine[self.net_fields[0]])
+        wrong = misfits(mine, self.size)
+        if wrong:
+            raise FieldsMismatchError("UNet needs values on one grid", wrong)
+        found = {name: layout(field, self.size) for name, field in mine.items()}
+        self.layouts = {name: item for name, item in found.items() if item is not None}
+        self._check_channels("nb_input_channels", self._channels[0], self.net_fields)
+        self._check_channels("nb_output_channels", self._channels[1], self.opt_fields)
+        self.borders = [
+            border(points, self._steps, self._sublayers, self._same) for points in self.size
+        ]
+
+    def _size_of(self, field: Field) -> tuple[int, ...]:
+        size = grid_size(field.shape or (), self._dims)
+        if size is None:
+            text = f"shape {field.shape} shows no grid of {self._dims} axes: give input_size"
+            raise FieldsMismatchError("UNet needs values on a grid", {field.name: text})
+        return size
+
+    def _check_channels(self, option: str, expected: int, names: Sequence[str]) -> None:
+        counts = {name: self.layouts[name].channels for name in names}
+        if sum(counts.values()) != expected:
+            raise FieldsMismatchError(
+                f"UNet.{option} is {expected} but must be {sum(counts.values())}, the number of "
+                "values at each point of",
+                {name: f"{count} at each point" for name, count in counts.items()},
+            )
+
+    def forward(self, *inputs: torch.Tensor) -> torch.Tensor | list[torch.Tensor]:
+        """Return the predictions for padded grids.
+
+        Args:
+            inputs: One tensor for each of `net_fields`, of shape (samples, *grid, channels).
+        """
+        x = inputs[0] if len(inputs) == 1 else torch.cat(inputs, dim=-1)
+        x = x.to(self.last.weight.dtype).movedim(-1, 1)
+        kept: list[torch.Tensor] = []
+        for level in self.down[:-1]:
+            x = level(x)
+            kept.append(x)
+            x = self.pool(x)
+        x = self.down[-1](x)
+        for up, join in zip(self.up, self.join, strict=True):
+            x, left = up(x), kept.pop()
+            x = join(torch.cat([_middle(left, x), x], dim=1) if self._merges else x)
+        output = self.last(x).movedim(1, -1)
+        if len(self.opt_fields) == 1:
+            return output
+        return list(output.split([self.layouts[name].channels for name in self.opt_fields], -1))
+
+
+def _middle(tensor: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """Return the middle part of a tensor (samples, channels, *axes) that is as large as another."""
+    for axis in range(2, tensor.dim()):
+        surplus = tensor.shape[axis] - like.shape[axis]
+        if surplus:
+            tensor = tensor.narrow(axis, surplus // 2, like.shape[axis])
+    return tensor
+
+
+def _positive(value: Any) -> bool:
+    return type(value) is int and value > 0
+
+
+def _is_size(given: Any, nb_dims: int) -> bool:
+    if given is None:
+        return True
+    return isinstance(given, (list, tuple)) and len(given) == nb_dims and all(map(_positive, given))
+
+
+def _check(option: str, value: Any, right: bool, wanted: str) -> None:
+    if not right:
+        raise ConfigError(f"UNet.{option} is {value!r} but must be {wanted}.")

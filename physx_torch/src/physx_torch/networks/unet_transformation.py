@@ -1,0 +1,84 @@
+"""UNetTransformation: pads grids for a UNet, and cuts its predictions out again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from physx_core import Network
+from physx_core.errors import ConfigError
+from physx_core.interfaces.network import Tensors
+from physx_core.statistics import Normalization
+from physx_torch.networks.grid import crop, pad, to_grid
+from physx_torch.networks.unet import UNet
+from physx_torch.transformation import TorchTransformation
+
+
+class UNetTransformation(TorchTransformation):
+    """Normalizes as `TorchTransformation` does, and brings fields to the grid that a `UNet` takes.
+
+    What the network reads is padded with zeros to the least size that it takes. Predictions are
+    cut to the grid and have the shape of the field that they are compared with: each value is
+    where its point was. Targets are multiplied by `UNet.data_scale`, predictions divided by it.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._network: UNet | None = None
+
+    def set_normalization(
+        self, normalization: Mapping[str, Normalization], network: Network
+    ) -> None:
+        """Keep the coefficients and the network, whose fields are bound already.
+
+        Raises:
+            ConfigError: The network is no UNet.
+        """
+        if not isinstance(network, UNet):
+            raise ConfigError(f"{type(network).__name__} is no UNet: leave out its transformation.")
+        super().set_normalization(normalization, network)
+        self._network = network
+
+    def transform_before_prediction(self, data: Tensors) -> Tensors:
+        """Return the data with `net_fields` normalized, as padded grids."""
+        network, data = self._unet(), super().transform_before_prediction(data)
+        grids = {
+            name: pad(
+                to_grid(data[name], network.size, network.layouts[name].channels), network.borders
+            )
+            for name in network.net_fields
+            if name in data
+        }
+        return {**data, **grids}
+
+    def transform_before_loss(
+        self, prediction: Tensors, targets: Tensors
+    ) -> tuple[Tensors, Tensors]:
+        """Return the prediction in the fields' shapes, and the targets normalized and scaled."""
+        prediction, targets = super().transform_before_loss(self._cut(prediction), targets)
+        scale = self._unet().data_scale
+        if scale != 1:
+            targets = {name: values * scale for name, values in targets.items()}
+        return prediction, targets
+
+    def transform_before_apply(self, prediction: Tensors) -> Tensors:
+        """Return the prediction in the fields' shapes and in physical units."""
+        prediction = self._cut(prediction)
+        scale = self._unet().data_scale
+        if scale != 1:
+            prediction = {name: values / scale for name, values in prediction.items()}
+        return super().transform_before_apply(prediction)
+
+    def _cut(self, prediction: Tensors) -> Tensors:
+        network = self._unet()
+        pairs = zip(network.pred_fields, network.opt_fields, strict=True)
+        fields = {
+            pred: crop(prediction[pred], network.borders).reshape(-1, *network.layouts[opt].shape)
+            for pred, opt in pairs
+            if pred in prediction
+        }
+        return {**prediction, **fields}
+
+    def _unet(self) -> UNet:
+        if self._network is None or not self._network.borders:
+            raise ConfigError("UNetTransformation needs a UNet whose fields are bound.")
+        return self._network

@@ -1,0 +1,76 @@
+"""How a network computes while it is trained: compiled, or in mixed precision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+
+from physx_core.errors import ConfigError, listed
+
+Forward = Callable[..., Any]
+
+PRECISIONS = {"bfloat16": torch.bfloat16, "float16": torch.float16}
+"""Names of the types that mixed precision computes in."""
+
+
+def compiled(forward: Forward, backend: str) -> Forward:
+    """Return a function compiled by ``torch.compile``, which happens at its first call.
+
+    Args:
+        forward: What is compiled.
+        backend: Name of a backend of ``torch.compile``, for example ``"inductor"``.
+
+    Raises:
+        ConfigError: There is no such backend; the returned function: compiling fails on this
+            machine.
+    """
+    known = torch.compiler.list_backends(exclude_tags=())
+    if backend not in known:
+        raise ConfigError(f'torch.compile has no backend "{backend}". It has: {listed(known)}.')
+    made = torch.compile(forward, backend=backend)
+
+    def run(*inputs: Any) -> Any:
+        from torch._dynamo.exc import TorchDynamoException
+
+        try:
+            return made(*inputs)
+        except TorchDynamoException as error:
+            reason = " ".join(str(error).strip().splitlines()[:2])
+            raise ConfigError(
+                f'torch.compile with the backend "{backend}" does not work here: {reason}. '
+                'Leave out "compile", or give it a compiler: for the processor, g++.'
+            ) from error
+
+    return run
+
+
+def in_precision(
+    forward: Forward, device: torch.device, precision: torch.dtype, back: torch.dtype
+) -> Forward:
+    """Return a function that computes in mixed precision and returns floating tensors as `back`.
+
+    Args:
+        forward: What computes.
+        device: Where.
+        precision: Floating type of those operations that do without more digits.
+        back: Floating type of the network, in which the loss is computed.
+    """
+
+    def run(*inputs: Any) -> Any:
+        with torch.autocast(device.type, precision):
+            output = forward(*inputs)
+        return _as_type(output, back)
+
+    return run
+
+
+def _as_type(output: Any, data_type: torch.dtype) -> Any:
+    if isinstance(output, torch.Tensor):
+        return output.to(data_type) if output.is_floating_point() else output
+    if isinstance(output, Mapping):
+        return {name: _as_type(value, data_type) for name, value in output.items()}
+    if isinstance(output, (tuple, list)):
+        return [_as_type(value, data_type) for value in output]
+    return output
