@@ -22,8 +22,8 @@ from physx_core import DatasetConfig, NetworkConfig, Training
 def training(epochs, **more):
     network = NetworkConfig(
         "torch/fc", {"layers": [3, 8, 2], "net_fields": "x", "opt_fields": "y"}, loss="MSELoss",
-        optimizer="Adam", lr=1e-2, optimization_kwargs={
-            "scheduler": "CosineAnnealingLR", "scheduler_kwargs": {"T_max": 10}})
+        optimizer="Adam", lr=1e-2, scheduler="CosineAnnealingLR", scheduler_kwargs={"T_max": 10},
+        optimization_kwargs={"accumulate": 3, "gradient_clip": 0.5})
     return Training(network, DatasetConfig(existing_dir="data", normalize=True), epoch_nb=epochs,
                     batch_size=7, batch_nb=20, seed=3, **more)
 
@@ -77,6 +77,50 @@ def test_ctrl_c_within_an_epoch_and_resume(training):
     assert main(words) == 0
     training(reached, session_name="whole").execute()
     assert parameters("whole", 0) == parameters("cut", 1)
+
+
+def test_halves_equal_the_whole_with_early_stopping_and_the_best(training):
+    with Dataset.open("data", writable=True, session="data") as dataset:
+        x = np.random.default_rng(1).standard_normal((30, 3))
+        dataset.append("validation", {"x": x, "y": np.sin(x[:, :2]) + 0.3})
+    options = {"patience": 3, "min_improvement": 2e-4, "validation_every": 2}
+    whole = training(400, session_name="whole", **options)
+    whole.execute()
+    assert whole.stopped and 8 < whole.epoch_id < 400 and whole.best.epoch < whole.epoch_id
+    for epochs in (3, whole.epoch_id - 3, whole.epoch_id - 1, 400, 400):
+        half = training(epochs, session_name="halves", resume=epochs != 3, **options)
+        half.execute()
+    assert (half.stopped, half.epoch_id) == (whole.stopped, whole.epoch_id)
+    assert parameters("whole", 0) == parameters("halves", 3)  # the last resume wrote nothing more
+    assert parameters("whole", "best") == parameters("halves", "best")
+    assert recorded("whole") == recorded("halves")
+
+
+def recorded(session):
+    """Return the lines of the file of numbers."""
+    return Path(f"sessions/{session}/stats/scalars.csv").read_text().splitlines()
+
+
+def test_a_training_whose_samples_environments_made_in_the_first_epoch(training):
+    network = NetworkConfig(
+        "torch/fc",
+        {"layers": [2, 8, 2], "net_fields": "state", "opt_fields": "next_state"},
+        loss="MSELoss",
+        optimizer="Adam",
+    )
+    spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=2)
+    options = {"batch_nb": 6, "batch_size": 5, "seed": 1}
+    data = DatasetConfig(normalize=True)
+    Training(network, data, spring, session_name="whole", epoch_nb=5, **options).execute()
+    more = {"session_name": "halves", **options}
+    Training(network, data, spring, epoch_nb=2, **more).execute()
+    Training(network, data, spring, epoch_nb=3, resume=True, **more).execute()
+    assert (
+        main(["train", "--config", "sessions/halves/config.toml", "--resume", "--epoch-nb=5"]) == 0
+    )
+    assert parameters("whole", 0) == parameters("halves", 2)
+    with Dataset.open("sessions/halves") as dataset:
+        assert dataset.num_samples("training") == 30
 
 
 def test_what_cannot_be_resumed(training):

@@ -165,6 +165,18 @@ def test_training_curves(opened, read):
     assert read(visualizer.file, "/run/duration", "Scalars:scalars", "epoch") == [(0, [2.0])]
 
 
+def test_histograms(opened, read):
+    visualizer = opened()
+    values = np.array([0.0, 1.0, 1.0, 30.0, np.nan])
+    for epoch in (2, 4):
+        visualizer.histograms({"weights/layers.0.bias": values}, epoch, "epoch")
+    visualizer.close()
+    rows = read(visualizer.file, "/run/weights/layers.0.bias", "BarChart:values", "epoch")
+    assert [epoch for epoch, _ in rows] == [2, 4]
+    counts = rows[0][1][0]["buffer"]
+    assert (len(counts), sum(counts), counts[0], counts[-1]) == (30, 4, 1, 1)
+
+
 def test_equal_scenes_share_a_layout_and_others_do_not(opened, tmp_path):
     def application(name, instance_nb, **look):
         visualizer = opened(instance_nb, path=tmp_path / name)

@@ -16,41 +16,86 @@ if TYPE_CHECKING:
     from physx_core.fields import Field
     from physx_core.interfaces.backend import Backend, Layout, Simulation, State
     from physx_core.interfaces.environment import Environment
+    from physx_core.interfaces.launcher import ClientHandle, Launcher
     from physx_core.interfaces.network import Network
     from physx_core.interfaces.optimization import Optimization
     from physx_core.interfaces.transformation import Transformation
     from physx_core.interfaces.visualizer import Observer, Visualizer
+    from physx_core.motors import Motor, Motors
     from physx_core.pipelines.data_generation import DataGeneration
     from physx_core.pipelines.prediction import Prediction
+    from physx_core.pipelines.replay import Replay
     from physx_core.pipelines.training import Training
     from physx_core.scene import Factory
-    from physx_core.world import Robot, World
+    from physx_core.sensors import (
+        ContactSensor,
+        EffortSensor,
+        Encoder,
+        ForceTorqueSensor,
+        Imu,
+        Sensors,
+    )
+    from physx_core.world import (
+        Box,
+        Capsule,
+        Cylinder,
+        Ground,
+        HeightField,
+        JointSettings,
+        Mesh,
+        Robot,
+        Sphere,
+        Stairs,
+        World,
+        Wrench,
+    )
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "Backend": "interfaces.backend",
+    "Box": "world",
+    "Capsule": "world",
+    "ClientHandle": "interfaces.launcher",
+    "ContactSensor": "sensors",
+    "Cylinder": "world",
     "DataGeneration": "pipelines.data_generation",
     "Dataset": "dataset",
     "DatasetConfig": "config",
+    "EffortSensor": "sensors",
+    "Encoder": "sensors",
     "Environment": "interfaces.environment",
     "EnvironmentConfig": "config",
     "Factory": "scene",
     "Field": "fields",
+    "ForceTorqueSensor": "sensors",
+    "Ground": "world",
+    "HeightField": "world",
+    "Imu": "sensors",
+    "JointSettings": "world",
     "Layout": "interfaces.backend",
+    "Launcher": "interfaces.launcher",
+    "Mesh": "world",
+    "Motor": "motors",
+    "Motors": "motors",
     "Network": "interfaces.network",
     "NetworkConfig": "config",
     "Observer": "interfaces.visualizer",
     "Optimization": "interfaces.optimization",
     "PhysxError": "errors",
     "Prediction": "pipelines.prediction",
+    "Replay": "pipelines.replay",
     "Robot": "world",
+    "Sensors": "sensors",
     "Simulation": "interfaces.backend",
+    "Sphere": "world",
+    "Stairs": "world",
     "State": "interfaces.backend",
     "Training": "pipelines.training",
     "Transformation": "interfaces.transformation",
     "Visualizer": "interfaces.visualizer",
     "World": "world",
+    "Wrench": "world",
 }
 
 __all__ = [  # noqa: RUF022 - grouped by what they are for
@@ -58,9 +103,13 @@ __all__ = [  # noqa: RUF022 - grouped by what they are for
     "Network", "NetworkConfig", "Optimization", "Transformation",
     "Dataset", "DatasetConfig",
     "Observer", "Visualizer",
-    "Backend", "Layout", "Robot", "Simulation", "State", "World",
-    "DataGeneration", "Prediction", "Training",
-    "PhysxError", "plugins",
+    "Backend", "Layout", "Simulation", "State",
+    "Robot", "JointSettings", "World", "Wrench",
+    "Box", "Capsule", "Cylinder", "Mesh", "Sphere", "Ground", "HeightField", "Stairs",
+    "Motor", "Motors", "Sensors",
+    "ContactSensor", "EffortSensor", "Encoder", "ForceTorqueSensor", "Imu",
+    "DataGeneration", "Prediction", "Replay", "Training",
+    "ClientHandle", "Launcher", "PhysxError", "plugins",
 ]  # fmt: skip
 
 

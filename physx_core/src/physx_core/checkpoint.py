@@ -2,6 +2,9 @@
 
 ``checkpoint.toml`` names the network, its transformation, its fields and their normalization; the
 network's own library writes the parameters beside it. Nothing in it is code.
+
+Those of a training are numbered in the order of writing, and the last is where it can be resumed.
+Beside them stands ``<name>_best``, the network of the epoch with the smallest loss.
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ import dataclasses
 import re
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,7 @@ from physx_core.interfaces.optimization import Optimization
 from physx_core.statistics import Normalization
 
 FORMAT_VERSION = 1
+BEST = "best"
 DESCRIPTION = "checkpoint.toml"
 _KEPT = (
     "network",
@@ -41,12 +45,16 @@ class Progress:
         batch: Number of batches of the next epoch that were finished.
         batches_read: Number of batches that were read from the dataset, in all epochs.
         seed: Seed of the training.
+        best: State of `BestEpoch`.
+        record: State of `TrainingRecord`.
     """
 
     epoch: int
     batch: int
     batches_read: int
     seed: int
+    best: dict[str, Any] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -85,6 +93,8 @@ def save(
     fields: Mapping[str, Field],
     normalization: Mapping[str, Normalization],
     progress: Progress,
+    *,
+    best: bool = False,
 ) -> Path:
     """Write the next checkpoint ``<network_name>_<number>`` and return its folder.
 
@@ -98,14 +108,16 @@ def save(
         fields: The dataset's fields.
         normalization: What the transformation normalizes with.
         progress: How far the training is.
+        best: Write ``<network_name>_best`` in the place of the one before, to predict with or to
+            start from, without what a resumed training needs.
     """
     number = max(numbers(network_dir, config.network_name), default=-1) + 1
-    path = network_dir / f"{config.network_name}_{number}"
+    path = network_dir / f"{config.network_name}_{BEST if best else number}"
     partial = network_dir / f".{path.name}.partial"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     network.save_parameters(partial / network.parameters_file)
-    if optimization.state_file:
+    if optimization.state_file and not best:
         optimization.save_state(partial / optimization.state_file)
     used = [name for name in (*network.net_fields, *network.opt_fields) if name in fields]
     plain = to_plain(config)
@@ -121,19 +133,26 @@ def save(
             },
         },
     )
-    if path.exists():
-        shutil.rmtree(path)
-    partial.rename(path)
+    _put_in_place(partial, path)
     return path
 
 
-def find(place: Path, name: str, which: int) -> Path:
+def _put_in_place(partial: Path, path: Path) -> None:
+    former = path.with_name(f".{path.name}.former")
+    shutil.rmtree(former, ignore_errors=True)
+    if path.exists():
+        path.rename(former)
+    partial.rename(path)
+    shutil.rmtree(former, ignore_errors=True)
+
+
+def find(place: Path, name: str, which: int | str) -> Path:
     """Return the folder of a checkpoint.
 
     Args:
         place: A session's folder, its network folder, or a checkpoint's own folder.
         name: Name of the network.
-        which: Number of the checkpoint; -1: the last.
+        which: Number of the checkpoint; -1: the last; ``"best"``: that of the smallest loss.
 
     Raises:
         CheckpointError: There is no such checkpoint; the message lists those that are there.
@@ -141,10 +160,12 @@ def find(place: Path, name: str, which: int) -> Path:
     if (place / DESCRIPTION).exists():
         return place
     folder = place / "network" if (place / "network").is_dir() else place
-    known = numbers(folder, name)
+    known: list[int | str] = [*numbers(folder, name)]
+    if which == BEST and (folder / f"{name}_{BEST}" / DESCRIPTION).exists():
+        known.append(BEST)
     if not known or which not in (-1, *known):
         there = [p.name for p in folder.iterdir() if p.is_dir()] if folder.is_dir() else []
-        wanted = f"{name}_{which}" if which >= 0 else f"{name}_<number>"
+        wanted = f"{name}_<number>" if which == -1 else f"{name}_{which}"
         raise CheckpointError(
             f'There is no checkpoint "{wanted}" in {folder}. There are: {listed(there)}.'
         )

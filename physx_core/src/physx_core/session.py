@@ -124,9 +124,13 @@ class Session:
         now = datetime.datetime.now(datetime.UTC).astimezone().isoformat(timespec="seconds")
         versions = ", ".join(f"{name} {version}" for name, version in installed_versions().items())
         title = f"{pipeline}, {now}"
-        with info.open("a", encoding="utf-8") as stream:
-            stream.write(f"{title}\n{'-' * len(title)}\nseed: {seed}\n{versions}\n\n")
-            stream.write(tomli_w.dumps(plain) + "\n")
+        lines = f"{title}\n{'-' * len(title)}\nseed: {seed}\n{versions}\n"
+        self.note(f"{lines}\n{tomli_w.dumps(plain)}")
+
+    def note(self, text: str) -> None:
+        """Add a paragraph to ``info.txt``; what stands there, notes of the user's too, stays."""
+        with (self.path / "info.txt").open("a", encoding="utf-8") as stream:
+            stream.write(f"{text.rstrip()}\n\n")
 
 
 def _last_number(root: Path, name: str) -> int:

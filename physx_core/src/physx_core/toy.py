@@ -24,7 +24,7 @@ class Spring(Environment):
     """A damped mass on a spring under a random force; semi-implicit Euler steps.
 
     Each sample holds the ``state`` (position in m, velocity in m/s) and ``force`` before the step
-    and the ``next_state`` after it.
+    and the ``next_state`` after it. A stored sample is replayed from its state with its force.
     """
 
     def __init__(
@@ -74,8 +74,11 @@ class Spring(Environment):
 
     def step(self) -> None:
         """Move the mass by one period."""
+        if self.sample is None:
+            force = self.rng.standard_normal(1)
+        else:
+            self.state, force = self.sample["state"], self.sample["force"]
         position, velocity = self.state
-        force = self.rng.standard_normal(1)
         pull = force[0] - self.stiffness * position - self.damping * velocity
         velocity = velocity + self.period * pull / self.mass
         following = np.array([position + self.period * velocity, velocity])
@@ -147,9 +150,13 @@ class Linear(Network):
         return np.concatenate([*parts, np.ones((len(parts[0]), 1))], axis=1)
 
     def predict(self, data: Tensors) -> Tensors:
+        """Return the linear function of the inputs by field."""
+        return {self.pred_fields[0]: self.forward(*(data[name] for name in self.net_fields))}
+
+    def forward(self, *inputs: Array) -> Array:
         """Return the linear function of the inputs."""
-        flat = self.rows(data) @ self.weights
-        return {self.pred_fields[0]: flat.reshape(len(flat), *self._shape)}
+        flat = self.rows(dict(zip(self.net_fields, inputs, strict=True))) @ self.weights
+        return flat.reshape(len(flat), *self._shape)
 
     def set_train(self) -> None:
         """Nothing differs between training and prediction."""

@@ -41,6 +41,7 @@ class Layout:
     _kinds: set[tuple[str, str]] = field(default_factory=set)
     _scenes: dict[int, dict[str, Box]] = field(default_factory=dict)
     _plots: dict[str, dict[str, int]] = field(default_factory=dict)
+    _histograms: dict[str, dict[str, str]] = field(default_factory=dict)
     _texts: dict[str, dict[int, str]] = field(default_factory=dict)
     _timelines: set[str] = field(default_factory=set)
     _titles: dict[int, str] = field(default_factory=dict)
@@ -68,6 +69,12 @@ class Layout:
         self._plots.setdefault(name, {})[entity] = curve_nb
         self._timelines.add(timeline)
         self._kinds.add(("plot", name))
+        self.changed = True
+
+    def add_histogram(self, group: str, label: str, entity: str) -> None:
+        """Make room for an entity with the bars of a distribution, as a tab of its group."""
+        self._histograms.setdefault(group, {})[label] = entity
+        self._kinds.add(("histogram", f"{group}/{label}"))
         self.changed = True
 
     def add_text(self, instance_id: int, name: str, entity: str) -> None:
@@ -111,7 +118,10 @@ class Layout:
         """
         self.changed = False
         scenes = [self._scene_view(instance_id) for instance_id in sorted(self._scenes)]
-        plots = [_plot_view(name, curves) for name, curves in self._plots.items()]
+        plots: list[rrb.View | Container] = [
+            *(_plot_view(name, curves) for name, curves in self._plots.items()),
+            *(_histogram_views(name, bars) for name, bars in self._histograms.items()),
+        ]
         texts = [self._text_views(name, entities) for name, entities in self._texts.items()]
         in_a_row = 1 < len(scenes) <= _ROW
         parts: list[Container] = []
@@ -193,6 +203,11 @@ def _plot_view(name: str, curves: Mapping[str, int]) -> rrb.TimeSeriesView:
     visible = sum(curves.values()) <= _LEGEND
     legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=visible)
     return rrb.TimeSeriesView(name=name, contents=list(curves), plot_legend=legend)
+
+
+def _histogram_views(group: str, entities: Mapping[str, str]) -> Container:
+    views = (rrb.BarChartView(origin=entity, name=label) for label, entity in entities.items())
+    return rrb.Tabs(*views, name=group)
 
 
 def _union(boxes: Sequence[Box]) -> Box:

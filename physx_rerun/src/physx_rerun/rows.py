@@ -6,7 +6,7 @@ costs a few µs and stores far less.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -64,7 +64,7 @@ class Rows:
 
     def __init__(self) -> None:
         self.nbytes = 0
-        self._statics: list[Chunk] = []
+        self._whole: list[Chunk] = []
         self._blocks: dict[tuple[Any, ...], _Block] = {}
 
     def static(self, entity: str, *archetypes: Any) -> None:
@@ -74,12 +74,13 @@ class Rows:
             entity: Path of the entity.
             archetypes: Instances of Rerun archetypes.
         """
-        columns = [
-            batch.partition([_length(batch)])
-            for archetype in archetypes
-            for batch in archetype.as_component_batches()
-        ]
-        self._statics.append(Chunk(entity, [], columns))
+        self._whole.append(Chunk(entity, [], _components(archetypes)))
+
+    def add_whole(self, entity: str, archetype: Any, times: Times) -> None:
+        """Add one row of an archetype that cannot be gathered into columns, such as a tensor's."""
+        block = _Block([times], [1])
+        indexes = [_index(timeline, block) for timeline in times]
+        self._whole.append(Chunk(entity, indexes, _components([archetype])))
 
     def add(self, entity: str, archetype: type[Any], times: Times, **values: Any) -> None:
         """Add one row.
@@ -116,7 +117,7 @@ class Rows:
 
     def take(self) -> list[Chunk]:
         """Return everything as chunks, those that hold at all times first, and forget it."""
-        chunks, self._statics = self._statics, []
+        chunks, self._whole = self._whole, []
         blocks, self._blocks = self._blocks, {}
         self.nbytes = 0
         for (entity, archetype, form, _, timelines), block in blocks.items():
@@ -129,6 +130,14 @@ class Rows:
             nbytes = sum(column.as_arrow_array().nbytes for column in columns)
             chunks.append(Chunk(entity, indexes, columns, nbytes))
         return chunks
+
+
+def _components(archetypes: Iterable[Any]) -> list[Any]:
+    return [
+        batch.partition([_length(batch)])
+        for archetype in archetypes
+        for batch in archetype.as_component_batches()
+    ]
 
 
 def _length(batch: Any) -> int:

@@ -8,11 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import rerun as rr
 
 from physx_core import Visualizer
 from physx_core.config import at_least, options
 from physx_core.errors import ConfigError, VisualizerError
+from physx_core.fields import Array
 from physx_core.scene import Event
 from physx_rerun import colors
 from physx_rerun.drawing import Drawing
@@ -23,6 +25,7 @@ from physx_rerun.streams import Recording
 from physx_rerun.viewer import Viewer, has_display, listens
 
 MODES = ("save", "spawn", "connect", "headless")
+BINS = 30
 FLUSH_SECONDS = 0.2
 FLUSH_STEPS = 100
 FLUSH_BYTES = 8_000_000
@@ -156,7 +159,7 @@ class RerunVisualizer(Visualizer):
         self._positions[timeline] = step
         times = {**self._positions, TIME: self._now()}
         for name, value in values.items():
-            entity = "/".join(["run", *map(rr.escape_entity_path_part, name.split("/"))])
+            entity = _entity(name)
             group, _, label = name.rpartition("/")
             if name not in self._curves:
                 self._curves.add(name)
@@ -165,6 +168,23 @@ class RerunVisualizer(Visualizer):
                 self._rows.static(entity, line)
                 self._layout.add_plot(group or name, entity, timeline, 1)
             self._rows.add(entity, rr.Scalars, times, scalars=[float(value)])
+        self._flush_if_due()
+
+    def histograms(self, values: Mapping[str, Array], step: int, timeline: str) -> None:
+        """Show how many of the finite numbers lie where; see `Observer.histograms`."""
+        if not self._is_open:
+            return
+        self._positions[timeline] = step
+        times = {**self._positions, TIME: self._now()}
+        for name, array in values.items():
+            finite = array[np.isfinite(array)]
+            if not finite.size:
+                continue
+            counts, edges = np.histogram(finite, BINS)
+            group, _, label = name.partition("/")
+            self._layout.add_histogram(group, label, _entity(name))
+            middles = (edges[1:] + edges[:-1]) / 2
+            self._rows.add_whole(_entity(name), rr.BarChart(counts, abscissa=middles), times)
         self._flush_if_due()
 
     def close(self) -> None:
@@ -212,6 +232,11 @@ class RerunVisualizer(Visualizer):
         self._recording.write(chunks)
         if self._layout.changed:
             self._recording.lay_out(self._layout.blueprint())
+
+
+def _entity(name: str) -> str:
+    """Return the path that the numbers of a name are logged to."""
+    return "/".join(["run", *map(rr.escape_entity_path_part, name.split("/"))])
 
 
 def _unused(folder: Path, name: str) -> Path:

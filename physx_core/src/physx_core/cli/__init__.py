@@ -13,13 +13,18 @@ from physx_core.errors import PhysxError, UsageError, nearest
 
 VERBS = {
     "plugins": "list the installed plugins, what they bring, and those that are broken",
+    "robots": "list the robots that can be given by name, and what collides of them",
     "info": "show a session or dataset: fields, units, samples, normalization, integrity",
     "generate": "make samples with an environment and store them in a session",
     "train": "train a network on a dataset, or on what an environment makes",
+    "stats": "show the numbers of a training as a table, or in TensorBoard",
     "verify": "check the files of a dataset, and repair them",
     "export": "write a dataset as npz, parquet, minari, zarr or one HDF5 file",
+    "export-network": "write a session's network as a file that runs without physx",
     "import": "make a dataset of an npz or HDF5 file",
     "predict": "put a session's network into a running environment",
+    "client": "run an environment for a run that waits for clients, on this machine or another",
+    "replay": "send stored samples through their environment, to look at them in a viewer",
 }
 
 
@@ -54,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(verb: str, words: list[str]) -> int:
     if verb not in VERBS:
         raise UsageError(f'There is no command "{verb}".{nearest(verb, VERBS)} See physx --help.')
-    name = f"{verb}_" if keyword.iskeyword(verb) else verb
+    name = f"{verb}_" if keyword.iskeyword(verb) else verb.replace("-", "_")
     module = importlib.import_module(f"physx_core.cli.{name}")
     try:
         module.run(words)

@@ -23,7 +23,13 @@ P = TypeVar("P", bound=Pipeline)
 Registry = ConstructorRegistry
 
 
-def pipeline_from(make: type[P], verb: str, places: Sequence[str], words: Sequence[str]) -> P:
+def pipeline_from(
+    make: type[P],
+    verb: str,
+    places: Sequence[str],
+    words: Sequence[str],
+    given: Mapping[str, Any] | None = None,
+) -> P:
     """Make a pipeline from what the user typed.
 
     Args:
@@ -33,12 +39,14 @@ def pipeline_from(make: type[P], verb: str, places: Sequence[str], words: Sequen
             ``environment.environment``.
         words: The words after the command. ``--config FILE`` names a TOML file whose table of the
             pipeline's kind holds options; words after it replace them.
+        given: Table of options that hold where the file has none of the name.
 
     Raises:
         PhysxError: An option is unknown or its value unfit.
         SystemExit: Help was asked for, or the parser has shown a mistake.
     """
     table, rest = _take_file(make, list(words))
+    table = {**(given or {}), **table}
     rest = _name_positionals(verb, places, rest)
     defaults = _nested_defaults(make, table, rest)
     options = _options_of(make, defaults, rest)
@@ -106,7 +114,10 @@ def _options_of(
     options: list[tuple[str, Any, Any]] = []
     for option in _dataclass_fields(make):
         name = _option_name(option.name)
-        default = defaults.get(name, option.default)
+        default = option.default
+        if option.default_factory is not dataclasses.MISSING:
+            default = option.default_factory()
+        default = defaults.get(name, default)
         hint = hints[option.name]
         if name != option.name:
             hint = _configuration(make, option.name)
@@ -117,7 +128,10 @@ def _options_of(
                 default = dataclasses.MISSING if name == "environment" else hint()
         help_text = tyro.conf.arg(help=docs.get(option.name, ""))
         annotated = Annotated[hint, help_text] if name == option.name else hint
-        options.append((name, annotated, dataclasses.field(default=default)))
+        if isinstance(default, (list, dict)):
+            options.append((name, annotated, dataclasses.field(default_factory=default.copy)))
+        else:
+            options.append((name, annotated, dataclasses.field(default=default)))
     return options
 
 

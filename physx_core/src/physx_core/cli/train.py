@@ -13,7 +13,11 @@ def run(words: Sequence[str]) -> None:
     """Train as the words say and print the last losses and where the network is."""
     pipeline = pipeline_from(Training, "train", ("dataset.existing_dir",), words)
     pipeline.execute()
+    if not pipeline.group.leads:
+        return
     print(f"training loss {pipeline.training_loss:.6g}")
     if not math.isnan(pipeline.validation_loss):
         print(f"validation loss {pipeline.validation_loss:.6g}")
+    if not math.isinf(pipeline.best.loss):
+        print(f"smallest loss {pipeline.best.loss:.6g}, after epoch {pipeline.best.epoch}")
     print(f"network: {pipeline.checkpoint_path}")

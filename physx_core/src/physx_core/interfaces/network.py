@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from physx_core.errors import FieldsMismatchError, listed
+from physx_core.errors import ConfigError, FieldsMismatchError, UsageError, listed
 from physx_core.fields import Batch, Field
+from physx_core.interfaces.group import Group
+
+if TYPE_CHECKING:
+    from physx_core.interfaces.transformation import Transformation
 
 Tensors = dict[str, Any]
 """Field name to a tensor of the network's library, with a leading sample axis."""
@@ -27,11 +32,13 @@ class Network(ABC):
         parameters_file: Name of the file that `save_parameters` writes into a checkpoint.
         default_optimization: Reference of the optimization used where none is configured.
         default_transformation: Reference of the transformation used where none is configured.
+        export_forms: Forms that `export` writes.
     """
 
     parameters_file: ClassVar[str]
     default_optimization: ClassVar[str]
     default_transformation: ClassVar[str]
+    export_forms: ClassVar[Sequence[str]] = ()
 
     net_fields: Sequence[str] = ("input",)
     opt_fields: Sequence[str] = ("ground_truth",)
@@ -44,6 +51,23 @@ class Network(ABC):
         Args:
             seed: Not negative.
         """
+
+    @classmethod
+    def join_group(cls, device: str) -> Group:
+        """Join the processes that were started to train this network together.
+
+        Args:
+            device: As for `set_device`.
+
+        Raises:
+            ConfigError: There are several, but the network's library cannot work together, or not
+                on this device.
+        """
+        if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+            raise ConfigError(
+                f"{cls.__name__} cannot be trained by several processes: leave torchrun out."
+            )
+        return Group()
 
     def bind(self, fields: Mapping[str, Field]) -> None:
         """Learn the shapes of the fields in `net_fields` and `opt_fields` before the first batch.
@@ -64,7 +88,17 @@ class Network(ABC):
 
     @abstractmethod
     def predict(self, data: Tensors) -> Tensors:
-        """Return ``{field: tensor}`` for `pred_fields` from the `net_fields` in `data`."""
+        """Return ``{field: tensor}`` for `pred_fields` from the `net_fields` in `data`.
+
+        After `set_eval` no gradients are recorded.
+        """
+
+    def forward(self, *inputs: Any) -> Any:
+        """Return what the network makes of the tensors of `net_fields`, given in that order.
+
+        A library's own base class leaves this to its networks, and calls it in `predict`.
+        """
+        raise UsageError(f"{type(self).__name__} does not implement forward().")
 
     @abstractmethod
     def set_train(self) -> None:
@@ -90,6 +124,10 @@ class Network(ABC):
     def get_parameters(self) -> dict[str, Any]:
         """Return the parameters by name."""
 
+    def get_gradients(self) -> dict[str, Any]:
+        """Return the gradients of the last step by parameter; empty where the library has none."""
+        return {}
+
     @abstractmethod
     def nb_parameters(self) -> int:
         """Return how many numbers the parameters hold."""
@@ -105,6 +143,29 @@ class Network(ABC):
         Raises:
             CheckpointError: The file is missing, damaged or of another architecture.
         """
+
+    def export(
+        self, path: Path, form: str, transformation: Transformation, fields: Mapping[str, Field]
+    ) -> None:
+        """Write network and transformation into one file that other programs run.
+
+        It reads `net_fields` and gives `pred_fields`, both in physical units and by these names,
+        for any number of samples.
+
+        Args:
+            path: The file; an existing one is replaced.
+            form: One of `export_forms`.
+            transformation: What the network is used with.
+            fields: The fields that the network was bound to.
+
+        Raises:
+            ConfigError: The network cannot be written in this form.
+            MissingLibraryError: A library that the form needs is not installed.
+        """
+        raise ConfigError(
+            f'{type(self).__name__} cannot be exported as "{form}". '
+            f"Forms: {listed(self.export_forms)}."
+        )
 
     @abstractmethod
     def numpy_to_tensor(self, batch: Batch) -> Tensors:

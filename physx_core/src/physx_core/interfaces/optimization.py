@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+from physx_core.errors import ConfigError
+from physx_core.interfaces.group import Group
 from physx_core.interfaces.network import Network, Tensors
 
 
@@ -45,6 +47,19 @@ class Optimization(ABC):
             ConfigError: There is no such optimizer, or it refuses the arguments.
         """
 
+    def set_scheduler(self, scheduler: str | type[Any], **kwargs: Any) -> None:
+        """Choose what changes the learning rate after each epoch, by class or by its name.
+
+        Args:
+            scheduler: Class or name.
+            kwargs: Arguments of the scheduler.
+
+        Raises:
+            ConfigError: There is no such scheduler, or it refuses the arguments.
+            UsageError: There is no optimizer yet.
+        """
+        raise ConfigError(f"{type(self).__name__} has no schedulers: leave out scheduler.")
+
     @abstractmethod
     def compute_loss(self, prediction: Tensors, targets: Tensors, data: Tensors) -> Any:
         """Return the loss of a prediction.
@@ -58,6 +73,8 @@ class Optimization(ABC):
     def transform_loss(self, loss: Any, data: Tensors) -> dict[str, Any]:
         """Return the statistics of this step; entries beside ``loss`` are recorded too.
 
+        Called after `optimize`. All entries are numbers, or what ``float`` makes one of.
+
         Args:
             loss: What `compute_loss` returned.
             data: The whole batch.
@@ -68,8 +85,30 @@ class Optimization(ABC):
     def optimize(self, loss: Any) -> None:
         """Change the parameters along the gradient of the loss."""
 
-    def epoch_end(self) -> None:  # noqa: B027
-        """An epoch of the training is over, for example for a schedule of the learning rate."""
+    def learning_rate(self) -> float | None:
+        """Return the present learning rate; None where there is no such thing."""
+        return None
+
+    def join(self, group: Group) -> None:
+        """Improve the parameters by the gradients of all processes of a group.
+
+        Called once, when the network has its first parameters; those of the leading process count.
+
+        Raises:
+            ConfigError: There are several processes, but the optimization cannot work together.
+        """
+        if group.size > 1:
+            raise ConfigError(
+                f"{type(self).__name__} cannot work in several processes: leave torchrun out."
+            )
+
+    def epoch_end(self, loss: float) -> None:  # noqa: B027
+        """An epoch of the training is over, for example for a schedule of the learning rate.
+
+        Args:
+            loss: What the epoch is judged by: the loss of its validation, or its mean training loss
+                where nothing is validated. NaN: not validated, though other epochs are.
+        """
 
     def save_state(self, path: Path) -> None:  # noqa: B027
         """Write what a later training needs, beside the parameters, to go on exactly here.

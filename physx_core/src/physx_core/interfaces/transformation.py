@@ -26,7 +26,11 @@ class Transformation:
         self.normalization = dict(normalization)
 
     def transform_before_prediction(self, data: Tensors) -> Tensors:
-        """Return what the network reads, from data in physical units."""
+        """Return what the network reads, from data in physical units.
+
+        Args:
+            data: The network's `net_fields`.
+        """
         return data
 
     def transform_before_loss(
@@ -41,5 +45,9 @@ class Transformation:
         return prediction, targets
 
     def transform_before_apply(self, prediction: Tensors) -> Tensors:
-        """Return the prediction in physical units."""
+        """Return the prediction as the environment gets it, in physical units.
+
+        Args:
+            prediction: As the network gave it.
+        """
         return prediction

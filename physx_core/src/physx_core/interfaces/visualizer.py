@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from physx_core.fields import Array
     from physx_core.scene import Event
 
 
@@ -49,6 +50,18 @@ class Observer:
             step: Position on the timeline.
             timeline: ``batch``, ``epoch`` or ``step``.
         """
+
+    def histograms(self, values: Mapping[str, Array], step: int, timeline: str) -> None:
+        """Arrays of numbers whose distribution is to be recorded.
+
+        Args:
+            values: Name to array, for example ``weights/layers.0.weight``.
+            step: Position on the timeline.
+            timeline: ``epoch``.
+        """
+
+    def note(self, text: str) -> None:
+        """Something worth telling happened, for example that a training stopped early."""
 
     def events(self, instance_id: int, step: int, events: list[Event]) -> None:
         """Drawing events of one environment instance at one of its steps."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from physx_core.observers.chosen import statistics_observers
 from physx_core.observers.progress import ProgressBar
-from physx_core.observers.scalars_file import ScalarsFile
+from physx_core.observers.scalars_file import ScalarsFile, read_scalars
 from physx_core.observers.several import Observers
 
-__all__ = ["Observers", "ProgressBar", "ScalarsFile"]
+__all__ = ["Observers", "ProgressBar", "ScalarsFile", "read_scalars", "statistics_observers"]

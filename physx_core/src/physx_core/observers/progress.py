@@ -44,6 +44,12 @@ class ProgressBar(Observer):
         if self._bar is not None and timeline == "epoch":
             self._bar.set_postfix_str(", ".join(f"{k} {v:.3g}" for k, v in values.items()), False)
 
+    def note(self, text: str) -> None:
+        """Print the text above the bar."""
+        from tqdm.auto import tqdm
+
+        tqdm.write(text, file=sys.stderr)
+
     def end(self) -> None:
         """Leave the finished bar standing."""
         if self._bar is not None:

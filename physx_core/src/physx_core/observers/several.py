@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from physx_core.fields import Array
 from physx_core.interfaces.visualizer import Observer
 from physx_core.scene import Event
 
@@ -56,6 +57,14 @@ class Observers(Observer):
                 observer.scalars(values, step, timeline)
             except Exception as error:
                 self._mute(observer, error)
+
+    def histograms(self, values: Mapping[str, Array], step: int, timeline: str) -> None:
+        """Give arrays to all."""
+        self._each(lambda observer: observer.histograms(values, step, timeline))
+
+    def note(self, text: str) -> None:
+        """Tell all that something happened."""
+        self._each(lambda observer: observer.note(text))
 
     def events(self, instance_id: int, step: int, events: list[Event]) -> None:
         """Give drawing events to all."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from typing import ClassVar
 
@@ -10,8 +11,9 @@ from physx_core.config import MODES, DatasetConfig, EnvironmentConfig, at_least,
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError
 from physx_core.fields import Batch
+from physx_core.pipelines.description import describe_dataset, describe_environment_config
 from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
-from physx_core.pipelines.storage import describe_environment, open_own
+from physx_core.pipelines.storage import describe_environment, open_own, recording_refused
 from physx_core.session import Session
 from physx_core.sources.source import Source
 
@@ -79,11 +81,16 @@ class DataGeneration(Pipeline):
         """A batch is about to be made."""
 
     def batch_produce(self) -> None:
-        """Make a batch and store it; the samples are committed when this returns."""
-        self.batch = self.source.batch(self.batch_size)
-        if self.batch_id == 0:
-            self.dataset.define_fields(self._mode, self.source.fields)
-        self.dataset.append(self._mode, self.batch)
+        """Make a batch and store it; the samples are committed when this returns.
+
+        With ``record_wrong_samples`` what `check_sample` refused meanwhile is stored too, in the
+        mode "wrong".
+        """
+        with recording_refused(self.source, self.dataset):
+            self.batch = self.source.batch(self.batch_size)
+            if self.batch_id == 0:
+                self.dataset.define_fields(self._mode, self.source.fields)
+            self.dataset.append(self._mode, self.batch)
 
     def batch_count(self) -> None:
         """Count the batch."""
@@ -99,7 +106,7 @@ class DataGeneration(Pipeline):
 
     @property
     def _mode(self) -> str:
-        return self.mode or (self.dataset_config or DatasetConfig()).mode
+        return self.mode or (self.dataset_config or DatasetConfig).mode
 
     def _open(self, resources: contextlib.ExitStack) -> None:
         dataset_config = self.dataset_config or DatasetConfig()
@@ -109,6 +116,11 @@ class DataGeneration(Pipeline):
                 "existing_dir. To add to a session, give its name and new_session=False."
             )
         config = self.environment_config
+        if config.load_samples:
+            raise ConfigError(
+                "DataGeneration makes new samples, so it takes no load_samples: that works in "
+                "Training, Prediction and Replay."
+            )
         seed = chosen_seed(config.seed)
         self.session = Session.create(self.session_dir, self.session_name, self.new_session)
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
@@ -122,3 +134,9 @@ class DataGeneration(Pipeline):
             stream_seed(seed, self._mode, offset),
             total=self.batch_nb * self.batch_size,
         )
+
+    def _components(self) -> Mapping[str, str]:
+        return {
+            "environment": describe_environment_config(self.environment_config),
+            "dataset": describe_dataset(self.dataset),
+        }

@@ -10,11 +10,13 @@ from typing import Any
 from physx_core import checkpoint
 from physx_core.config import NetworkConfig
 from physx_core.errors import ConfigError, MissingFieldError, UsageError
-from physx_core.fields import Batch, Field
+from physx_core.fields import Array, Batch, Field
+from physx_core.interfaces.group import Group
 from physx_core.interfaces.network import Network
 from physx_core.interfaces.optimization import Optimization
 from physx_core.interfaces.transformation import Transformation
 from physx_core.plugins import resolve
+from physx_core.plugins.networks import resolve_network
 from physx_core.statistics import Normalization
 
 
@@ -27,6 +29,7 @@ class Learner:
         transformation: Works between physical units and the network.
         optimization: Improves the network; None where nothing is trained.
         fields: The fields that the network was bound to, by name.
+        group: The processes that train the network together.
     """
 
     def __init__(self, config: NetworkConfig, *, trains: bool) -> None:
@@ -44,7 +47,8 @@ class Learner:
             raise ConfigError(
                 'NetworkConfig.network is missing: name a network, for example "torch/fc".'
             )
-        self.network: Network = _make("network", config.network, config.network_kwargs, Network)
+        make, arguments = resolve_network(config.network, config.network_kwargs)
+        self.network: Network = _made("network", config.network, make, arguments, Network)
         reference = config.transformation or self.network.default_transformation
         self.transformation: Transformation = _make(
             "transformation", reference, config.transformation_kwargs, Transformation
@@ -54,6 +58,8 @@ class Learner:
         self.network.set_device(config.device)
         self.optimization: Optimization | None = None
         self.fields: dict[str, Field] = {}
+        self.group = Group()
+        self._is_between_steps = False
         if trains:
             self.optimization = self._make_optimization(config)
 
@@ -69,6 +75,10 @@ class Learner:
             optimization.set_loss(config.loss)
         if config.optimizer is not None or config.require_training_stuff:
             optimization.set_optimizer(config.optimizer, self.network, **arguments)
+        if config.scheduler is not None:
+            optimization.set_scheduler(config.scheduler, **config.scheduler_kwargs)
+        elif config.scheduler_kwargs:
+            raise ConfigError("NetworkConfig.scheduler_kwargs are given without scheduler.")
         return optimization
 
     def bind(self, fields: Mapping[str, Field], normalization: Mapping[str, Normalization]) -> None:
@@ -119,34 +129,91 @@ class Learner:
         Raises:
             UsageError: There is no optimization.
         """
+        if self._is_between_steps:
+            self._is_between_steps = False
+            self.network.set_train()
+        if self.group.size > 1:
+            return self._optimize_together(batch)
         loss, data = self.loss(batch)
         optimization = self._trainer()
         optimization.optimize(loss)
         return optimization.transform_loss(loss, data)
 
-    def mean_loss(self, batches: Iterable[Batch]) -> float:
-        """Return the mean loss over all samples of some batches; the network learns nothing."""
+    def _optimize_together(self, batch: Batch) -> dict[str, Any]:
+        """Learn from this process's share of the batch; the statistics are those of the whole."""
+        share, weight = self.group.share_of(batch)
+        loss, data = self.loss(share)
+        optimization = self._trainer()
+        optimization.optimize(loss * (weight * self.group.size))  # their mean is that of the batch
+        losses = optimization.transform_loss(loss, data)
+        totals = self.group.total([float(value) * weight for value in losses.values()])
+        return dict(zip(losses, totals, strict=True))
+
+    def mean_losses(self, batches: Iterable[Batch]) -> dict[str, float]:
+        """Return the mean statistics over all samples of some batches, ``loss`` first.
+
+        The network learns nothing. Processes that train together take their share of each batch.
+        """
         self.network.set_eval()
-        total, count = 0.0, 0
+        optimization = self._trainer()
+        sums: dict[str, float] = {}
+        count = 0.0
         for batch in batches:
-            size = len(next(iter(batch.values())))
-            loss, _ = self.loss(batch)
-            total += float(loss) * size
+            share, size = batch, float(len(next(iter(batch.values()))))
+            if self.group.size > 1:
+                share, weight = self.group.share_of(batch)
+                size *= weight
+            for name, value in optimization.transform_loss(*self.loss(share)).items():
+                sums[name] = sums.get(name, 0.0) + float(value) * size
             count += size
         self.network.set_train()
-        return total / count
+        *totals, total = self.group.total([*sums.values(), count])
+        return {name: value / total for name, value in zip(sums, totals, strict=True)}
 
-    def epoch_end(self) -> None:
-        """Tell the optimization that an epoch is over."""
-        self._trainer().epoch_end()
+    def distributions(self) -> dict[str, Array]:
+        """Return weights and gradients as arrays, ``weights/<name>`` and ``gradients/<name>``."""
+        network = self.network
+        tensors = {
+            **{f"weights/{name}": value for name, value in network.get_parameters().items()},
+            **{f"gradients/{name}": value for name, value in network.get_gradients().items()},
+        }
+        return network.tensor_to_numpy(tensors)
+
+    @property
+    def learning_rate(self) -> float | None:
+        """The present learning rate; None where there is no such thing."""
+        return self._trainer().learning_rate()
+
+    def join(self, group: Group) -> None:
+        """Train together with other processes from here on; fields and parameters are known.
+
+        Raises:
+            ConfigError: The optimization cannot do that.
+        """
+        self.group = group
+        if group.size > 1:
+            self._trainer().join(group)
+
+    def epoch_end(self, loss: float) -> None:
+        """Tell the optimization that an epoch is over, and the loss that it is judged by."""
+        self._trainer().epoch_end(loss)
 
     def predict_in_training(self, batch: Batch) -> Batch:
-        """Return the prediction of the network as it is now, between two optimization steps."""
+        """Return the prediction of the network as it is now, between two optimization steps.
+
+        There may be many between two steps, so the network stays ready to predict until the next.
+
+        Raises:
+            UsageError: The fields' shapes are not known yet.
+        """
+        if not self.fields:
+            raise UsageError(
+                "get_prediction() before the first batch is made needs the shapes of the network's "
+                'fields: define them with Field("name", shape=...).'
+            )
+        self._is_between_steps = True
         self.network.set_eval()
-        try:
-            return self.predict(batch)
-        finally:
-            self.network.set_train()
+        return self.predict(batch)
 
     def predict(self, batch: Batch) -> Batch:
         """Return the prediction for a batch, both in physical units.
@@ -155,19 +222,20 @@ class Learner:
             MissingFieldError: The batch lacks a field that the network reads.
         """
         network = self.network
-        missing = [name for name in network.net_fields if name not in batch]
-        if missing:
+        try:
+            read = {name: batch[name] for name in network.net_fields}
+        except KeyError as error:
             raise MissingFieldError(
-                f'The network reads the field "{missing[0]}", which is not given. '
+                f'The network reads the field "{error.args[0]}", which is not given. '
                 f"Given: {', '.join(batch) or 'none'}.",
-                field=missing[0],
-            )
-        inputs = network.numpy_to_tensor({name: batch[name] for name in network.net_fields})
+                field=str(error.args[0]),
+            ) from None
+        inputs = network.numpy_to_tensor(read)
         prediction = network.predict(self.transformation.transform_before_prediction(inputs))
         return network.tensor_to_numpy(self.transformation.transform_before_apply(prediction))
 
-    def save(self, network_dir: Path, progress: checkpoint.Progress) -> Path:
-        """Write the next checkpoint and return its folder."""
+    def save(self, network_dir: Path, progress: checkpoint.Progress, *, best: bool = False) -> Path:
+        """Write the next checkpoint, or the best one, and return its folder."""
         return checkpoint.save(
             network_dir,
             self.config,
@@ -176,7 +244,12 @@ class Learner:
             self.fields,
             self.transformation.normalization,
             progress,
+            best=best,
         )
+
+    def export(self, path: Path, form: str) -> None:
+        """Write network and transformation as one file: see `Network.export`."""
+        self.network.export(path, form, self.transformation, self.fields)
 
     def resume(self, found: checkpoint.Checkpoint) -> None:
         """Go on exactly where a checkpoint was written; the fields are bound already.
@@ -218,7 +291,10 @@ def restored(config: NetworkConfig, path: Path) -> Learner:
 
 
 def _make(kind: str, reference: Any, arguments: dict[str, Any], base: type[Any]) -> Any:
-    make = resolve(kind, reference)
+    return _made(kind, reference, resolve(kind, reference), arguments, base)
+
+
+def _made(kind: str, reference: Any, make: Any, arguments: dict[str, Any], base: type[Any]) -> Any:
     try:
         component = make(**arguments)
     except TypeError as error:
@@ -226,7 +302,7 @@ def _make(kind: str, reference: Any, arguments: dict[str, Any], base: type[Any])
     if not isinstance(component, base):
         raise ConfigError(
             f"{reference!r} made a {type(component).__name__}, which is no physx {kind}. "
-            "A class of the library itself goes through its plugin, for example "
-            'network="torch/module", network_kwargs={"module": "package.module:Class"}.'
+            "A function that makes one of the library's own goes through its plugin, for example "
+            'network="torch/module", network_kwargs={"module": "package.module:function"}.'
         )
     return component

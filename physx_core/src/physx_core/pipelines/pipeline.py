@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from types import TracebackType
 from typing import ClassVar, Self
 
@@ -40,6 +42,8 @@ class Pipeline(ABC):
     session: Session
     observers: Observers
     _resources: contextlib.ExitStack | None = None
+    _leads = True  # whether this process writes the session; others may help it to train
+    _began = 0.0
 
     @abstractmethod
     def execute(self) -> None:
@@ -48,6 +52,10 @@ class Pipeline(ABC):
     @abstractmethod
     def _open(self, resources: contextlib.ExitStack) -> None:
         """Open everything; what must be closed goes on the stack, in the order of opening."""
+
+    def _components(self) -> Mapping[str, str]:
+        """Return what the run is made of, in words, for ``info.txt``."""
+        return {}
 
     def __enter__(self) -> Self:
         """Open the session and everything that the pipeline works with.
@@ -66,7 +74,9 @@ class Pipeline(ABC):
         self.session = None  # type: ignore[assignment]
         try:
             with contextlib.ExitStack() as resources:
+                self._began = time.monotonic()
                 self._open(resources)
+                self._note_components()
                 self._resources = resources.pop_all()
         except BaseException:
             if self.session is not None:
@@ -83,7 +93,24 @@ class Pipeline(ABC):
         """Close everything."""
         resources, self._resources = self._resources, None
         if resources is not None:
+            self._note_end(error)
             resources.__exit__(kind, error, trace)
+
+    def _note_components(self) -> None:
+        components = self._components()
+        if self._leads and components:
+            texts = (f"{name}: {text}" for name, text in components.items())
+            self.session.note("\n".join(text.replace("\n", "\n  ") for text in texts))
+
+    def _note_end(self, error: BaseException | None) -> None:
+        how = "finished"
+        if isinstance(error, KeyboardInterrupt):
+            how = "interrupted"
+        elif error is not None:
+            how = f"ended by {type(error).__name__}"
+        if self._leads:
+            with contextlib.suppress(OSError):  # the run's own error is the one to tell
+                self.session.note(f"{how} after {time.monotonic() - self._began:.1f} s")
 
     @contextlib.contextmanager
     def _running(self) -> Iterator[None]:
@@ -100,7 +127,10 @@ class Pipeline(ABC):
         environment: EnvironmentConfig | None,
         further: Iterable[Observer] = (),
     ) -> None:
-        """Open the observers of the run."""
+        """Open the observers of the run; only the process that writes the session has any."""
+        if not self._leads:
+            self.observers = Observers([])
+            return
         observers: list[Observer] = [ProgressBar(), ScalarsFile(), *further]
         instance_nb = 0
         if environment is not None:
@@ -121,6 +151,7 @@ class Pipeline(ABC):
         predict: Predict | None = None,
         total: int | None = None,
         in_process: bool = False,
+        replayed: Path | None = None,
     ) -> Source:
         """Open the environments, in this process or in clients.
 
@@ -131,8 +162,10 @@ class Pipeline(ABC):
             predict: The network's prediction for a batch; None: there is no network.
             total: How many rows will be asked; None: unknown.
             in_process: Whether they must run in this process.
+            replayed: Folder of the dataset whose samples they replay; what its environments saved
+                can be loaded. None: they make new samples.
         """
-        services = RunServices(self.session.dataset_dir, self.observers, predict)
+        services = RunServices(self.session.dataset_dir, self.observers, predict, replayed)
         source: Source
         if in_process or not config.as_tcp_ip_client:
             from physx_core.sources.local import LocalSource
@@ -141,12 +174,15 @@ class Pipeline(ABC):
         else:
             from physx_core.sources.clients import ClientSource
 
-            ahead = None if predict is None else 0  # a network that learns changes its answers
+            # A network that learns changes its answers; a row to replay is sent when it is due.
+            ahead = None if predict is None and replayed is None else 0
             source = ClientSource(config, services, seed, run_ahead=ahead, total=total)
         return resources.enter_context(source)
 
     def _record_config(self, seed: int) -> None:
         """Write the options into the session, with the seed that was drawn if none was given."""
+        if not self._leads:
+            return
         plain = {**to_plain(self), "session_name": self.session.name}
         plain = {name.removesuffix("_config"): value for name, value in plain.items()}
         (plain if hasattr(self, "seed") else plain["environment"])["seed"] = seed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -11,9 +12,17 @@ from physx_core import checkpoint
 from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, at_least, options
 from physx_core.dataset import Dataset
 from physx_core.fields import Batch, Field
+from physx_core.pipelines.description import describe_environment_config, describe_learner
+from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.learner import Learner, restored
 from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
-from physx_core.pipelines.storage import describe_environment, open_own
+from physx_core.pipelines.storage import (
+    describe_environment,
+    open_existing,
+    open_own,
+    recording_refused,
+)
+from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.session import Session
 from physx_core.sources.source import Source
 
@@ -21,13 +30,23 @@ from physx_core.sources.source import Source
 @options
 @dataclass(eq=False)
 class Prediction(Pipeline):
-    """Steps the environment and gives it the network's prediction, again and again.
+    """Steps the environments and gives them the network's predictions, again and again.
 
-    The environment runs in this process, whatever ``as_tcp_ip_client`` says.
+    One environment runs in this process. Several (``num_clients``) run in clients, or in this
+    process too with ``as_tcp_ip_client=False``. In each step every instance makes one sample, the
+    network predicts for all of them as one batch, row i for instance i + 1, and each instance gets
+    its row with `Environment.apply_prediction`: the same numbers either way. What an environment
+    asks for itself with `Environment.get_prediction` is predicted sample by sample in this process,
+    but for all clients as one batch, whose results a network may round otherwise.
+
+    With ``load_samples`` the environments replay stored samples, those of
+    ``dataset_config.existing_dir`` or else of the session, mode ``dataset_config.mode``, in the
+    order of writing: each step takes as many as there are instances, which find them in
+    `Environment.sample`. After the last sample comes the first. They are only read.
 
     Attributes:
         learner: The network and its transformation, from the session's checkpoint.
-        source: The environment.
+        source: The environments.
         dataset: The session's own dataset, open for writing, if samples are recorded; else None.
         batch: The present samples, one row for each instance of the environment.
         prediction: The network's prediction for them, in physical units.
@@ -45,7 +64,8 @@ class Prediction(Pipeline):
     step_nb: int = at_least(-1, -1)
     """Number of steps; -1: until Ctrl-C."""
     record: bool = False
-    """Store samples and predictions in the session's dataset, mode "prediction"."""
+    """Store samples and predictions in the session's dataset, mode "prediction"; refused samples
+    too, with `record_wrong_samples`."""
 
     kind: ClassVar[str] = "prediction"
     learner: Learner = field(init=False, repr=False)
@@ -54,20 +74,25 @@ class Prediction(Pipeline):
     batch: Batch = field(init=False, repr=False)
     prediction: Batch = field(init=False, repr=False)
     step_id: int = field(init=False, repr=False, default=0)
+    _stored: StoredRows | None = field(init=False, repr=False, default=None)
 
     def execute(self) -> None:
-        """Run all steps.
+        """Run all steps. Ctrl-C ends the run in order after the present step.
 
         Raises:
             PhysxError: There is no network, or the environment failed.
+            KeyboardInterrupt: Ctrl-C before ``step_nb`` steps were made; a second one ends the run
+                at once.
         """
-        with self._running():
+        with self._running(), deferred_interrupt() as interrupted:
             self.prediction_begin()
-            while self.prediction_condition():
+            while self.prediction_condition() and not interrupted():
                 self.sample_begin()
                 self.predict()
                 self.sample_end()
             self.prediction_end()
+            if self.step_nb >= 0 and self.prediction_condition():
+                raise KeyboardInterrupt
 
     def prediction_begin(self) -> None:
         """The first step is about to be made."""
@@ -82,12 +107,15 @@ class Prediction(Pipeline):
         """A step is about to be made."""
 
     def predict(self) -> None:
-        """Step the environment, ask the network, and give its answer to the environment."""
-        self.batch = self.source.batch(self.source.instance_nb)
-        self.prediction = self.learner.predict(self.batch)
-        self.source.apply(self.prediction)
-        if self.dataset is not None:
-            self._store(self.dataset)
+        """Step the environments, ask the network, and give its answers to the environments."""
+        count = self.source.instance_nb
+        with recording_refused(self.source, self.dataset):
+            stored = None if self._stored is None else self._stored.take_on(count)
+            self.batch = self.source.batch(count, stored)
+            self.prediction = self.learner.predict(self.batch)
+            self.source.apply(self.prediction)
+            if self.dataset is not None:
+                self._store(self.dataset)
 
     def sample_end(self) -> None:
         """Count the step."""
@@ -124,9 +152,13 @@ class Prediction(Pipeline):
         self.learner = restored(
             network, checkpoint.find(place, network.network_name, network.which_network)
         )
+        config = self.dataset_config or DatasetConfig()
+        self._stored, replayed = None, None
+        if environment.load_samples:
+            existing = resources.enter_context(open_existing(self.session, config))
+            self._stored, replayed = StoredRows(existing, config.mode), existing.directory
         self.dataset = None
         if self.record:
-            config = self.dataset_config or DatasetConfig()
             self.dataset = resources.enter_context(open_own(self.session, config))
             self.dataset.update_info(prediction=describe_environment(environment, seed))
         self._record_config(seed)
@@ -136,5 +168,12 @@ class Prediction(Pipeline):
             environment,
             stream_seed(seed, "prediction", 0),
             predict=self.learner.predict,
-            in_process=True,
+            in_process=environment.num_clients == 1,
+            replayed=replayed,
         )
+
+    def _components(self) -> Mapping[str, str]:
+        return {
+            **describe_learner(self.learner),
+            "environment": describe_environment_config(self.environment_config),
+        }

@@ -11,6 +11,7 @@ import numpy as np
 from physx_core.errors import ConnectionRefusedByPeerError, DatasetError, UsageError
 from physx_core.fields import Batch, Sample
 from physx_core.interfaces.visualizer import Observer
+from physx_core.pipelines.storage import PARAMETERS
 from physx_core.scene import Event
 from physx_core.transport.values import decode, encode
 
@@ -21,15 +22,23 @@ Predict: TypeAlias = Callable[[Batch], Batch]
 class RunServices:
     """Answers the requests of environments in this process; the server passes on the clients'."""
 
-    def __init__(self, dataset_dir: Path, observer: Observer, predict: Predict | None) -> None:
+    def __init__(
+        self,
+        dataset_dir: Path,
+        observer: Observer,
+        predict: Predict | None,
+        source_dir: Path | None = None,
+    ) -> None:
         """Keep whom to ask.
 
         Args:
             dataset_dir: Where the instances' parameters are kept.
             observer: Who looks at drawing events.
             predict: The network's prediction; None: the pipeline has no network.
+            source_dir: A dataset that is only read: parameters that are not kept in `dataset_dir`
+                are looked for here.
         """
-        self._dir = dataset_dir
+        self._dir, self._source_dir = dataset_dir, source_dir
         self._observer = observer
         self._predict = predict
 
@@ -50,14 +59,14 @@ class RunServices:
         """
         if self._predict is None:
             raise UsageError(
-                "get_prediction() needs a network, and data generation has none. "
+                "get_prediction() needs a network, and this run has none. "
                 "It works in training and prediction."
             )
         return self._predict(batch)
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
         """Keep an instance's values beside the dataset; earlier ones of other names stay."""
-        path = self._parameters_file(instance_id)
+        path = self._dir / PARAMETERS.format(instance_id)
         path.parent.mkdir(parents=True, exist_ok=True)
         merged = {**self.load_parameters(instance_id), **values}
         partial = path.with_suffix(".partial")
@@ -70,18 +79,16 @@ class RunServices:
         Raises:
             DatasetError: The file is damaged.
         """
-        path = self._parameters_file(instance_id)
-        if not path.exists():
-            return {}
-        try:
-            values: dict[str, Any] = decode(path.read_bytes())
-        except ConnectionRefusedByPeerError as error:
-            raise DatasetError(f"{path} is damaged: {error}") from error
+        values: dict[str, Any] = {}
+        for place in (self._source_dir, self._dir):
+            path = place / PARAMETERS.format(instance_id) if place is not None else None
+            if path is not None and path.exists():
+                try:
+                    values |= decode(path.read_bytes())
+                except ConnectionRefusedByPeerError as error:
+                    raise DatasetError(f"{path} is damaged: {error}") from error
         return values
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:
         """Hand drawing events to the observers."""
         self._observer.events(instance_id, step, events)
-
-    def _parameters_file(self, instance_id: int) -> Path:
-        return self._dir / f"parameters_{instance_id}.bin"

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from physx_core.config import DatasetConfig, EnvironmentConfig, to_plain
 from physx_core.dataset import Dataset
-from physx_core.errors import DatasetNotFoundError, UsageError
+from physx_core.errors import ConfigError, DatasetNotFoundError, UsageError, WrongSamplesError
 from physx_core.plugins import reference_of
 from physx_core.session import Session, installed_versions
+from physx_core.sources.source import Source
+
+WRONG = "wrong"
+"""Mode of the samples that `check_sample` refused."""
+PARAMETERS = "parameters_{}.bin"
+"""Name of the file beside a dataset that holds what an instance saved."""
 
 
 def open_own(session: Session, config: DatasetConfig) -> Dataset:
@@ -45,6 +54,89 @@ def open_existing(session: Session, config: DatasetConfig) -> Dataset:
                 "makes the samples."
             )
         raise
+
+
+def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) -> None:
+    """Check that a training's samples come from one place.
+
+    Raises:
+        ConfigError: They do not.
+    """
+    if environment is None:
+        return
+    if environment.load_samples and environment.always_produce:
+        raise ConfigError(
+            "load_samples replays stored samples and always_produce makes new ones: choose one. "
+            "To replay in every epoch, set only_first_epoch=False."
+        )
+    if config.existing_dir is not None and not environment.load_samples:
+        raise ConfigError(
+            "A training takes its samples from existing_dir or from an environment, not both. To "
+            "send the stored samples through the environment, set load_samples=True."
+        )
+
+
+def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
+    """Copy an existing dataset into a session's own one: all rows, and the environments' values.
+
+    The existing one is not changed. Rows that lie in whole partitions are copied by the system,
+    which shares them on the disk where the file system can.
+
+    Args:
+        dataset: The session's own dataset, open for writing.
+        config: Names the existing one; None: the session's own samples are there already.
+
+    Raises:
+        ConfigError: The session's own dataset has samples of its own.
+        DatasetNotFoundError: There is no such dataset.
+        DatasetError: It is damaged, or the disk is full.
+    """
+    if config.existing_dir is None:
+        return
+    if any(dataset.num_samples(mode) for mode in dataset.modes):
+        raise ConfigError(
+            "The session has samples of its own already, so it cannot begin with a copy of "
+            f"{config.existing_dir}. To go on with its own, leave existing_dir out; otherwise "
+            "take a new session."
+        )
+    dataset.merge(config.existing_dir)
+    with Dataset.open(config.existing_dir) as existing:
+        dataset.update_info(**existing.info, copied_from=str(existing.directory))
+        for path in existing.directory.glob(PARAMETERS.format("*")):
+            shutil.copyfile(path, dataset.directory / path.name)
+
+
+def is_copy(directory: Path) -> bool:
+    """Return whether a dataset began as a copy of another one."""
+    with contextlib.suppress(DatasetNotFoundError), Dataset.open(directory) as dataset:
+        return "copied_from" in dataset.info
+    return False
+
+
+@contextlib.contextmanager
+def recording_refused(source: Source, dataset: Dataset | None) -> Iterator[None]:
+    """Store what `check_sample` refuses of the batch that is made meanwhile, behind the batch.
+
+    It goes to the mode "wrong", also where too many refused samples end the run. If the batch
+    cannot be made for another reason, what was refused is not stored either.
+
+    Args:
+        source: Makes the batch.
+        dataset: Gets the samples; None: they are forgotten.
+    """
+    try:
+        yield
+    except WrongSamplesError:
+        _store_refused(source, dataset)
+        raise
+    _store_refused(source, dataset)
+
+
+def _store_refused(source: Source, dataset: Dataset | None) -> None:
+    rows = source.take_refused()
+    if rows and dataset is not None:
+        dataset.define_fields(WRONG, source.fields)
+        dataset.append(WRONG, rows)
 
 
 def describe_environment(config: EnvironmentConfig, seed: int) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import statistics
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,12 +14,24 @@ from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, a
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError
 from physx_core.fields import Batch
+from physx_core.interfaces.group import Group
+from physx_core.interfaces.network import Network
+from physx_core.observers import statistics_observers
+from physx_core.pipelines.description import describe_training
 from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.learner import Learner
 from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
-from physx_core.pipelines.storage import describe_environment, open_existing, open_own
+from physx_core.pipelines.resuming import dataset_to_resume, last_checkpoint
+from physx_core.pipelines.storage import (
+    check_sources,
+    copy_existing,
+    describe_environment,
+    open_existing,
+    open_own,
+)
 from physx_core.pipelines.training_data import TrainingData
-from physx_core.plugins import resolve
+from physx_core.pipelines.training_record import BestEpoch, TrainingRecord
+from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
 from physx_core.sources.source import Source
 
@@ -29,11 +41,24 @@ from physx_core.sources.source import Source
 class Training(Pipeline):
     """Trains a network for ``epoch_nb`` epochs of ``batch_nb`` batches of ``batch_size`` samples.
 
-    The samples come from an existing dataset (``dataset_config.existing_dir``), from the session's
-    own one, or from environments: these make new samples in the first epoch, which are stored and
-    used again in the later ones, or in every epoch with ``always_produce``.
+    The samples come from
+
+    - an existing dataset (``dataset_config.existing_dir``), which is only read, or the session's
+      own one;
+    - environments: they make new samples in the first epoch, which are stored and used again in the
+      later ones, or in every epoch with ``always_produce``;
+    - an existing dataset by way of environments, with ``load_samples``: the session gets its own
+      copy of the dataset; in the first epoch, or in every one with ``only_first_epoch=False``, each
+      stored sample goes through an environment, and what that makes of it is learned from and takes
+      its place in the copy: see `TrainingData`. Without ``existing_dir`` they are the samples that
+      the session itself has.
+
+    Several processes that ``torchrun`` starts train one network together on stored samples: each
+    learns from its share of every batch, which is ``batch_size`` times the number of processes, and
+    the first one writes the session.
 
     Attributes:
+        group: The processes that train together.
         learner: The network, its transformation and its optimization.
         data: Where the batches come from.
         batch: The present batch, in physical units.
@@ -42,6 +67,7 @@ class Training(Pipeline):
         losses: What `Optimization.transform_loss` returned for the present batch.
         training_loss: Mean loss over the batches of the last epoch; NaN before its end.
         validation_loss: Mean loss over the samples to validate with; NaN before the first time.
+        best: The epoch with the smallest loss, whose network is the checkpoint "best".
         checkpoint_path: Folder of the checkpoint that was written last.
     """
 
@@ -66,10 +92,22 @@ class Training(Pipeline):
     validation_every: int = at_least(0, 1)
     """Validate after each so many epochs, if the dataset has a validation mode or
     `validation_split` holds samples back; 0: never."""
+    patience: int | None = at_least(1, None)
+    """Stop after so many validations in a row without improvement of the loss, or epochs where
+    nothing is validated; None: never. The network stays as it is then; "best" is beside it."""
+    min_improvement: float = at_least(0, 0.0)
+    """How much smaller than the best one a loss must be to be an improvement."""
+    statistics: Sequence[str | type[Any]] = ()
+    """Where numbers go beside stats/scalars.csv, for example "torch/tensorboard" or "rerun"."""
+    statistics_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of each of them, by its name."""
+    histograms_every: int = at_least(0, 0)
+    """Record the distribution of weights and gradients after each so many epochs; 0: never."""
     resume: bool = field(default=False, metadata={"recorded": False})
     """Go on from the session's last checkpoint, until `epoch_nb` epochs are made in all."""
 
     kind: ClassVar[str] = "training"
+    group: Group = field(init=False, repr=False, default_factory=Group)
     learner: Learner = field(init=False, repr=False)
     data: TrainingData = field(init=False, repr=False)
     batch: Batch = field(init=False, repr=False)
@@ -78,6 +116,7 @@ class Training(Pipeline):
     losses: dict[str, Any] = field(init=False, repr=False, default_factory=dict)
     training_loss: float = field(init=False, repr=False, default=float("nan"))
     validation_loss: float = field(init=False, repr=False, default=float("nan"))
+    best: BestEpoch = field(init=False, repr=False)
     checkpoint_path: Path | None = field(init=False, repr=False, default=None)
 
     def execute(self) -> None:
@@ -97,11 +136,11 @@ class Training(Pipeline):
                     self.optimize()
                     self.batch_count()
                     self.batch_end()
-                    if interrupted() and self.batch_condition():
+                    if self.group.any(interrupted()) and self.batch_condition():
                         self._end_early()
                 self.epoch_count()
                 self.epoch_end()
-                if interrupted():
+                if self.group.any(interrupted()):
                     self._end_early()
             self.train_end()
 
@@ -110,15 +149,16 @@ class Training(Pipeline):
         self.epoch_id = self._resumed.epoch
 
     def epoch_condition(self) -> bool:
-        """Return whether there are epochs left."""
-        return self.epoch_id < self.epoch_nb
+        """Return whether there are epochs left and the network still improves."""
+        return self.epoch_id < self.epoch_nb and not self.stopped
 
     def epoch_begin(self) -> None:
         """An epoch is about to begin."""
         begins = self.epoch_id == self._resumed.epoch
         self.batch_id = self._resumed.batch if begins else 0
-        self._losses_of_epoch: list[float] = []
         self._epoch_batches = self.data.begin_epoch(self.epoch_id, self.learner.batch_fields)
+        if self.data.has_changed:
+            self.learner.normalize(self.data.normalization())
         if begins:
             self.data.skip(self._resumed.batches_read)
             left = (self.epoch_nb - self.epoch_id) * self._epoch_batches - self.batch_id
@@ -145,8 +185,7 @@ class Training(Pipeline):
     def batch_count(self) -> None:
         """Count the batch and record its losses."""
         self.batch_id += 1
-        self._losses_of_epoch.append(self.losses["loss"])
-        values = {f"{name}/batch": value for name, value in self.losses.items()}
+        values = self._record.add(self.losses)
         number = self.epoch_id * self._epoch_batches + self.batch_id
         self.observers.scalars(values, number, "batch")
         self.observers.advance(1)
@@ -161,33 +200,77 @@ class Training(Pipeline):
 
     def epoch_end(self) -> None:
         """Validate, record the epoch's losses, and keep a checkpoint if that is wanted."""
-        if self._losses_of_epoch:
-            self.training_loss = statistics.fmean(self._losses_of_epoch)
-        values = {"loss/training": self.training_loss}
-        every = self.validation_every
-        if every and self.epoch_id % every == 0 and self.data.has_validation:
-            self.validation_loss = values["loss/validation"] = self.validate()
-        self.learner.epoch_end()
+        means = self._record.take_means()
+        self.training_loss = means.get("loss", float("nan"))
+        values = {f"{name}/training": value for name, value in means.items()}
+        if self.learner.learning_rate is not None:
+            values["learning_rate"] = self.learner.learning_rate
+        every, judged = self.validation_every, self.training_loss
+        validates = every > 0 and self.data.has_validation
+        is_due = not validates or self.epoch_id % every == 0
+        if validates:
+            judged = self._validate(values) if is_due else float("nan")
         self.observers.scalars(values, self.epoch_id, "epoch")
+        if self.histograms_every and self.epoch_id % self.histograms_every == 0:
+            self.observers.histograms(self.learner.distributions(), self.epoch_id, "epoch")
+        if is_due and self.best.judge(judged, self.epoch_id):
+            wanted = self.network_config.save_best
+            if wanted or (wanted is None and (validates or self.patience is not None)):
+                self._write(best=True)
+        self.learner.epoch_end(judged)
         if self.network_config.save_each_epoch and self.epoch_id < self.epoch_nb:
             self.save_checkpoint()
 
+    def _validate(self, values: dict[str, float]) -> float:
+        losses = self.validate()
+        values |= {f"{name}/validation": value for name, value in losses.items()}
+        self.validation_loss = losses["loss"]
+        return self.validation_loss
+
     def train_end(self) -> None:
-        """The last epoch is over: keep the network."""
+        """The last epoch is over: keep the network, and tell if there should have been more."""
         self.observers.end()
+        if self.stopped and self._leads:
+            self.observers.note(self.stopped)
+            self.session.note(self.stopped)
         self.save_checkpoint()
 
-    def validate(self) -> float:
-        """Return the mean loss over the samples to validate with."""
-        return self.learner.mean_loss(self.data.validation_batches(self.learner.batch_fields))
+    @property
+    def stopped(self) -> str:
+        """Why the training ends before its last epoch; empty where it does not."""
+        if self.patience is None or self.epoch_id >= self.epoch_nb:
+            return ""
+        return self.best.reason_to_stop(self.patience)
+
+    def validate(self) -> dict[str, float]:
+        """Return the mean loss, and other statistics, over the samples to validate with."""
+        batches = self.data.validation_batches(self.learner.batch_fields)
+        return self.learner.mean_losses(batches)
 
     def save_checkpoint(self) -> Path:
-        """Write the network into the session and return the checkpoint's folder."""
-        progress = Progress(
-            self.epoch_id, self.batch_id, self.data.batches_read, self._resumed.seed
-        )
-        self.checkpoint_path = self.learner.save(self.session.network_dir, progress)
+        """Write the network into the session and return the checkpoint's folder.
+
+        Where nothing was learned since the last one was written, that stays the last.
+        """
+        now = (self.epoch_id, self.batch_id)
+        if self.checkpoint_path is None or self._saved != now:
+            self._saved: tuple[int, int] = now
+            self.checkpoint_path = self._write()
         return self.checkpoint_path
+
+    def _write(self, *, best: bool = False) -> Path:
+        written = None
+        if self._leads:
+            progress = Progress(
+                self.epoch_id,
+                self.batch_id,
+                self.data.batches_read,
+                self._resumed.seed,
+                self.best.state,
+                self._record.state,
+            )
+            written = str(self.learner.save(self.session.network_dir, progress, best=best))
+        return Path(self.group.tell(written))
 
     def _end_early(self) -> None:
         self.save_checkpoint()
@@ -198,24 +281,26 @@ class Training(Pipeline):
     def _open(self, resources: contextlib.ExitStack) -> None:
         config = self.dataset_config or DatasetConfig()
         environment = self.environment_config
-        if environment is not None and config.existing_dir is not None:
-            raise ConfigError(
-                "A training takes its samples from existing_dir or from an environment, not both."
-            )
-        last = self._last_checkpoint() if self.resume else None
-        if last is not None:
-            environment = self._environment_to_resume(last.progress)
-        self._resumed = last.progress if last else Progress(0, 0, 0, chosen_seed(self.seed))
+        check_sources(config, environment)
+        self._join_group()
+        last = None
+        if self.resume:
+            session = Session.existing(self.session_dir, self.session_name)
+            last = last_checkpoint(session, self.network_config.network_name, environment)
+            config, environment = dataset_to_resume(session, config), None
+        self._begin_with(last)
         self._seed_network(self._resumed.seed)
         self.learner = Learner(self.network_config, trains=True)
         if config.existing_dir is not None:  # a missing dataset leaves no session behind
             Dataset.open(config.existing_dir).close()
-        new = self.new_session and not self.resume
-        self.session = Session.create(self.session_dir, self.session_name, new)
+        self.session = self._make_session()
         make = open_existing if environment is None else open_own
         dataset = resources.enter_context(make(self.session, config))
+        if environment is not None:
+            copy_existing(dataset, config)
         self._record_config(self._resumed.seed)
-        self._observe(resources, environment)
+        further = statistics_observers(self.statistics, self.statistics_kwargs, environment)
+        self._observe(resources, environment, further if self._leads else ())
         source = None
         if environment is not None:
             source = self._open_environments(resources, environment, dataset)
@@ -223,35 +308,58 @@ class Training(Pipeline):
             dataset,
             source,
             config,
-            batch_size=self.batch_size,
+            batch_size=self.batch_size * self.group.size,
             batch_nb=self.batch_nb,
             seed=self._resumed.seed,
-            always_produce=environment is not None and environment.always_produce,
+            environment=environment,
             data_type=self.network_config.data_type,
         )
-        if source is None:
-            self.learner.bind(self.data.fields, self.data.normalization())
+        fields = self.data.fields
+        shapes = [fields[name].shape for name in self.learner.batch_fields if name in fields]
+        if not self.data.produces or None not in shapes:  # else the first batch tells
+            self.learner.bind(fields, self.data.normalization())
         self._load_parameters(last)
+        self.learner.join(self.group)
         self.learner.network.set_train()
 
-    def _last_checkpoint(self) -> checkpoint.Checkpoint:
-        session = Session.existing(self.session_dir, self.session_name)
-        name = self.network_config.network_name
-        return checkpoint.read(checkpoint.find(session.network_dir, name, -1))
-
-    def _environment_to_resume(self, progress: Progress) -> EnvironmentConfig | None:
-        """Return None: all samples are stored already, or the training cannot be resumed."""
-        environment = self.environment_config
-        if environment is not None and (environment.always_produce or progress.epoch == 0):
+    def _join_group(self) -> None:
+        config = self.network_config
+        if config.network is None:  # the learner tells it
+            return
+        component, _ = resolve_network(config.network, config.network_kwargs)
+        join = getattr(component, "join_group", Network.join_group)
+        self.group = join(config.device)
+        self._leads = self.group.leads
+        if self.group.size > 1 and self.environment_config is not None and not self.resume:
             raise ConfigError(
-                "A training cannot be resumed while environments make its samples: they would "
-                "begin anew. Train on the stored samples: leave the environment out."
+                "Several processes train on stored samples only, each on its share: make the "
+                "samples with physx generate first, and leave the environment out."
             )
-        return None
+
+    def _begin_with(self, last: checkpoint.Checkpoint | None) -> None:
+        """Begin at the first epoch, or where a checkpoint was written."""
+        seed = self.group.tell(chosen_seed(self.seed))
+        self._resumed = last.progress if last else Progress(0, 0, 0, seed)
+        self._saved = (self._resumed.epoch, self._resumed.batch)
+        self.checkpoint_path = last.path if last else None
+        self._record = TrainingRecord(self._resumed.record)
+        self.best = BestEpoch(self._resumed.best, self.min_improvement)
+
+    def _make_session(self) -> Session:
+        made = None
+        if self._leads:
+            new = self.new_session and not self.resume
+            made = Session.create(self.session_dir, self.session_name, new)
+        path = Path(self.group.tell(made and str(made.path)))
+        return made or Session(path)
+
+    def _components(self) -> Mapping[str, str]:
+        return describe_training(self.learner, self.environment_config, self.data.dataset)
 
     def _seed_network(self, seed: int) -> None:
         if self.network_config.network is not None:
-            component = resolve("network", self.network_config.network)
+            config = self.network_config
+            component, _ = resolve_network(config.network, config.network_kwargs)
             if hasattr(component, "set_seed"):
                 component.set_seed(seed)
 

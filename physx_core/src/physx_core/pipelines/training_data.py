@@ -5,16 +5,34 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
-from physx_core.config import DatasetConfig
+import numpy as np
+
+from physx_core.config import DatasetConfig, EnvironmentConfig
 from physx_core.dataset import Dataset, Subset
+from physx_core.dataset.definitions import compare_fields
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
-from physx_core.fields import Batch, Field
+from physx_core.fields import RESERVED, Batch, Field
+from physx_core.pipelines.storage import recording_refused
+from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.sources.source import Source
 from physx_core.statistics import Normalization
 
 
 class TrainingData:
-    """Batches that environments make, or that the dataset holds.
+    """Batches that environments make, or that the dataset holds, or that go from one to the other.
+
+    Without environments all epochs read the dataset. Environments make new samples in the first
+    epoch, or in each with ``always_produce``; with ``load_samples`` they replay stored ones in the
+    first epoch, or in each with ``only_first_epoch=False``. The other epochs read the dataset.
+
+    In an epoch that replays, the samples to learn from are taken once in each pass, in the order of
+    writing or, with ``shuffle``, in a new random one; an epoch is one pass, or ``batch_nb``
+    batches. Each goes to an instance, which finds it in `Environment.sample`; what it makes of it
+    has the same fields, is checked like any sample, is learned from, and takes the place of the
+    stored values in the dataset. The row keeps its ``env_id``, ``episode`` and ``step``. A later
+    replay begins with what the earlier one made. Samples that are held back, and those of the mode
+    "validation", are not replayed. What normalizes is computed from the stored rows before the
+    first epoch, and anew before each epoch that follows a replay.
 
     Attributes:
         dataset: Where batches are read from, and stored if environments make them.
@@ -33,7 +51,7 @@ class TrainingData:
         batch_size: int,
         batch_nb: int | None,
         seed: int,
-        always_produce: bool,
+        environment: EnvironmentConfig | None,
         data_type: str,
     ) -> None:
         """Keep where to read and what.
@@ -45,15 +63,17 @@ class TrainingData:
             batch_size: Samples in a batch.
             batch_nb: Batches in an epoch; None: one pass over the stored samples.
             seed: Seed of the order of samples.
-            always_produce: Whether environments make new samples in every epoch.
+            environment: What the environments are for; None without a source.
             data_type: Floating type of the batches that are read.
 
         Raises:
             ConfigError: Environments make the samples, and `batch_nb` is missing or some are to
                 be held back; or there are too few to hold back some.
-            DatasetError: The dataset alone is read, and has no samples of the mode.
+            DatasetError: Stored samples are needed, and the dataset has none of the mode.
+            FieldsMismatchError: The environments have other fields than the samples to replay.
         """
-        if source is not None and batch_nb is None:
+        replay = environment is not None and environment.load_samples
+        if source is not None and batch_nb is None and not replay:
             raise ConfigError(
                 "Training.batch_nb is missing: environments make as many batches as it says."
             )
@@ -62,23 +82,27 @@ class TrainingData:
         self._config = config
         self._batch_size, self._batch_nb = batch_size, batch_nb
         self._seed = seed
-        self._always_produce = always_produce
+        self._always = environment is not None and (
+            not environment.only_first_epoch if replay else environment.always_produce
+        )
         self._data_type = data_type
         self._mode = config.mode
         self._reader: Iterator[Batch] | None = None
-        self._produces = source is not None
+        self._at_work = source is not None
+        self._changed = False
         if source is None and not self._count(self._mode):
             raise DatasetError(
                 f'The dataset has no samples of mode "{self._mode}" to train on. '
                 f"It has: {listed(dataset.modes)}."
             )
-        self.parts = self._split()
+        self.parts = self._split(replay)
+        self._stored = self._stored_rows(source) if replay and source is not None else None
 
-    def _split(self) -> dict[str, Subset]:
+    def _split(self, replay: bool) -> dict[str, Subset]:
         share = self._config.validation_split
         if not share:
             return {}
-        if self.source is not None:
+        if self.source is not None and not replay:
             raise ConfigError(
                 "DatasetConfig.validation_split holds back stored samples, but environments make "
                 'these. Make the samples first, or make others in the mode "validation".'
@@ -88,6 +112,18 @@ class TrainingData:
         shares = {"training": 1 - share, "validation": share}
         return self.dataset.split(self._mode, shares, by=self._config.split_by)
 
+    def _stored_rows(self, source: Source) -> StoredRows:
+        """Return the rows to replay, which have the environments' fields."""
+        part = self.parts.get("training")
+        random = np.random.default_rng([self._seed, 1]) if self._config.shuffle else None
+        rows = StoredRows(self.dataset, self._mode, part.rows if part else None, random)
+        known, given = (
+            {name: field for name, field in fields.items() if name not in RESERVED}
+            for fields in (self.fields, {field.name: field for field in source.fields})
+        )
+        compare_fields(f'The environment cannot replay mode "{self._mode}", which', known, given)
+        return rows
+
     def begin_epoch(self, epoch_id: int, names: Sequence[str]) -> int:
         """Get ready for an epoch and return its number of batches.
 
@@ -95,8 +131,8 @@ class TrainingData:
             epoch_id: Number of the epoch, counted from 0.
             names: Fields that the batches read from the dataset shall hold.
         """
-        self._produces = self.source is not None and (epoch_id == 0 or self._always_produce)
-        if not self._produces and self._reader is None:
+        self._at_work = self.source is not None and (epoch_id == 0 or self._always)
+        if not self._at_work and self._reader is None:
             part = self.parts.get("training")
             batches = part.batches if part else partial(self.dataset.batches, self._mode)
             self._reader = batches(
@@ -112,15 +148,27 @@ class TrainingData:
 
     def next_batch(self) -> Batch:
         """Return the next batch in physical units; stored already if environments made it."""
-        if self._produces and self.source is not None:
-            batch = self.source.batch(self._batch_size)
-            self.dataset.define_fields(self._mode, self.source.fields)
-            self.dataset.append(self._mode, batch)
-            return batch
+        if self._at_work and self.source is not None:
+            with recording_refused(self.source, self.dataset):
+                if self._stored is not None:
+                    return self._replayed(self.source, self._stored)
+                batch = self.source.batch(self._batch_size)
+                self.dataset.define_fields(self._mode, self.source.fields)
+                self.dataset.append(self._mode, batch)
+                return batch
         if self._reader is None:
             raise UsageError("next_batch() needs begin_epoch() before it.")
         self.batches_read += 1
         return next(self._reader)
+
+    def _replayed(self, source: Source, stored: StoredRows) -> Batch:
+        """Have the environments replay the next stored samples, and store what they make."""
+        index, rows = stored.take(self._batch_size)
+        batch = source.batch(len(index), rows)
+        made = {name: values for name, values in batch.items() if name not in RESERVED}
+        self.dataset.update(self._mode, index, made)
+        self._changed = True
+        return batch
 
     def skip(self, batches: int) -> None:
         """Pass over batches that an earlier part of the training has read."""
@@ -129,8 +177,13 @@ class TrainingData:
 
     @property
     def produces(self) -> bool:
-        """Whether environments make the batches of the present epoch."""
-        return self._produces
+        """Whether environments make new samples in the present epoch."""
+        return self._at_work and self._stored is None
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether stored samples were replaced since `normalization` was called."""
+        return self._changed
 
     def validation_batches(self, names: Sequence[str]) -> Iterator[Batch]:
         """Return the batches to validate with, in the order of writing."""
@@ -145,16 +198,19 @@ class TrainingData:
 
     @property
     def fields(self) -> Mapping[str, Field]:
-        """The stored fields by name."""
+        """The stored fields by name; those of the environments as long as nothing is stored."""
+        if self.source is not None and not self._count(self._mode):
+            return {field.name: field for field in self.source.fields}
         return self.dataset.fields(self._mode)
 
     def normalization(self) -> dict[str, Normalization]:
         """Return what normalizes the fields; empty where nothing shall be normalized."""
-        if not self._config.normalize:
+        self._changed = False
+        if not self._config.normalize or not self._count(self._mode):
             return {}
         if self.parts:
             return self.parts["training"].normalization()
-        if self._config.recompute_normalization and not self._produces:
+        if self._config.recompute_normalization and not self.produces:
             return self.dataset.recompute_normalization(self._mode)
         return self.dataset.normalization_of(self._mode)
 

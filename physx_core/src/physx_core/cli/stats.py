@@ -1,0 +1,104 @@
+"""``physx stats``: the numbers of a training."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import math
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from physx_core.errors import MissingLibraryError, SessionError
+from physx_core.observers import read_scalars
+
+BARS = "▁▂▃▄▅▆▇█"
+
+
+@dataclass
+class Stats:
+    """Show the numbers that were recorded in a session."""
+
+    session: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SESSION")]
+    """The session's folder."""
+    width: int = 32
+    """Length of the spark lines."""
+    tensorboard: bool = False
+    """Show them in TensorBoard: start it, tell its address, and end it with Ctrl-C."""
+    port: int = 6006
+    """Port that TensorBoard listens at, on this machine only."""
+
+
+def run(words: Sequence[str]) -> None:
+    """Print a line for each number, or start TensorBoard.
+
+    Raises:
+        SessionError: The session has no numbers, or none for TensorBoard.
+        MissingLibraryError: TensorBoard is not installed.
+    """
+    options = tyro.cli(Stats, args=words, prog="physx stats")
+    if options.tensorboard:
+        _start_tensorboard(Path(options.session), options.port)
+        return
+    numbers = read_scalars(Path(options.session))
+    head = ("name", "per", "number", "last", "min", "max", "mean")
+    lines = [head, *(_line(*key, list(steps.values())) for key, steps in numbers.items())]
+    curves = ["", *(spark_line(list(steps.values()), options.width) for steps in numbers.values())]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
+    for line, curve in zip(lines, curves, strict=True):
+        columns = [f"{line[0]:{widths[0]}}", f"{line[1]:{widths[1]}}"]
+        columns += [f"{text:>{width}}" for text, width in zip(line[2:], widths[2:], strict=True)]
+        print("  ".join([*columns, curve]).rstrip())
+
+
+def _line(timeline: str, name: str, values: list[float]) -> tuple[str, ...]:
+    finite = [value for value in values if math.isfinite(value)] or [math.nan]
+    figures = (values[-1], min(finite), max(finite), statistics.fmean(finite))
+    return name, timeline, str(len(values)), *(f"{value:.4g}" for value in figures)
+
+
+def spark_line(values: Sequence[float], width: int) -> str:
+    """Return a curve of at most `width` bars from the smallest to the largest value.
+
+    Each bar is the mean of as many values as there are to a bar. Where all values are positive and
+    span more than a factor of 100, the bars are of their logarithms. NaN and infinity are an "x".
+    """
+    size = min(width, len(values))
+    edges = [len(values) * number // max(1, size) for number in range(size + 1)]
+    means = [statistics.fmean(values[a:b]) for a, b in itertools.pairwise(edges)]
+    finite = [mean for mean in means if math.isfinite(mean)]
+    if finite and min(finite) > 0 and max(finite) > 100 * min(finite):
+        means = [math.log(mean) if math.isfinite(mean) else mean for mean in means]
+    return "".join(_bars(means))
+
+
+def _bars(values: Sequence[float]) -> Iterable[str]:
+    finite = [value for value in values if math.isfinite(value)]
+    low = min(finite, default=0.0)
+    span = max(finite, default=0.0) - low
+    for value in values:
+        if not math.isfinite(value):
+            yield "x"
+        else:
+            yield BARS[int((value - low) / span * (len(BARS) - 1) + 0.5)] if span else BARS[0]
+
+
+def _start_tensorboard(session: Path, port: int) -> None:
+    folder = session / "stats" / "tensorboard"
+    if not folder.is_dir():
+        raise SessionError(
+            f'There is no {folder}: train with statistics=["torch/tensorboard"], or '
+            "--statistics torch/tensorboard. Without --tensorboard a table is printed."
+        )
+    if importlib.util.find_spec("tensorboard") is None:
+        raise MissingLibraryError(
+            "physx stats --tensorboard", "tensorboard", "tensorboard", "physx-torch"
+        )
+    place = ("--logdir", str(folder), "--host", "127.0.0.1", "--port", str(port))
+    subprocess.run([sys.executable, "-m", "tensorboard.main", *place], check=False)

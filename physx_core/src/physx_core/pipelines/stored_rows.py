@@ -1,0 +1,91 @@
+"""StoredRows: stored samples, to be sent through environments pass after pass."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physx_core.dataset import Dataset
+from physx_core.errors import DatasetError, listed
+from physx_core.fields import Batch
+
+_AHEAD = 1 << 22
+
+Index = NDArray[np.intp]
+
+
+class StoredRows:
+    """Rows of a mode, all of them in each pass: in the order of writing, or in a new random one.
+
+    They are read some ahead, about 4 MB, but not beyond the end of a pass: what is stored in the
+    place of rows that were given is found by the next pass. Rows that are added later are in none.
+
+    Attributes:
+        count: How many rows a pass has.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        mode: str,
+        rows: Index | None = None,
+        random: np.random.Generator | None = None,
+    ) -> None:
+        """Keep what to read.
+
+        Args:
+            dataset: Where the rows are.
+            mode: Their mode.
+            rows: Numbers of the rows of a pass; None: all that there are now.
+            random: Draws the order of each pass; None: the order of `rows`.
+
+        Raises:
+            DatasetError: The mode has no rows.
+        """
+        if mode not in dataset.modes or not dataset.num_samples(mode):
+            raise DatasetError(
+                f'The dataset in {dataset.directory} has no samples of mode "{mode}" to send '
+                f"through an environment. It has: {listed(dataset.modes)}."
+            )
+        self._view = dataset[mode]
+        self._rows = np.arange(dataset.num_samples(mode)) if rows is None else rows
+        self.count = len(self._rows)
+        self._random = random
+        nbytes = sum(view.field.nbytes for _, view in self._view.items())
+        self._ahead = max(1, _AHEAD // max(1, nbytes))
+        self._order: Index = self._rows[:0]
+        self._given = self._start = self._stop = 0
+        self._block: Batch = {}
+
+    def take(self, count: int) -> tuple[Index, Batch]:
+        """Return the next rows of the pass, fewer than `count` at its end.
+
+        Returns:
+            Their numbers in the mode, and the rows: field name to array of shape
+            (rows, *field shape).
+        """
+        if self._given == len(self._order):
+            random = self._random
+            self._order = self._rows if random is None else random.permutation(self._rows)
+            self._given = self._start = self._stop = 0
+        first, last = self._given, min(self._given + count, self.count)
+        if last > self._stop:
+            self._start, self._stop = first, min(first + max(count, self._ahead), self.count)
+            index = self._order[self._start : self._stop]
+            self._block = {name: view[index] for name, view in self._view.items()}
+        self._given = last
+        place = slice(first - self._start, last - self._start)
+        return self._order[first:last], {name: rows[place] for name, rows in self._block.items()}
+
+    def take_on(self, count: int) -> Batch:
+        """Return exactly `count` rows; after the last one of a pass comes the first of the next."""
+        index, rows = self.take(count)
+        parts = [rows]
+        left = count - len(index)
+        while left:
+            index, rows = self.take(left)
+            parts.append(rows)
+            left -= len(index)
+        if len(parts) == 1:
+            return rows
+        return {name: np.concatenate([part[name] for part in parts]) for name in rows}

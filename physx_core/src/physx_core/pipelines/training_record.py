@@ -1,0 +1,112 @@
+"""TrainingRecord and BestEpoch: the numbers of a training, and what they say of its epochs."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+RECENT = 50
+"""Number of batches that the running mean and variance are of."""
+
+
+class TrainingRecord:
+    """Sums over the present epoch, and the losses of the last batches."""
+
+    def __init__(self, state: Mapping[str, Any]) -> None:
+        """Begin, or go on where `state` was taken; it is empty at the begin."""
+        self._count: int = state.get("count", 0)
+        self._sums: dict[str, float] = dict(state.get("sums", {}))
+        self._recent = deque[float](state.get("recent", ()), RECENT)
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """All that a resumed training needs, as plain data."""
+        return {"count": self._count, "sums": dict(self._sums), "recent": list(self._recent)}
+
+    def add(self, losses: Mapping[str, float]) -> dict[str, float]:
+        """Count a batch and return its numbers, to be recorded.
+
+        These are ``<name>/batch`` for each entry, and mean and sample variance of the loss over the
+        last `RECENT` batches, ``loss/mean`` and ``loss/variance``.
+
+        Args:
+            losses: The batch's statistics, ``loss`` among them.
+        """
+        values, sums = {}, self._sums
+        for name, value in losses.items():
+            values[f"{name}/batch"] = number = float(value)
+            sums[name] = sums.get(name, 0.0) + number
+        self._count += 1
+        recent = self._recent
+        recent.append(values["loss/batch"])
+        size = len(recent)
+        mean = values["loss/mean"] = sum(recent) / size
+        squares = sum([(loss - mean) * (loss - mean) for loss in recent])
+        values["loss/variance"] = squares / (size - 1) if size > 1 else 0.0
+        return values
+
+    def take_means(self) -> dict[str, float]:
+        """Return the means over the epoch's batches by name, and begin a new epoch."""
+        means = {name: total / self._count for name, total in self._sums.items()}
+        self._count, self._sums = 0, {}
+        return means
+
+
+class BestEpoch:
+    """Knows the epoch with the smallest loss, and since when there was no real improvement.
+
+    Attributes:
+        loss: The smallest loss so far.
+        epoch: Number of the epochs that were finished then.
+        waited: How many epochs were judged since one that was better by `min_improvement`.
+    """
+
+    def __init__(self, state: Mapping[str, Any], min_improvement: float) -> None:
+        """Begin, or go on where `state` was taken; it is empty at the begin.
+
+        Args:
+            state: See `state`.
+            min_improvement: How much smaller a loss must be to count as an improvement.
+        """
+        self.loss: float = state.get("loss", math.inf)
+        self.epoch: int = state.get("epoch", 0)
+        self.waited: int = state.get("waited", 0)
+        self._reference: float = state.get("reference", math.inf)
+        self._min_improvement = min_improvement
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """All that a resumed training needs, as plain data."""
+        return {
+            "loss": self.loss,
+            "epoch": self.epoch,
+            "waited": self.waited,
+            "reference": self._reference,
+        }
+
+    def judge(self, loss: float, epoch: int) -> bool:
+        """Take an epoch's loss into account and return whether it is the smallest.
+
+        Args:
+            loss: Loss of its validation, or its training loss. NaN is no improvement.
+            epoch: Number of epochs that are finished.
+        """
+        if loss < self._reference - self._min_improvement:
+            self._reference, self.waited = loss, 0
+        else:
+            self.waited += 1
+        if not loss < self.loss:
+            return False
+        self.loss, self.epoch = loss, epoch
+        return True
+
+    def reason_to_stop(self, patience: int) -> str:
+        """Return why a training stops that waits so often for an improvement; empty: it goes on."""
+        if self.waited < patience:
+            return ""
+        return (
+            f"The training stopped early: the loss did not improve {self.waited} times in a row "
+            f"(patience={patience}). The smallest was {self.loss:.6g}, after epoch {self.epoch}."
+        )

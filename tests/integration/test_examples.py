@@ -1,0 +1,160 @@
+"""Every example runs, and says what it is to show."""
+
+import importlib.util
+import re
+import sys
+
+import numpy as np
+import pytest
+
+from physx_core import DataGeneration, EnvironmentConfig
+from physx_core.errors import WrongSamplesError
+
+pytest.importorskip("torch")
+
+
+@pytest.fixture
+def feature(root, run):
+    """Run a script of examples/features and return what it printed."""
+    return lambda name, *words: run(root / f"examples/features/{name}.py", *words).stdout
+
+
+def number(text, pattern):
+    return float(re.search(pattern, text)[1])
+
+
+def test_one_environment_fills_a_dataset(feature):
+    text = feature("single_environment")
+    assert "input         5000 x (10, 3) m" in text
+    mean, truth = (line.partition("[")[2] for line in text.splitlines()[-2:])
+    assert mean == truth != ""
+
+
+def test_several_clients_take_turns(feature):
+    text = feature("several_clients")
+    assert "1 client(s):" in text and "4 client(s):" in text
+    assert "[1 2 3 4 1 2 3 4]" in text
+
+
+def test_offline_training_reads_stored_samples(feature):
+    assert number(feature("offline_training"), r"([\d.]+) with those held back") < 0.005
+
+
+def test_online_training_stores_what_clients_make(feature):
+    text = feature("online_training")
+    assert "stored: 640 samples" in text and "stored: 4480 samples" in text
+    losses = [float(loss) for loss in re.findall(r"loss ([\d.]+)", text)]
+    assert losses[3] < losses[0] / 10 and losses[7] < losses[4] / 10
+
+
+def test_an_environment_watches_gradient_descent(feature):
+    distances = re.findall(r"is ([\d.]+) m off", feature("gradient_descent"))
+    assert len(distances) == 7 and float(distances[0]) > 0.1 > 1e-2 > float(distances[-1])
+
+
+def test_prediction_takes_part_and_is_recorded(feature, tmp_path):
+    pytest.importorskip("rerun", reason="needs physx-rerun for the recording")
+    text = feature("prediction", "--rerun")
+    assert number(text, r"guesses are ([\d.]+) m") < number(text, r"would be ([\d.]+) m") / 10
+    assert list(tmp_path.glob("sessions/prediction/*.rrd"))
+
+
+# The beam -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def beam(root):
+    """The module of the beam."""
+    pytest.importorskip("felupe", reason="needs felupe, which solves the beam")
+    spec = importlib.util.spec_from_file_location(
+        "examples_beam_beam", root / "examples/beam/beam.py"
+    )
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
+
+
+def tip_load(beam, force):
+    forces = np.zeros((*beam.NODES, 3))
+    forces[-1, :, :, 2] = force / 16
+    return forces
+
+
+def test_the_beam_bends_as_beam_theory_says_under_small_loads(beam):
+    solver = beam.ElasticBeam()
+    assert np.allclose(solver.rest[3, 1, 2], [3 / 15, 0.25 / 3, 0.5 / 3])
+    solver.solve(tip_load(beam, 0.1))
+    length, _, height = beam.SIZE
+    area, inertia = height**2, height**4 / 12
+    shear = beam.YOUNG / (2 * (1 + beam.POISSON)) * area * 5 / 6
+    theory = 0.1 * (length**3 / (3 * beam.YOUNG * inertia) + length / shear)  # Timoshenko
+    assert solver.displacement[-1, :, :, 2].mean() == pytest.approx(theory, rel=0.15)
+    assert np.all(solver.displacement[0] == 0)
+
+
+def test_large_loads_bend_it_less_than_in_proportion(beam):
+    solver = beam.ElasticBeam()
+    deflections = []
+    for force in (1, 40):
+        solver.solve(tip_load(beam, force))
+        deflections.append(solver.displacement[-1, :, :, 2].mean())
+    assert 0.3 < deflections[1] < 0.9 * 40 * deflections[0]
+    solver.solve(0 * tip_load(beam, 0))  # elastic: it comes back
+    assert np.abs(solver.displacement).max() < 1e-6
+
+
+def test_loads_that_newton_cannot_reach_at_once_are_reached_in_steps(beam):
+    whole, parts = beam.ElasticBeam(), beam.ElasticBeam()
+    far = tip_load(beam, -300)
+    whole.solve(far)
+    for part in np.linspace(0.1, 1, 10):
+        parts.solve(part * far)
+    assert np.allclose(whole.displacement, parts.displacement, atol=1e-6)
+
+
+def test_the_skin_is_closed_and_faces_outwards(beam):
+    corners = beam.ElasticBeam().rest.reshape(-1, 3)[beam.skin()]
+    volumes = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    assert volumes.sum() == pytest.approx(np.prod(beam.SIZE))
+
+
+def test_a_step_that_diverges_is_refused(beam, tmp_path, monkeypatch):
+    def fail(solver, forces):
+        raise beam.NoEquilibriumError
+
+    monkeypatch.setattr(beam.ElasticBeam, "solve", fail)
+    config = EnvironmentConfig(beam.Beam, as_tcp_ip_client=False, max_wrong_samples_per_step=3)
+    with pytest.raises(WrongSamplesError, match="refused 4 samples"):
+        DataGeneration(config, session_dir=str(tmp_path), batch_nb=1, batch_size=1).execute()
+
+
+@pytest.mark.slow
+def test_the_beam_is_learned_and_compared(root, run, tmp_path):
+    pytest.importorskip("felupe", reason="needs felupe, which solves the beam")
+    pytest.importorskip("rerun", reason="needs physx-rerun for the recording")
+    text = run(root / "examples/beam/run.py", "--small").stdout
+    assert re.search(r"FC +[\d.]+% +[\d.]+%", text) and re.search(r"UNet +[\d.]+%", text)
+    assert (tmp_path / "sessions/beam/fc.rrd").stat().st_size > 10_000
+    assert (tmp_path / "sessions/beam/unet.rrd").stat().st_size > 10_000
+
+
+# Operators ------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("problem", "library", "network"),
+    [
+        ("ring", "neuralop", "Fourier neural operator"),
+        ("plate", "torch_geometric", "graph network"),
+        ("picture", "torch", "UNet"),
+    ],
+)
+def test_operators_are_learned_by_networks_of_other_libraries(problem, library, network, root, run):
+    if importlib.util.find_spec(library) is None:
+        pytest.skip(f"needs {library}, where the {network} comes from")
+    text = run(root / "examples/operators/run.py", "--small", problem).stdout
+    sizes = [int(size) for size in re.findall(rf"^(?:{network}|FC) +(\d+)", text, re.M)]
+    assert len(sizes) == 2 and sizes[1] == pytest.approx(sizes[0], rel=0.02)
