@@ -116,10 +116,8 @@ def train(size: Size, sessions: str, session: str) -> None:
         loss="MSELoss",
         optimizer="Adam",
         lr=2e-3,
-        optimization_kwargs={
-            "scheduler": "CosineAnnealingLR",
-            "scheduler_kwargs": {"T_max": size.epochs},
-        },
+        scheduler="CosineAnnealingLR",
+        scheduler_kwargs={"T_max": size.epochs},
     )
     training = Training(
         network,
