@@ -28,6 +28,8 @@ lint: .venv/tools
 bench: .venv/packages
 	$(BIN)/python benchmarks/generation.py
 	$(BIN)/python benchmarks/training.py
+	$(BIN)/python benchmarks/prediction.py
+	$(BIN)/python benchmarks/transport.py
 	$(BIN)/python benchmarks/dataset.py
 
 clean:
