@@ -31,6 +31,8 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/prediction.py
 	$(BIN)/python benchmarks/transport.py
 	$(BIN)/python benchmarks/dataset.py
+	$(BIN)/python benchmarks/backends.py
+	$(BIN)/python benchmarks/differentiable.py
 
 clean:
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

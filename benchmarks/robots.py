@@ -31,8 +31,9 @@ INTRODUCTION = """# Robots
 `Robot("cartpole")` and `Robot("a1/a1")` name a robot instead of a file: an own one, or one of the
 package `example-robot-data` (`pip install "physx-dart[robots]"`). `physx robots` lists them.
 
-The table is made by `benchmarks/robots.py`, with {versions}. Each robot floats freely (one
-whose root link has no mass is fixed), is loaded without collision shapes, then makes {steps} steps
+The table is made by `benchmarks/robots.py`, with {versions}.
+Each robot floats freely (one whose root link has no mass is fixed), is loaded without collision
+shapes, then makes {steps} steps
 of 1 ms without torques from its neutral configuration. *Agreement* is the largest difference of the
 engines' accelerations in {states} random states, relative to the largest acceleration of the state.
 Columns *dof* (of the joints) and *mass* in kg; *load* in ms. Where *collisions* says meshes,

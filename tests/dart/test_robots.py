@@ -94,3 +94,15 @@ def test_the_command_lists_them(capsys):
     assert lines[0].split() == ["name", "dof", "mass", "[kg]", "collisions"]
     cartpole = [line.split() for line in lines if line.startswith("cartpole ")]
     assert cartpole == [["cartpole", "2", "1.1", "primitives"]]
+
+
+def test_a_link_and_a_joint_may_have_the_same_name(backend, write_urdf):
+    path = find_robot("cartpole")
+    text = path.read_text(encoding="utf-8").replace('joint name="hinge"', 'joint name="pole"')
+    same = Robot(write_urdf(text), fixed_base=False)
+    other = Robot(path, fixed_base=False)
+    with backend.build(World([same])) as one, backend.build(World([other])) as two:
+        one.step(5)
+        two.step(5)
+        np.testing.assert_array_equal(one.positions(), two.positions())
+        np.testing.assert_array_equal(one.body_poses(["pole"]), two.body_poses(["pole"]))

@@ -13,6 +13,7 @@ from physx_dart.parts import Mover
 from physx_dart.rotations import matrix_from_quaternion
 
 _TRANSLATION, _ROTATION = "physx translation", "physx rotation"
+_LINK = "physx link "
 
 
 def load_model(mover: Mover, gravity: tuple[float, ...], *, armature: Vector) -> Any:
@@ -47,7 +48,13 @@ def load_stepping_model(mover: Mover, gravity: tuple[float, ...], *, armature: V
     second = base.addJoint(first, pinocchio.JointModelSpherical(), nowhere, _ROTATION)
     frame = pinocchio.Frame(_ROTATION, second, 0, nowhere, pinocchio.FrameType.BODY)
     place = base.addFrame(frame)
-    model = pinocchio.appendModel(base, _parsed(mover), place, nowhere)
+    robot = _parsed(mover)
+    links = [frame for frame in robot.frames if frame.type == pinocchio.FrameType.BODY]
+    for frame in links:  # appendModel cannot tell a link and a joint of the same name apart
+        frame.name = f"{_LINK}{frame.name}"
+    model = pinocchio.appendModel(base, robot, place, nowhere)
+    for frame in model.frames:
+        frame.name = frame.name.removeprefix(_LINK)
     return _finished(model, mover, gravity, armature, 3)
 
 
