@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cmath
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -20,7 +19,7 @@ from physx_core.errors import (
     listed,
     nearest,
 )
-from physx_core.fields import Array, Batch, Field, Sample
+from physx_core.fields import Array, Batch, Field, Sample, is_finite
 
 ROW_FIELDS = (
     Field("env_id", shape=(), dtype="int32", role="additional"),
@@ -114,14 +113,13 @@ class Columns:
         """
         for name in self._floating:
             values = self.arrays[name][:count]
-            # The sum of squares is finite only if all are; it is quicker, but may overflow.
-            if not cmath.isfinite(np.vdot(values, values)) and not np.isfinite(values).all():
+            if not is_finite(values):
                 self._raise_not_finite(name, values)
         return {name: array[:count] for name, array in self.arrays.items()}
 
     def is_finite(self, row: int) -> bool:
         """Return whether a row holds neither NaN nor an infinite number."""
-        return all(np.isfinite(self.arrays[name][row]).all() for name in self._floating)
+        return all(is_finite(self.arrays[name][row]) for name in self._floating)
 
     def _raise_not_finite(self, name: str, values: Array) -> None:
         bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)

@@ -24,6 +24,8 @@ RESERVED = ("env_id", "episode", "step")
 
 _KINDS = "biufc"
 
+_SMALL = 8192  # elements
+
 
 @dataclass(frozen=True)
 class Field:
@@ -135,3 +137,17 @@ def _as_field(item: Any, role: Role) -> Field:
             return Field(name, shape=(), dtype=kind, role=role)
         return Field(name, dtype=kind, role=role)
     raise ConfigError(f'{item!r} is no field. Give Field(...), "name" or ("name", type).')
+
+
+def is_finite(array: Array) -> bool:
+    """Return whether no value is NaN or infinite."""
+    if array.dtype.kind not in "fc":
+        return True
+    # A sum tells it in one fast pass, unless it overflows. Small arrays take the quicker dot
+    # product; for large ones it would start threads, which costs more than it saves.
+    if array.size <= _SMALL:
+        total = np.vdot(array, array).real
+    else:
+        with np.errstate(over="ignore", invalid="ignore"):
+            total = abs(np.add.reduce(array, axis=None))
+    return math.isfinite(total) or bool(np.isfinite(array).all())

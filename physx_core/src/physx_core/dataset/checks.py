@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -17,9 +16,7 @@ from physx_core.errors import (
     listed,
     nearest,
 )
-from physx_core.fields import RESERVED, Array, Batch, Field
-
-_SMALL = 8192
+from physx_core.fields import RESERVED, Array, Batch, Field, is_finite
 
 
 def infer_fields(arrays: Mapping[str, Any]) -> list[Field]:
@@ -125,20 +122,6 @@ def convert(
             field=name,
         )
     return converted
-
-
-def is_finite(array: Array) -> bool:
-    """Return whether no value is NaN or infinite."""
-    if array.dtype.kind not in "fc":
-        return True
-    # A sum tells it in one fast pass, unless it overflows. Small arrays take the quicker dot
-    # product; for large ones it would start threads, which costs more than it saves.
-    if array.size <= _SMALL:
-        total = np.vdot(array, array).real
-    else:
-        with np.errstate(over="ignore", invalid="ignore"):
-            total = abs(np.add.reduce(array, axis=None))
-    return math.isfinite(total) or bool(np.isfinite(array).all())
 
 
 def _as_rows(name: str, values: Any) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 
 from physx_core.columns import ROW_FIELDS
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError, NotFiniteError
-from physx_core.fields import RESERVED, Batch, Field
+from physx_core.fields import RESERVED, Batch, Field, is_finite
 from physx_core.scene import Event
 from physx_core.transport.frames import MAX_PAYLOAD
 from physx_core.transport.values import decode
@@ -152,7 +152,7 @@ def check_rows(block: Batch, instance_id: int, last_step: int) -> int:
             raise ConnectionRefusedByPeerError(
                 f'It sent rows whose field "{name}" is neither true nor false.'
             )
-        if kind in "fc" and not np.isfinite(values).all():
+        if not is_finite(values):
             row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
             raise NotFiniteError(
                 f'field "{name}" holds NaN or an infinite number.',
