@@ -102,15 +102,15 @@ def generate(size: Size, sessions: str, clients: int) -> str:
     return training.session.name
 
 
-def networks(size: Size) -> dict[str, tuple[NetworkConfig, int, int]]:
-    """Return the networks to train, for how many epochs, and the size of their batches."""
-    learning = {"loss": "MSELoss", "optimizer": "Adam", "scheduler": "CosineAnnealingLR"}
+def networks(size: Size) -> dict[str, tuple[NetworkConfig, int]]:
+    """Return the networks to train, and for how many epochs."""
+    learning = {"loss": "MSELoss", "optimizer": "Adam", "lr": 2e-3}
     layers = [VALUES, 256, 256, VALUES]
     fc = NetworkConfig(
         "torch/fc",
         network_name="fc",
         network_kwargs={**FIELDS, "layers": layers, "activation": "SiLU"},
-        lr=2e-3,
+        scheduler="CosineAnnealingLR",
         scheduler_kwargs={"T_max": size.fc_epochs},
         **learning,
     )
@@ -126,17 +126,14 @@ def networks(size: Size) -> dict[str, tuple[NetworkConfig, int, int]]:
             "nb_steps": 2,
             "border_mode": "same",
         },
-        lr=5e-3,
+        scheduler="CosineAnnealingLR",
         scheduler_kwargs={"T_max": size.unet_epochs},
         **learning,
     )
-    # the UNet normalizes batches, whose mean and deviation are better known of many samples
-    return {"FC": (fc, size.fc_epochs, 32), "UNet": (unet, size.unet_epochs, 128)}
+    return {"FC": (fc, size.fc_epochs), "UNet": (unet, size.unet_epochs)}
 
 
-def train(
-    name: str, network: NetworkConfig, epochs: int, batch_size: int, sessions: str, session: str
-) -> None:
+def train(name: str, network: NetworkConfig, epochs: int, sessions: str, session: str) -> None:
     """Train one network in the session of the samples."""
     training = Training(
         network,
@@ -145,7 +142,7 @@ def train(
         session_name=session,
         new_session=False,
         epoch_nb=epochs,
-        batch_size=batch_size,
+        batch_size=32,
         seed=0,
     )
     begin = time.perf_counter()
@@ -211,8 +208,8 @@ def main() -> int:
     size = SMALL if options.small else FULL
     session = generate(size, options.session_dir, options.clients)
     results = {}
-    for name, (network, *learning) in networks(size).items():
-        train(name, network, *learning, options.session_dir, session)
+    for name, (network, epochs) in networks(size).items():
+        train(name, network, epochs, options.session_dir, session)
         results[name] = compare(network, size.steps, options.session_dir, session)
     print_table(results)
     best = min(results, key=lambda name: np.mean(results[name].errors))

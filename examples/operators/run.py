@@ -19,14 +19,20 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from environments import PIXELS, PLATE, POINTS, Picture, Plate, Ring
 
-from physx_core import DataGeneration, DatasetConfig, EnvironmentConfig, NetworkConfig, Training
+from physx_core import (
+    DataGeneration,
+    Dataset,
+    DatasetConfig,
+    EnvironmentConfig,
+    NetworkConfig,
+    Training,
+)
 
 
 @dataclass(frozen=True)
@@ -165,13 +171,17 @@ def norm(values: np.ndarray, axes: tuple[int, ...]) -> np.ndarray:
 def solve(problem: Problem, samples: int, epochs: int, sessions: str) -> float:
     """Print the problem's table and return how many times smaller the error is than FC's."""
     session = generate(problem, samples, sessions)
-    run: Callable = lambda *network: learn(problem, *network, epochs, sessions, session)  # noqa: E731
-    own = run(problem.network, problem.network_kwargs)
-    same_size = run("torch/fc", fully_connected(problem, own[0]))
+    place = epochs, sessions, session
+    own = learn(problem, problem.network, problem.network_kwargs, *place)
+    same_size = learn(problem, "torch/fc", fully_connected(problem, own[0]), *place)
     print(f"\n{problem.title}\n{samples} samples, {epochs} epochs")
     print(f"{'':26}{'parameters':>12}{'seconds':>10}{'error':>10}")
     for name, (parameters, seconds, error) in ((problem.name, own), ("FC", same_size)):
         print(f"{name:26}{parameters:>12}{seconds:>10.1f}{error:>10.2%}")
+    with Dataset.open(f"{sessions}/{session}") as dataset:
+        given, wanted = (dataset["validation"][name][:] for name in problem.fields)
+    if given.shape == wanted.shape:
+        print(f"{'left as it is':48}{relative_error(given, wanted):>10.2%}")
     return same_size[2] / own[2]
 
 
