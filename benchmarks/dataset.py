@@ -139,8 +139,9 @@ def in_ram(tensors: dict[str, torch.Tensor], size: int, batches: int) -> Work:
         while given < batches:
             order = torch.randperm(len(tensors["x"]))
             for chosen in order.split(size)[: batches - given]:
-                for tensor in tensors.values():
-                    torch.index_select(tensor, 0, chosen)
+                _ = {
+                    name: torch.index_select(tensor, 0, chosen) for name, tensor in tensors.items()
+                }
                 given += 1
         return batches
 
