@@ -260,20 +260,27 @@ def test_a_flood_of_strangers_does_not_keep_a_late_client_out(by_hand, join, por
         for connection in kept:
             connection.close()
 
+    def come_late():
+        end = time.monotonic() + 20
+        while len(opened) <= 200 and time.monotonic() < end:
+            time.sleep(0.01)
+        clients.extend(join("--patience", "30") for _ in range(2))
+
+    clients = []
     crowd = [threading.Thread(target=flood) for _ in range(2)]
+    late = threading.Thread(target=come_late)
     join()
     try:
         with by_hand(num_clients=1) as source:
             source.batch(1)
-        for thread in crowd:
+        for thread in (*crowd, late):
             thread.start()
-        clients = [join("--patience", "30") for _ in range(2)]
         with by_hand(num_clients=2, timeout=40.0) as source:
             steps = [step for _ in range(20) for step in source.batch(2)["step"].tolist()]
         assert [client.wait(20) for client in clients] == [0, 0]
     finally:
         over.set()
-        for thread in crowd:
+        for thread in (*crowd, late):
             thread.join()
     assert steps == [step // 2 for step in range(40)]
     assert len(opened) > 200
