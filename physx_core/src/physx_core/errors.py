@@ -302,5 +302,45 @@ class FeatureNotSupportedError(SimulationError):
         )
 
 
+class EpisodeError(PhysxError):
+    """A call at the wrong moment of an episode, for example a step before the first reset."""
+
+
+class ActionError(PhysxError):
+    """An action that is no element of the action space and cannot be brought into it.
+
+    Attributes:
+        entry: Where in the action it is wrong, for example ``[2]`` or ``["arm"][0]``; empty where
+            all of it is.
+    """
+
+    def __init__(self, message: str, entry: str = "") -> None:
+        self.entry = entry
+        super().__init__(message)
+
+
 class VisualizerError(PhysxError):
     """A viewer cannot be started, reached or written to."""
+
+
+# Environments in other processes ------------------------------------------------------------
+
+
+class RemoteError(PhysxError):
+    """An environment in another process cannot be served, reached or driven."""
+
+
+class RemoteClosedError(RemoteError):
+    """The other side ended the connection, or the connection was closed here before."""
+
+
+class RemoteTimeoutError(RemoteError):
+    """The other side did not answer in time."""
+
+
+class RemoteProtocolError(RemoteError):
+    """The other side sent what the protocol does not allow."""
+
+
+class RequestError(RemoteError):
+    """A request cannot be carried out; the environment is as it was before, and lives on."""

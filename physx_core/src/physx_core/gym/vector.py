@@ -1,0 +1,321 @@
+"""Several environments in several processes, stepped together."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from physx_core.config import EnvironmentConfig, reference_of
+from physx_core.errors import ActionError, ConfigError, UsageError
+from physx_core.fields import Array, Batch, Sample
+from physx_core.gym.making import make_env
+from physx_core.gym.space_fields import SpaceFields
+from physx_core.gym.vector_worker import COMMAND, FORBIDDEN, VectorWorker, packed
+from physx_core.scene import Event
+from physx_core.sources.clients import ClientSource
+
+_LOG = logging.getLogger("physx")
+
+
+class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
+    """A vector environment whose environments are stepped in client processes.
+
+    ``gymnasium.make_vec("physx/Ant-v0", num_envs=4)`` makes one. It does what Gymnasium's
+    `AsyncVectorEnv` does, with the clients of a data generation: spawned, authenticated, watched,
+    and ended in every case. An environment that raises is named with its traceback.
+
+    Infos come back as far as they are plain values and arrays; a warning names those that are not.
+    """
+
+    def __init__(
+        self,
+        env: str | type[Any],
+        num_envs: int = 1,
+        *,
+        env_kwargs: Mapping[str, Any] | None = None,
+        processes: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        copy: bool = True,
+        timeout: float = 60.0,
+    ) -> None:
+        """Start the processes.
+
+        Args:
+            env: Id of the environment, ``"package.module:Class"``, ``"script.py:Class"``, or the
+                class.
+            num_envs: How many environments.
+            env_kwargs: Keyword arguments of each.
+            processes: How many processes share the environments; None: as many as there are
+                processors, but no more than environments.
+            autoreset_mode: What happens after the end of an episode.
+            copy: Whether observations are copies; otherwise they are valid until the next call.
+            timeout: How long a step may take, in s.
+
+        Raises:
+            ConfigError: A value cannot be, or a space holds values without a fixed shape.
+            PhysxError: An environment or a process failed.
+        """
+        if num_envs < 1 or (processes is not None and processes < 1):
+            raise ConfigError("num_envs and processes must be at least 1.")
+        name, options = reference_of(env), dict(env_kwargs or {})
+        mode = AutoresetMode(autoreset_mode)
+        self.num_envs = num_envs
+        self._describe(name, options, mode)
+        share = -(-num_envs // min(processes or len(os.sched_getaffinity(0)), num_envs))
+        self._share, self._copy = share, copy
+        self._notes = _Notes()
+        config = EnvironmentConfig(
+            VectorWorker,
+            num_clients=-(-num_envs // share),
+            timeout=timeout,
+            env_kwargs={
+                "env": name,
+                "num_envs": num_envs,
+                "share": share,
+                "make_kwargs": options,
+                "autoreset": mode.value,
+            },
+        )
+        self._clients = config.num_clients
+        source = ClientSource(config, self._notes, [0], run_ahead=0)
+        self._source: ClientSource | None = source
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(source)
+            self._answer()
+            stack.pop_all()
+
+    def _describe(self, name: str, options: Mapping[str, Any], mode: AutoresetMode) -> None:
+        with_spaces = make_env(name, options)
+        self.single_observation_space = with_spaces.observation_space
+        self.single_action_space = with_spaces.action_space
+        self.metadata = {**with_spaces.metadata, "autoreset_mode": mode}
+        self.render_mode = with_spaces.render_mode
+        self.spec = with_spaces.spec
+        with_spaces.close()
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._mode = mode
+        self._observations = SpaceFields(self.single_observation_space, "observation")
+        self._actions = SpaceFields(self.single_action_space, "action")
+
+    # Stepping -------------------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin new episodes; return observations and infos.
+
+        Args:
+            seed: Environment i gets ``seed + i``; or a seed for each.
+            options: Handed to each environment's `reset`, except for ``reset_mask``, shape
+                (num_envs,): which environments are reset, where the mode is `DISABLED`.
+
+        Raises:
+            ConfigError: The number of seeds, or the mask, does not fit.
+        """
+        count = self.num_envs
+        seeds = [seed + i for i in range(count)] if isinstance(seed, int) else seed
+        seeds = [None] * count if seeds is None else [None if s is None else int(s) for s in seeds]
+        options = dict(options or {})
+        mask = np.ones(count, np.bool_)
+        if "reset_mask" in options:
+            mask = np.asarray(options.pop("reset_mask"))
+        if len(seeds) != count or mask.shape != (count,) or mask.dtype != np.bool_:
+            raise ConfigError(
+                f"reset() of {count} environments got {len(seeds)} seeds, and a mask of shape "
+                f"{mask.shape} and type {mask.dtype}: give one seed and one bool for each."
+            )
+        if not mask.any():
+            raise ConfigError("reset_mask resets no environment.")
+        rest = options or None
+        self._command(
+            "reset",
+            [
+                {"seeds": s, "mask": m, "options": rest}
+                for s, m in zip(self._shared(seeds), self._shared(mask.tolist()), strict=True)
+            ],
+        )
+        rows = self._answer()
+        return self._batch(rows), self._infos({})
+
+    def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
+        """Step all environments.
+
+        Args:
+            actions: A batch of actions: see `action_space`.
+
+        Returns:
+            Observations, rewards, terminations, truncations, each with a leading axis of
+            environments, and infos.
+
+        Raises:
+            ActionError: The actions are not of the space's shape.
+            PhysxError: An environment raised, or a process failed.
+        """
+        self._open().apply(self._shares_of(actions))
+        rows = self._answer()
+        over = rows["terminated"] | rows["truncated"]
+        finals: dict[int, Any] = {}
+        if self._mode is AutoresetMode.SAME_STEP:
+            names = [field.name for field in self._observations.fields]
+            for i in np.flatnonzero(over).tolist():
+                arrays = {name: rows[f"final_{name}"][i].copy() for name in names}
+                finals[i] = self._observations.value(arrays)
+        infos = self._infos(finals)
+        flags = rows["terminated"].copy(), rows["truncated"].copy()
+        return self._batch(rows), rows["reward"].copy(), *flags, infos
+
+    def _shares_of(self, actions: Any) -> Batch:
+        """Return the actions by client: arrays of shape (clients, share, *shape)."""
+        shares: Batch = {}
+        try:
+            given = self._actions.arrays(actions)
+        except (TypeError, ValueError, LookupError) as error:
+            raise ActionError(f"These are no actions of {self.action_space}: {error}.") from error
+        for field in self._actions.fields:
+            wanted = (self.num_envs, *(field.shape or ()))
+            array = given[field.name]
+            if array.shape != wanted:
+                raise ActionError(
+                    f"The actions have the shape {array.shape} but need {wanted}: one action of "
+                    f"{self.single_action_space} for each environment."
+                )
+            padding = self._clients * self._share - self.num_envs
+            if padding:
+                array = np.concatenate([array, np.repeat(array[-1:], padding, axis=0)])
+            shares[field.name] = array.reshape(self._clients, self._share, *wanted[1:])
+        return shares
+
+    def _answer(self) -> Batch:
+        """Return what became of the last actions or commands, by field: (num_envs, *shape)."""
+        rows = self._open().batch(self._clients)
+        return {
+            name: array.reshape(-1, *array.shape[2:])[: self.num_envs]
+            for name, array in rows.items()
+            if array.ndim > 1
+        }
+
+    def _batch(self, rows: Batch) -> Any:
+        names = [field.name for field in self._observations.fields]
+        return self._observations.batch(
+            {name: rows[name].copy() if self._copy else rows[name] for name in names}
+        )
+
+    def _infos(self, finals: Mapping[int, Any]) -> dict[str, Any]:
+        infos: dict[str, Any] = {}
+        by_env = self._notes.take("infos", self._share)
+        for i in range(self.num_envs):
+            info = by_env.get(i, {})
+            if i in finals:
+                info = {"final_obs": finals[i], **info}
+            if info:
+                infos = self._add_info(infos, info, i)
+        return infos
+
+    # Everything else ------------------------------------------------------------------------
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call a method of each environment, or read an attribute; return what each gives.
+
+        Raises:
+            UsageError: It is `reset`, `step` or `close`, or what it gives cannot be sent.
+        """
+        if name in FORBIDDEN:
+            raise UsageError(f'call("{name}") would go past this object: use {name}() itself.')
+        self._command("call", [(name, list(args), kwargs)] * self._clients)
+        self._answer()
+        results = self._notes.take("results", self._share)
+        return tuple(results.get(i) for i in range(self.num_envs))
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return an attribute of each environment."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of each environment: one value for all, or a list with one for each.
+
+        Raises:
+            ConfigError: There are more or fewer values than environments.
+        """
+        each = list(values) if isinstance(values, (list, tuple)) else [values] * self.num_envs
+        if len(each) != self.num_envs:
+            raise ConfigError(f"{len(each)} values for {self.num_envs} environments.")
+        self._command("set", [(name, share) for share in self._shared(each)])
+        self._answer()
+
+    def render(self) -> tuple[Any, ...]:
+        """Return what each environment renders."""
+        return self.call("render")
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """End the processes."""
+        source, self._source = getattr(self, "_source", None), None
+        if source is not None:
+            source.close()
+
+    def _open(self) -> ClientSource:
+        if self._source is None:
+            raise UsageError("This vector environment is closed.")
+        return self._source
+
+    def _command(self, name: str, arguments: Sequence[Any]) -> None:
+        """Have each client obey a command in the place of actions."""
+        self._open().apply({COMMAND: packed(name, arguments)})
+
+    def _shared(self, values: Sequence[Any]) -> list[list[Any]]:
+        """Return the values of each client's environments."""
+        return [
+            list(values[first : first + self._share])
+            for first in range(0, self.num_envs, self._share)
+        ]
+
+
+class _Notes:
+    """What clients say beside their rows; the services of the run that they think they are in."""
+
+    def __init__(self) -> None:
+        self._said: dict[int, dict[str, Any]] = {}
+        self._left_out: set[str] = set()
+
+    def take(self, what: str, share: int) -> dict[int, Any]:
+        """Return infos or results by environment, and forget them."""
+        found = {
+            (number - 1) * share + place: value
+            for number, said in self._said.items()
+            for place, value in enumerate(said.get(what, []))
+        }
+        self._said = {}
+        return found
+
+    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
+        """Keep what a client says before its row."""
+        self._said[instance_id] = values
+        new = set(values.get("left_out", [])) - self._left_out
+        if new:
+            self._left_out |= new
+            _LOG.warning(
+                "Infos of these names are left out, for they hold more than plain values and "
+                "arrays: %s.",
+                ", ".join(sorted(new)),
+            )
+
+    def load_parameters(self, instance_id: int) -> dict[str, Any]:
+        """Return nothing: workers do not ask."""
+        return {}
+
+    def predict(self, fields: Sample) -> Sample:
+        """Refuse: workers do not ask."""
+        raise UsageError("A vector environment has no network.")
+
+    def show(self, instance_id: int, step: int, events: list[Event]) -> None:
+        """Do nothing: workers do not draw."""

@@ -1,0 +1,175 @@
+"""`ParallelVectorEnv` against Gymnasium's own `AsyncVectorEnv`, with real processes."""
+
+import contextlib
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from physx_core.errors import ActionError, ConfigError, EnvironmentFailedError, UsageError
+from physx_core.gym.vector import ParallelVectorEnv
+
+HERE = f"{__file__}:"
+
+
+class Counter(gymnasium.Env):
+    """Counts its steps; nested spaces, infos of all kinds, ends after some steps."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(self, length=3, render_mode=None, fails_at=None):
+        self.length, self.render_mode, self.fails_at = length, render_mode, fails_at
+        self.observation_space = spaces.Dict(
+            {
+                "count": spaces.Box(0, 1e6, (2,), np.float64),
+                "parts": spaces.Tuple((spaces.Discrete(5), spaces.MultiBinary(3))),
+            }
+        )
+        self.action_space = spaces.Dict({"kind": spaces.Discrete(4), "size": spaces.Box(-1, 1)})
+        self.count = 0
+        self.seen = []
+
+    def observe(self):
+        bits = np.array([self.count >> i & 1 for i in range(3)], np.int8)
+        return {"count": np.full(2, self.count, float), "parts": (self.count % 5, bits)}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = (options or {}).get("start", 0)
+        draw = int(self.np_random.integers(1000))
+        return self.observe(), {"draw": draw, "options": str(options)}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        self.count += 1
+        if self.count == self.fails_at:
+            raise RuntimeError("the counter is stuck")
+        over = self.count >= self.length
+        info = {"kind": int(action["kind"]), "object": object()} if over else {}
+        return self.observe(), float(action["size"][0]), over, False, info
+
+    def render(self):
+        return np.full((2, 2, 3), self.count, np.uint8)
+
+
+class Unstorable(Counter):
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Text(5)
+
+
+def same(one, other):
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for name, value in one.items():
+            same(value, other[name])
+    elif isinstance(one, (tuple, list)):
+        assert len(one) == len(other)
+        for value, others in zip(one, other, strict=True):
+            same(value, others)
+    elif isinstance(one, np.ndarray) and one.dtype == object:
+        same(list(one), list(other))
+    elif one is not None or other is not None:
+        np.testing.assert_array_equal(one, other)
+        assert np.asarray(one).dtype == np.asarray(other).dtype
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_it_gives_what_gymnasium_gives(mode, nothing_stays_behind):
+    def make():
+        return gymnasium.make("CartPole-v1", max_episode_steps=7)
+
+    ours = ParallelVectorEnv(
+        "CartPole-v1",
+        3,
+        env_kwargs={"max_episode_steps": 7},
+        processes=2,
+        autoreset_mode=mode,
+    )
+    theirs = SyncVectorEnv([make] * 3, autoreset_mode=mode)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert ours.metadata["autoreset_mode"] is mode
+    theirs.action_space.seed(1)
+    with contextlib.closing(ours):
+        same(ours.reset(seed=[4, 5, 6]), theirs.reset(seed=[4, 5, 6]))
+        for _ in range(20):
+            actions = theirs.action_space.sample()
+            same(ours.step(actions), theirs.step(actions))
+        same(ours.reset(seed=3), theirs.reset(seed=3))
+
+
+def test_nested_spaces_infos_calls_and_attributes(caplog, nothing_stays_behind):
+    env = ParallelVectorEnv(
+        HERE + "Counter", 3, env_kwargs={"render_mode": "rgb_array"}, processes=3
+    )
+    with contextlib.closing(env):
+        observation, infos = env.reset(seed=1, options={"start": 1})
+        assert observation["count"].tolist() == [[1.0, 1.0]] * 3
+        assert observation["parts"][0].tolist() == [1, 1, 1]
+        assert infos["options"].tolist() == ["{'start': 1}"] * 3
+        draws = infos["draw"].tolist()
+        again = env.reset(seed=[1, 2, 3])[1]["draw"].tolist()
+        assert draws == again
+        assert len(set(draws)) > 1
+        actions = {
+            "kind": np.array([0, 1, 2]),
+            "size": np.array([[0.5], [-0.5], [1.0]], np.float32),
+        }
+        kept = env.step(actions)
+        env.step(actions)
+        observation, rewards, terminated, truncated, infos = env.step(actions)
+        assert rewards.tolist() == [0.5, -0.5, 1.0]
+        assert terminated.all()
+        assert not truncated.any()
+        assert infos["kind"].tolist() == [0, 1, 2]
+        assert kept[0]["count"].tolist() == [[1.0, 1.0]] * 3  # a copy
+        assert [picture[0, 0, 0] for picture in env.render()] == [3, 3, 3]
+        env.set_attr("length", [7, 8, 9])
+        assert env.get_attr("length") == (7, 8, 9)
+        assert env.call("observe")[0]["parts"][0] == 3
+        with pytest.raises(UsageError, match=r"use step\(\) itself"):
+            env.call("step")
+    assert "left out" in caplog.text
+    assert "object" in caplog.text
+    with pytest.raises(UsageError, match="closed"):
+        env.reset()
+
+
+def test_disabled_autoreset_with_a_mask(nothing_stays_behind):
+    env = ParallelVectorEnv(
+        HERE + "Counter", 2, processes=1, autoreset_mode="Disabled", env_kwargs={"length": 9}
+    )
+    with contextlib.closing(env):
+        env.reset(seed=0)
+        actions = {"kind": np.zeros(2, int), "size": np.zeros((2, 1), np.float32)}
+        env.step(actions)
+        mask = np.array([False, True])
+        observation, _ = env.reset(options={"reset_mask": mask, "start": 4})
+        assert observation["count"][:, 0].tolist() == [1.0, 4.0]
+        with pytest.raises(ConfigError, match="mask"):
+            env.reset(options={"reset_mask": [True]})
+
+
+def test_mistakes_and_failures_are_named(nothing_stays_behind):
+    with pytest.raises(ConfigError, match=r"CartPole-v7.*CartPole-v1"):
+        ParallelVectorEnv("CartPole-v7", 2)
+    with pytest.raises(ConfigError, match="no fixed shape"):
+        ParallelVectorEnv(HERE + "Unstorable", 2)
+    with pytest.raises(ConfigError, match="at least 1"):
+        ParallelVectorEnv("CartPole-v1", 0)
+    env = ParallelVectorEnv(HERE + "Counter", 2, env_kwargs={"fails_at": 2}, processes=2)
+    with contextlib.closing(env):
+        env.reset()
+        with pytest.raises(ActionError, match=r"shape \(3,\) but need \(2,\)"):
+            env.step({"kind": np.zeros(3, int), "size": np.zeros((2, 1), np.float32)})
+        with pytest.raises(ActionError, match="no actions"):
+            env.step([1, 2])
+        with pytest.raises(ConfigError, match="3 seeds"):
+            env.reset(seed=[1, 2, 3])
+        actions = {"kind": np.zeros(2, int), "size": np.zeros((2, 1), np.float32)}
+        env.step(actions)
+        with pytest.raises(EnvironmentFailedError, match="the counter is stuck"):
+            env.step(actions)
