@@ -1,0 +1,395 @@
+"""The order in which everything happens in an episode of a pipeline."""
+
+from __future__ import annotations
+
+import weakref
+from abc import abstractmethod
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import gymnasium
+import numpy as np
+
+from physx_core.errors import EpisodeError, SimulationError, UnknownOptionError
+from physx_core.gym.actions import Actions
+from physx_core.gym.buffers import ObservationChecks, copied, fill, neutral
+from physx_core.gym.periods import Periods
+from physx_core.gym.pipeline_env import Info, PipelineEnv, Step
+from physx_core.gym.recording import Recording
+from physx_core.gym.simulator import Simulator, simulator_of
+from physx_core.world import numbers
+
+if TYPE_CHECKING:
+    from physx_core.gym.robot_env import RobotEnv
+
+
+class Episodes(PipelineEnv):
+    """What `RobotEnv` does at construction, reset, step and stop, for the pipeline on it.
+
+    Construction: `_initialize_action_space`, `_initialize_observation_space`.
+
+    Reset: `stop`; the seed; registered forces are removed; `_setup`; spaces, if the simulator was
+    rebuilt; actions become neutral; `_setup` of the layers; `_sample_state`; the simulation starts;
+    `_initialize_buffers`; `_refresh_buffers`; `refresh_observation`; `has_terminated`.
+
+    Step: the action is checked and cut; every `control_dt` `compute_command`, every `observe_dt`
+    `refresh_observation` (before a command of the same moment); then once `_refresh_buffers`,
+    `refresh_observation`, `has_terminated`, `compute_reward`. Methods are those of the top of the
+    pipeline. An exception stops the episode.
+    """
+
+    _left_out: ClassVar[frozenset[str]] = frozenset({"_derived", "_renderer"})
+
+    def __init__(
+        self,
+        simulator: Any,
+        step_dt: float,
+        simulation_duration_max: float = 86400.0,
+        debug: bool = False,
+        render_mode: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Make an environment; nothing runs before `reset`.
+
+        Args:
+            simulator: A `Simulator`; or a world, or the path or name of a robot, of which one is
+                made.
+            step_dt: Time of a step, in s; a multiple of the control and observation periods.
+            simulation_duration_max: Time, in s, after which an episode is truncated.
+            debug: Whether every physics step is recorded, in training too.
+            render_mode: ``"human"``, ``"rgb_array"``, or None: no pictures.
+            kwargs: Options of `Simulator.build` or `Simulator`, where one is made; otherwise those
+                of the next of several classes that an environment inherits from.
+
+        Raises:
+            ConfigError: An option cannot be.
+        """
+        if not isinstance(simulator, Simulator):
+            simulator, kwargs = simulator_of(simulator, kwargs), {}
+        _construct_next(self, kwargs)
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise UnknownOptionError("render_mode", [render_mode], self.metadata["render_modes"])
+        self.simulator, self.render_mode, self.debug = simulator, render_mode, bool(debug)
+        self.step_dt = numbers.positive("step_dt", step_dt)
+        option = "simulation_duration_max"
+        self.simulation_duration_max = numbers.positive(option, simulation_duration_max)
+        self.num_steps = np.full((), -1, np.int64)
+        self.reset_options: dict[str, Any] = {}
+        self.viewer_kwargs: dict[str, Any] = {}
+        self.recording = Recording()
+        self.control_dt = self.observe_dt = -1.0
+        self._derived: weakref.ref[PipelineEnv] | None = None
+        self._renderer: Any = None
+        self._quantities: Any = None
+        self._training, self._ready, self._why = True, False, "Call reset() before step()."
+        self._builds, self._count = -1, -1
+        self._flat_observation: Any = None
+        self._set_periods()
+        self._initialize_spaces()
+
+    # Overridden by RobotEnv --------------------------------------------------------------------
+
+    @abstractmethod
+    def _make_buffers(self) -> None:
+        """Make `action` and `observation`."""
+
+    @abstractmethod
+    def _sample_state(self) -> tuple[Any, Any]:
+        """Return the first state."""
+
+    # The pipeline ----------------------------------------------------------------------------
+
+    @property
+    def unwrapped(self) -> RobotEnv:
+        """This environment."""
+        return self  # type: ignore[return-value]
+
+    @property
+    def derived(self) -> PipelineEnv:
+        """The topmost layer of the pipeline on this environment; itself, if there is none."""
+        found = None if self._derived is None else self._derived()
+        return self if found is None else found
+
+    def _update_pipeline(self, derived: PipelineEnv | None) -> None:
+        """Make a layer the top of the pipeline; None: this environment alone."""
+        top = self if derived is None else derived
+        self._derived = None if top is self else weakref.ref(top)
+        if self._ready:
+            self._ready, self._why = False, "The pipeline has changed: call reset()."
+
+    @property
+    def quantities(self) -> Any:
+        """Values that rewards and terminations share, computed at most once a step."""
+        if self._quantities is None:
+            from physx_core.gym.quantities import Quantities
+
+            self._quantities = Quantities(self)
+        return self._quantities
+
+    # Settings --------------------------------------------------------------------------------
+
+    @property
+    def training(self) -> bool:
+        """Whether this is for training; otherwise for evaluation, where episodes are recorded."""
+        return self._training
+
+    def train(self, mode: bool = True) -> None:
+        """Switch between training and evaluation.
+
+        Raises:
+            EpisodeError: An episode runs.
+        """
+        if bool(mode) is not self._training and self.is_simulation_running:
+            raise EpisodeError("An episode runs: call stop() before train() or eval().")
+        self._training = bool(mode)
+
+    def eval(self) -> None:
+        """Switch to evaluation; see `train`."""
+        self.train(False)
+
+    def _set_periods(self) -> None:
+        """Work out what is due when in a step."""
+        simulator = self.simulator
+        self.periods = Periods(self.step_dt, self.simulation_duration_max, simulator)
+        self.control_dt, self.observe_dt = self.periods.control_dt, self.periods.observe_dt
+        simulator.set_moment(1 if self.debug else self.periods.moment)
+
+    @abstractmethod
+    def _is_held(self) -> bool:
+        """Return whether commands and observations within a step change nothing."""
+
+    def _initialize_spaces(self) -> None:
+        self.simulator.prepare()
+        simulator = self.simulator
+        self.robot, self.robot_state = simulator.robot, simulator.robot_state
+        self.stepper_state, self.measurements = simulator.stepper_state, simulator.measurements
+        self.is_simulation_running = simulator.is_simulation_running
+        self._initialize_action_space()
+        self._initialize_observation_space()
+        self._make_buffers()
+        self._own_checks = ObservationChecks(self.observation_space, self._flat_observation)
+        self._builds = simulator.builds
+
+    def _initialize_seed(self, seed: int | None = None) -> None:
+        """Draw everything anew from a seed: states, errors of sensors, samples of spaces.
+
+        Args:
+            seed: From 0; None: one is drawn.
+        """
+        if seed is None:
+            self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random()
+        else:
+            gymnasium.Env.reset(self, seed=seed)
+        self._seed_sensors()
+        for i, layer in enumerate(self.derived.layers):
+            for k, space in enumerate((layer.action_space, layer.observation_space)):
+                drawn = np.random.SeedSequence(self.np_random_seed, spawn_key=(2, i, k))
+                space.seed(int(drawn.generate_state(1)[0]))
+
+    def _seed_sensors(self) -> None:
+        known = self.np_random_seed
+        entropy = known if known >= 0 else int(self.np_random.integers(2**63))
+        self.simulator.seed(np.random.SeedSequence(entropy, spawn_key=(1,)))
+
+    # An episode ------------------------------------------------------------------------------
+
+    def run_reset(
+        self, top: PipelineEnv, seed: int | None, options: dict[str, Any] | None
+    ) -> tuple[Any, Info]:
+        """Begin an episode with a layer as the top; see `reset`."""
+        self.stop()
+        simulator = self.simulator
+        self._update_pipeline(top)
+        if seed is not None or self._np_random is None:
+            self._initialize_seed(seed)
+        self.reset_options = dict(options or {})
+        simulator.remove_all_forces()
+        self._setup()
+        self._set_periods()
+        simulator.prepare()
+        if simulator.builds != self._builds:
+            self._initialize_spaces()
+            for layer in top.layers[1:]:
+                layer._initialize_action_space()
+                layer._initialize_observation_space()
+        layers = top.layers
+        for layer in layers:
+            fill(layer.action, neutral(layer.action_space))
+        self.num_steps[...] = self._count = 0
+        for layer in layers[1:]:
+            layer._setup()
+        positions, velocities = self._sample_state()
+        if self._quantities is not None:
+            self._quantities.reset()
+        try:
+            simulator.start(positions, velocities)
+            info = self._begin(top)
+        except BaseException:
+            simulator.stop()
+            raise
+        self._ready = True
+        if self.render_mode == "human":
+            self.render()
+        return copied(top.observation), info
+
+    def _begin(self, top: PipelineEnv) -> Info:
+        """Bring everything to the first state."""
+        top._initialize_buffers()
+        top._refresh_buffers()
+        if self._quantities is not None:
+            self._quantities.clear()
+        top.refresh_observation(self.measurements)
+        self._attend(top)
+        self._checks.check_form(top.observation)
+        self._checks.check_finite(top.observation)
+        info: Info = {}
+        self._records = self.recording.begin(self, top, info)
+        held = top is self and not self._records and self._is_held()
+        self._last_step = self.periods.last
+        self._schedule = self.periods.schedule(held, self._records and self.debug)
+        terminated, truncated = top.has_terminated(info)
+        if terminated or truncated:
+            word = "terminated" if terminated else "truncated"
+            raise EpisodeError(
+                f"The episode is {word} at its first state already. Look at _sample_state and "
+                f"has_terminated; what was observed is {top.observation}."
+            )
+        return info
+
+    def _attend(self, top: PipelineEnv) -> None:
+        """Take actions from, and check observations of, the top of the pipeline."""
+        self._actions = Actions(top.action_space, top.action)
+        alone = top is self
+        self._checks = self._own_checks if alone else ObservationChecks(top.observation_space)
+
+    def run_step(self, top: PipelineEnv, action: Any) -> Step:
+        """Simulate a step under an action of the top; see `step`."""
+        if not self._ready or top is not self.derived:
+            raise self._refusal(top)
+        if action is not top.action:
+            self._actions.take(action)
+        try:
+            self._run(top)
+            top.refresh_observation(self.measurements)
+            self._checks.check_finite(top.observation)
+            info: Info = {}
+            terminated, truncated = top.has_terminated(info)
+            if self.stepper_state.iter >= self._last_step:
+                truncated = True
+            reward = float(top.compute_reward(terminated, info))
+            if reward != reward:
+                raise SimulationError(f"The reward of {type(top).__name__} is not a number.")
+        except BaseException:
+            self.stop()
+            raise
+        if terminated or truncated:
+            word = "terminated" if terminated else "was truncated"
+            self._ready, self._why = False, f"The episode {word}: call reset()."
+        if self.render_mode == "human":
+            self.render()
+        return copied(top.observation), reward, bool(terminated), bool(truncated), info
+
+    def _run(self, top: PipelineEnv) -> None:
+        """Control and simulate for a step, up to its last observation."""
+        simulator, quantities = self.simulator, self._quantities
+        measurements, command = self.measurements, self.robot_state.command
+        for observe, control, steps in self._schedule:
+            if observe:
+                top.refresh_observation(measurements)
+            if control:
+                top.compute_command(top.action, command)
+                simulator.apply_command()
+            if self._records:
+                self.recording.row(self)
+            simulator.step(steps)
+        self._count += 1
+        self.num_steps[()] = self._count
+        top._refresh_buffers()
+        if quantities is not None:
+            quantities.clear()
+
+    def resume(self, top: PipelineEnv) -> None:
+        """Make a layer the top of the pipeline without ending its episode."""
+        self._derived = None if top is self else weakref.ref(top)
+
+    def _refusal(self, top: PipelineEnv) -> EpisodeError:
+        if not self._ready:
+            return EpisodeError(self._why)
+        return EpisodeError(
+            f"The episode belongs to {type(self.derived).__name__}, the top of the pipeline, but "
+            f"step is of {type(top).__name__}: call step there, or reset here."
+        )
+
+    def is_inside(self) -> bool:
+        """Return whether `observation` is within its space."""
+        return self._own_checks.inside(self.observation)
+
+    def stop(self) -> None:
+        """End the episode; what was recorded is written. To go on, call `reset`."""
+        if self.is_simulation_running:
+            self.recording.end(self)
+            self.simulator.stop()
+            self._ready, self._why = False, "The episode was stopped: call reset()."
+
+    def close(self) -> None:
+        """Stop, and free engine and viewer; `reset` brings them back."""
+        self.stop()
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+        self.recording.close()
+        self.simulator.close()
+
+    # State -----------------------------------------------------------------------------------
+
+    def run_restore(self, top: PipelineEnv, state: Any) -> None:
+        """Go back to a snapshot of a layer and all below; see `restore`."""
+        layers = top.layers
+        names = [type(layer).__name__ for layer in layers]
+        if not isinstance(state, dict) or state.get("layers") != names:
+            given = state.get("layers") if isinstance(state, dict) else state
+            raise SimulationError(f"The snapshot is of {given}, not of {names}.")
+        if self.num_steps < 0 or self.derived is not top or not self.is_simulation_running:
+            self.run_reset(top, None, state["own"][0]["options"])
+        for layer, own in zip(layers, state["own"], strict=True):
+            layer._restore_own(own)
+
+    def _snapshot_own(self) -> dict[str, Any]:
+        quantities = self._quantities
+        return super()._snapshot_own() | {
+            "simulator": self.simulator.snapshot(),
+            "random": copied(self.np_random.bit_generator.state),
+            "seed": self.np_random_seed,
+            "num_steps": int(self.num_steps),
+            "ready": (self._ready, self._why),
+            "options": dict(self.reset_options),
+            "quantities": None if quantities is None else quantities.snapshot(),
+        }
+
+    def _restore_own(self, own: dict[str, Any]) -> None:
+        self.simulator.restore(own["simulator"])
+        self.np_random.bit_generator.state = own["random"]
+        self._np_random_seed = own["seed"]
+        self.num_steps[...] = self._count = own["num_steps"]
+        self._ready, self._why = own["ready"]
+        self.reset_options = dict(own["options"])
+        if own["quantities"] is not None:
+            self.quantities.restore(own["quantities"])
+        super()._restore_own(own)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take up a pickled or copied environment."""
+        super().__setstate__(state)
+        self._derived = self._renderer = None
+
+
+def _construct_next(env: Any, options: dict[str, Any]) -> None:
+    """Call the constructor of the class after `Episodes` in an environment's order of classes."""
+    order = type(env).__mro__
+    after = order[order.index(Episodes) + 1 :]
+    takes = [each for each in after if "__init__" in vars(each) and each is not object]
+    if options and not takes:
+        raise UnknownOptionError(type(env).__name__, options, _OPTIONS)
+    super(Episodes, env).__init__(**options)
+
+
+_OPTIONS = ("simulator", "step_dt", "simulation_duration_max", "debug", "render_mode")

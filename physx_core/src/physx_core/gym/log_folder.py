@@ -1,0 +1,49 @@
+"""The folder of the logs for which nobody named a file."""
+
+from __future__ import annotations
+
+import collections
+import tempfile
+from pathlib import Path
+from typing import Any
+
+KEPT = 32
+"""Logs that are kept; the oldest ones go."""
+
+
+class LogFolder:
+    """A folder that is made when it is needed, and goes with its owner and all logs in it."""
+
+    def __init__(self) -> None:
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._paths: collections.deque[Path] = collections.deque()
+        self._count = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return nothing: a copy has a folder of its own."""
+        return {}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Begin without a folder."""
+        LogFolder.__init__(self)
+
+    def new_path(self, name: str) -> Path:
+        """Return the path of the next log; of those before, the newest `KEPT` stay.
+
+        Args:
+            name: What its name begins with.
+        """
+        if self._folder is None:
+            self._folder = tempfile.TemporaryDirectory(prefix="physx-logs-")
+        if len(self._paths) == KEPT:
+            self._paths.popleft().unlink(missing_ok=True)
+        self._count += 1
+        self._paths.append(Path(self._folder.name) / f"{name}_{self._count:06}.h5")
+        return self._paths[-1]
+
+    def close(self) -> None:
+        """Delete the folder."""
+        if self._folder is not None:
+            self._folder.cleanup()
+        self._folder = None
+        self._paths.clear()

@@ -1,0 +1,94 @@
+"""What the base environment records of its episodes, and where to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from physx_core.gym.episodes import Episodes
+    from physx_core.gym.layer import Info, PipelineEnv
+    from physx_core.gym.log_folder import LogFolder
+    from physx_core.gym.telemetry import Telemetry
+
+
+class Recording:
+    """Telemetry of an environment, which is made when it is first needed.
+
+    Files go to a folder of their own, which is removed when the environment is closed; one whose
+    path is given by the option ``"log_path"`` of `reset` stays.
+    """
+
+    def __init__(self) -> None:
+        self._telemetry: Telemetry | None = None
+        self._folder: LogFolder | None = None
+
+    @property
+    def telemetry(self) -> Telemetry:
+        """Where variables are registered."""
+        if self._telemetry is None:
+            from physx_core.gym.telemetry import Telemetry
+
+            self._telemetry = Telemetry()
+        return self._telemetry
+
+    def begin(self, env: Episodes, top: PipelineEnv, info: Info) -> bool:
+        """Begin to record an episode, if that is wanted; return whether it is.
+
+        In evaluation and with `debug` the file's path is put into the information.
+        """
+        if env.training and not env.debug:
+            if self._telemetry is None:
+                return False
+            self.telemetry.begin(training=True)
+            return self.telemetry.is_recording
+        from physx_core.gym.standard_columns import constants_of, register_simulator
+
+        register_simulator(self.telemetry, env.simulator)
+        action, motors = top.action, env.simulator.motors
+        if isinstance(action, np.ndarray) and action.dtype == np.float64:
+            joints = [motor.joint for motor in motors]
+            names = joints if action.shape == (len(joints),) else None
+            self.telemetry.register("action", action, names)
+        path = self._path(env)
+        info["log_path"] = str(path)
+        self.telemetry.begin(path, constants_of(env))
+        return True
+
+    def _path(self, env: Episodes) -> Path:
+        given = env.reset_options.get("log_path")
+        if given is not None:
+            return Path(given)
+        if self._folder is None:
+            from physx_core.gym.log_folder import LogFolder
+
+            self._folder = LogFolder()
+        return self._folder.new_path(type(env).__name__)
+
+    def row(self, env: Episodes) -> None:
+        """Record what is now."""
+        env.robot_state.refresh()
+        self.telemetry.record(env.stepper_state.t)
+
+    def data(self, env: Episodes) -> dict[str, Any]:
+        """Return what was recorded, the present state included; see `Telemetry.log_data`."""
+        if self.telemetry.is_recording:
+            self.row(env)
+        return self.telemetry.log_data
+
+    def end(self, env: Episodes) -> None:
+        """Record the last state, and write the file, if there was a step."""
+        telemetry = self._telemetry
+        if telemetry is not None and telemetry.is_recording:
+            if env.num_steps == 0:
+                telemetry.discard()
+                return
+            self.row(env)
+            telemetry.end()
+
+    def close(self) -> None:
+        """Remove the files whose path nobody gave."""
+        if self._folder is not None:
+            self._folder.close()

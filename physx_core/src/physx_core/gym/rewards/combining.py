@@ -1,0 +1,119 @@
+"""Rewards that are made of others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from physx_core.errors import ConfigError
+from physx_core.gym.quantities import Quantities, Quantity
+from physx_core.gym.rewards.reward import Reward
+from physx_core.world import numbers
+
+
+class _Mixture(Reward):
+    """What sums and products share.
+
+    Attributes:
+        rewards: The parts.
+        weights: Of each, as they are used.
+    """
+
+    def __init__(
+        self, rewards: Sequence[Reward] | Mapping[Reward, float], name: str, *, normalize: bool
+    ) -> None:
+        super().__init__(name)
+        weighted = dict(rewards) if isinstance(rewards, Mapping) else dict.fromkeys(rewards, 1.0)
+        if not weighted or not all(isinstance(each, Reward) for each in weighted):
+            raise ConfigError(f'"{name}" needs rewards, not {list(weighted)}.')
+        names = [part for each in weighted for part in each.names]
+        if len(set(names)) < len(names):
+            raise ConfigError(f'Two parts of "{name}" have one name: {sorted(names)}.')
+        for each, weight in weighted.items():
+            numbers.finite(f'weight of "{each.name}"', weight)
+        self.rewards = tuple(weighted)
+        self.weights = tuple(weighted.values())
+        if normalize:
+            wrong = [each.name for each in self.rewards if not each.is_normalized]
+            if wrong or min(self.weights) < 0 or sum(self.weights) <= 0:
+                raise ConfigError(
+                    f'"{name}" cannot be normalized: its parts must be, and have weights of at '
+                    f"least 0. Not normalized: {wrong}; weights: {self.weights}."
+                )
+            total = sum(self.weights)
+            self.weights = tuple(weight / total for weight in self.weights)
+        self.is_normalized = normalize
+
+    @property
+    def watched(self) -> tuple[Quantity, ...]:
+        """The quantities of all parts."""
+        return tuple(quantity for each in self.rewards for quantity in each.watched)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of this reward and all parts."""
+        return (self.name, *(name for each in self.rewards for name in each.names))
+
+    def _parts(
+        self, quantities: Quantities, terminated: bool, info: dict[str, float]
+    ) -> list[float]:
+        """Return the parts' rewards, and note them in the info."""
+        found = []
+        for each in self.rewards:
+            value = each.compute(quantities, terminated, info)
+            info[each.name] = value
+            found.append(value)
+        return found
+
+
+class Sum(_Mixture):
+    """The weighted sum of rewards."""
+
+    def __init__(
+        self,
+        rewards: Sequence[Reward] | Mapping[Reward, float],
+        name: str = "total",
+        *,
+        normalize: bool = False,
+    ) -> None:
+        """Choose the parts.
+
+        Args:
+            rewards: Rewards, or the weight of each.
+            name: Of the sum.
+            normalize: Divide by the sum of the weights; the sum is then within 0 and 1, as all of
+                its parts must be.
+
+        Raises:
+            ConfigError: There are none, two have one name, or they cannot be normalized.
+        """
+        super().__init__(rewards, name, normalize=normalize)
+
+    def compute(self, quantities: Quantities, terminated: bool, info: dict[str, float]) -> float:
+        """Return the sum."""
+        parts = self._parts(quantities, terminated, info)
+        return sum(weight * part for weight, part in zip(self.weights, parts, strict=True))
+
+
+class Product(_Mixture):
+    """The weighted geometric mean of rewards within 0 and 1: good only where all of them are."""
+
+    def __init__(
+        self, rewards: Sequence[Reward] | Mapping[Reward, float], name: str = "total"
+    ) -> None:
+        """Choose the parts.
+
+        Args:
+            rewards: Normalized rewards, or the weight of each.
+            name: Of the product.
+
+        Raises:
+            ConfigError: There are none, two have one name, or one is not normalized.
+        """
+        super().__init__(rewards, name, normalize=True)
+
+    def compute(self, quantities: Quantities, terminated: bool, info: dict[str, float]) -> float:
+        """Return the product."""
+        parts = self._parts(quantities, terminated, info)
+        pairs = zip(parts, self.weights, strict=True)
+        return math.prod([float(part**weight) for part, weight in pairs if weight])

@@ -1,0 +1,99 @@
+"""Attitudes: the filter's mathematics against turns that are known exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from physx_core.gym.blocks import mahony
+from physx_core.sensors.attitudes import from_rotation_vectors, product, turned, turned_back
+
+DT = 0.005
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def quaternions(n, seed=0):
+    q = np.random.default_rng(seed).normal(size=(n, 4))
+    return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+def angle(a, b):
+    dot = np.abs(np.sum(a * b, axis=-1))
+    return 2 * np.arccos(np.minimum(dot, 1.0))
+
+
+def test_one_and_many_agree():
+    rng = np.random.default_rng(1)
+    states = np.concatenate([quaternions(5), rng.normal(size=(5, 9))], axis=1)
+    measured = np.concatenate([rng.normal(size=(5, 3)), 6 * rng.normal(size=(5, 3))], axis=1)
+    measured[3, 3:] *= 9.81 / np.linalg.norm(measured[3, 3:])
+    measured[4, 3:] = 0.0  # weightless
+    for _ in range(20):
+        alone = [
+            mahony.advanced(row.tolist(), seen.tolist(), 1.3, 0.2, DT, 9.81)
+            for row, seen in zip(states, measured, strict=True)
+        ]
+        states = mahony.advanced_rows(states, measured, 1.3, 0.2, DT, 9.81)
+        np.testing.assert_allclose(states, alone, rtol=0, atol=1e-13)
+
+
+def test_follows_a_turn_exactly_without_gains():
+    rate = np.array([0.7, -1.1, 0.4])
+    begin = quaternions(1)[0]
+    state = [*begin, *rate, 0, 0, 0, *rate]
+    for _ in range(400):
+        state = mahony.advanced(state, [*rate, 0, 0, 0], 0.0, 0.0, DT, 9.81)
+    end = product(begin, from_rotation_vectors(400 * DT * rate))
+    assert angle(end, np.array(state[:4])) < 1e-7
+
+
+def test_finds_up_and_bias_from_acceleration():
+    truth = quaternions(1, seed=3)[0]
+    seen = 9.81 * turned_back(truth, UP)
+    bias = np.array([0.02, -0.01, 0.03])
+    state = [0.0, 0.0, 0.0, 1.0, *bias, 0, 0, 0, *bias]
+    for _ in range(int(120 / DT)):
+        state = mahony.advanced(state, [*bias, *seen], 1.0, 0.1, DT, 9.81)
+    found = turned_back(np.array(state[:4]), UP)
+    np.testing.assert_allclose(found, seen / 9.81, atol=1e-3)
+    across = bias - np.dot(bias, found) * found  # a bias about the vertical cannot be seen
+    estimate = np.array(state[7:10])
+    np.testing.assert_allclose(estimate - np.dot(estimate, found) * found, across, atol=1e-3)
+
+
+@pytest.mark.parametrize(("size", "share"), [(1.0, 1.0), (1.1, 0.58), (0.9, 0.62), (1.3, 0.0)])
+def test_accelerations_count_as_far_as_they_have_the_size_of_gravity(size, share):
+    still = [0.0, 0.0, 0.0, 1.0, *[0.0] * 9]
+    seen = 9.81 * np.array([0.1, 0.0, 0.99**0.5])
+    moved = mahony.advanced(still, [0, 0, 0, *(size * seen)], 1.0, 0, DT, 9.81)
+    full = mahony.advanced(still, [0, 0, 0, *seen], 1.0, 0, DT, 9.81)
+    assert abs(moved[1] / full[1] - share) < 1e-3
+    np.testing.assert_allclose(full[1], -0.5 * DT * 0.1, rtol=1e-3)
+
+
+def test_upright_has_no_twist():
+    for truth in quaternions(20):
+        found = np.array(mahony.upright(*(9.81 * turned_back(truth, UP))))
+        np.testing.assert_allclose(turned_back(found, UP), turned_back(truth, UP), atol=1e-12)
+        assert found[2] == 0.0
+    assert mahony.upright(0.0, 0.0, -9.81) == (1.0, 0.0, 0.0, 0.0)
+    assert mahony.upright(0.0, 0.0, 0.0) == (0.0, 0.0, 0.0, 1.0)
+
+
+def test_without_twist_keeps_up_where_it_was():
+    for truth in quaternions(20):
+        found = np.array(mahony.without_twist(*truth))
+        np.testing.assert_allclose(np.linalg.norm(found), 1.0)
+        np.testing.assert_allclose(turned_back(found, UP), turned_back(truth, UP), atol=1e-12)
+        np.testing.assert_allclose(found[2], 0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_roll_pitch_yaw(seed):
+    roll, pitch, yaw = np.random.default_rng(seed).uniform(-1.4, 1.4, 3)
+    turns = from_rotation_vectors(np.diag([roll, pitch, yaw]))
+    whole = product(turns[2], product(turns[1], turns[0]))
+    np.testing.assert_allclose(mahony.roll_pitch_yaw(*whole), [roll, pitch, yaw], atol=1e-12)
+    np.testing.assert_allclose(
+        turned(whole, UP), turned(turns[2], turned(turns[1], turned(turns[0], UP))), atol=1e-12
+    )

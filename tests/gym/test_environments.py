@@ -1,0 +1,190 @@
+"""The registered environments, on every engine that can run them."""
+
+import pickle
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import physx_core.gym  # registers them
+from physx_core.errors import FeatureNotSupportedError
+from physx_core.gym import RobotEnv
+
+ENGINES = ("dart", "pinocchio")
+NAMES = ("Cartpole", "Acrobot", "Ant", "Quadruped", "ArmReach", "PushBox")
+ALL = [(n, b) for n in NAMES for b in ENGINES if (n, b) != ("PushBox", "pinocchio")]
+STEPS = {"pinocchio": 12, "dart": 40}
+
+
+class Nameless(gymnasium.Env):
+    """Without `compute_reward`, which stable-baselines3 takes for that of a goal environment."""
+
+    def __init__(self, env):
+        self.env, self.metadata = env, env.metadata
+        self.observation_space, self.action_space = env.observation_space, env.action_space
+
+    def reset(self, *, seed=None, options=None):
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action):
+        return self.env.step(action)
+
+
+def make(name, backend, **options):
+    return gymnasium.make(f"physx/{name}-v0", backend=backend, **options)
+
+
+def actions_of(env, count, seed=0):
+    env.action_space.seed(seed)
+    return [env.action_space.sample() for _ in range(count)]
+
+
+def run(env, actions, seed):
+    observations, rewards = [env.reset(seed=seed)[0]], []
+    for action in actions:
+        observation, reward, terminated, truncated, _ = env.step(action)
+        observations.append(observation)
+        rewards.append(reward)
+        if terminated or truncated:
+            observations.append(env.reset()[0])
+    return np.array(observations), np.array(rewards)
+
+
+@pytest.mark.parametrize(("name", "backend"), ALL)
+def test_checkers_find_nothing(name, backend):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = make(name, backend)
+        check_env(env.unwrapped, skip_render_check=True)
+        sb3_check_env(Nameless(env), skip_render_check=True)
+    env.close()
+
+
+@pytest.mark.parametrize(("name", "backend"), ALL)
+def test_the_same_seed_gives_the_same_bits(name, backend):
+    env, other = make(name, backend), make(name, backend)
+    assert isinstance(env.unwrapped, RobotEnv)
+    actions = actions_of(env, STEPS[backend])
+    first = run(env, actions, 3)
+    run(env, actions_of(env, 5, seed=1), 8)
+    for again in (run(env, actions, 3), run(other, actions, 3)):
+        for one, two in zip(first, again, strict=True):
+            np.testing.assert_array_equal(one, two)
+    assert not np.array_equal(first[0][0], env.reset(seed=4)[0])
+    copied = pickle.loads(pickle.dumps(other.unwrapped))  # noqa: S301 - our own
+    state = env.unwrapped.snapshot()
+    one = [env.step(action)[0] for action in actions[:3]]
+    env.unwrapped.restore(state)
+    np.testing.assert_array_equal(one, [env.step(action)[0] for action in actions[:3]])
+    np.testing.assert_array_equal(copied.step(actions[0])[0], other.step(actions[0])[0])
+
+
+def test_a_pole_that_falls_terminates_and_time_truncates():
+    env = make("Cartpole", "dart", continuous=True)
+    assert env.action_space == gymnasium.spaces.Box(-1, 1, (1,))
+    env.reset(seed=0)
+    for steps in range(1, 500):  # noqa: B007
+        _, reward, terminated, truncated, _ = env.step(np.ones(1, np.float32))
+        assert reward == 1.0
+        if terminated or truncated:
+            break
+    assert (terminated, truncated) == (True, False)
+    assert 5 < steps < 60
+    env = make("Cartpole", "dart", simulation_duration_max=0.1)
+    env.reset(seed=0)
+    ends = [env.step(1)[2:4] for _ in range(5)]
+    assert ends == [(False, False)] * 4 + [(False, True)]
+
+
+def test_an_acrobot_above_the_bar_terminates():
+    env = make("Acrobot", "pinocchio").unwrapped
+    env.reset(seed=0)
+    env._sample_state = lambda: (np.array([np.pi, 0.0]), np.zeros(2))
+    with pytest.raises(physx_core.errors.EpisodeError, match="terminated at its first state"):
+        env.reset()
+    env._sample_state = lambda: (np.array([1.5, 0.0]), np.array([6.0, 0.0]))
+    env.reset()
+    rewards, terminated = [], False
+    while not terminated:
+        _, reward, terminated, truncated, _ = env.step(1)
+        rewards.append(reward)
+        assert not truncated
+    assert rewards == [-1.0] * (len(rewards) - 1) + [0.0]
+
+
+@pytest.mark.parametrize("name", ["Ant", "Quadruped"])
+def test_legs_stand_fall_and_tell_their_rewards(name):
+    env = make(name, "dart")
+    env.reset(seed=0)
+    for _ in range(20):
+        _, reward, terminated, truncated, info = env.step(np.zeros(env.action_space.shape))
+        assert reward == pytest.approx(sum(info["reward"].values()))
+        assert not (terminated or truncated)
+    base = env.unwrapped
+    state = base.robot_state.q.copy()
+    state[2] += 1.0
+    state[3:7] = [1.0, 0.0, 0.0, 0.0]  # upside down
+    base.simulator.simulation.set_state(state, np.zeros(len(base.robot_state.v)))
+    assert env.step(np.zeros(env.action_space.shape))[2]
+
+
+@pytest.mark.parametrize("backend", ENGINES)
+def test_an_arm_holds_its_pose_and_goes_where_it_is_told(backend):
+    env = make("ArmReach", backend)
+    env.reset(seed=0)
+    for _ in range(20):
+        first = env.step(np.zeros(7, np.float32))[0]
+    for _ in range(5):
+        held, reward, *_, info = env.step(np.zeros(7, np.float32))
+    np.testing.assert_allclose(held[:7], first[:7], atol=1e-2)
+    assert reward == pytest.approx(-np.linalg.norm(held[17:]))
+    assert info["is_success"] == (np.linalg.norm(held[17:]) < 0.05)
+    for _ in range(10):
+        moved, *_ = env.step(np.array([0, 0, 0, 0, 0, 0, 1], np.float32))
+    assert moved[6] - held[6] == pytest.approx(1.5 * 0.4, abs=0.15)
+
+
+def test_a_box_is_pushed_to_its_goal():
+    env = make("PushBox", "dart")
+    observation, _ = env.reset(seed=1)
+    for _ in range(200):
+        observation, reward, terminated, truncated, info = env.step(push(observation))
+        if terminated or truncated:
+            break
+    assert terminated
+    assert info["is_success"]
+    assert reward > 9.0
+    with pytest.raises(FeatureNotSupportedError, match="body_contacts"):
+        make("PushBox", "pinocchio").reset()
+
+
+def push(observation):
+    """Go around the box, behind it, then push it towards the goal."""
+    stick, speed, box, way = (observation[i : i + 2] for i in (0, 2, 4, 13))
+    way = way / max(np.linalg.norm(way), 1e-9)
+    aside = np.array([-way[1], way[0]])
+    along, across = (stick - box) @ way, (stick - box) @ aside
+    if along < -0.1 and abs(across) < 0.1:
+        target = box + 0.2 * way - 2.0 * across * aside
+    elif along < -0.26:
+        target = box - 0.3 * way
+    elif abs(across) > 0.27:
+        target = box - 0.35 * way + across * aside
+    else:
+        target = stick + 0.3 * np.sign(across or 1.0) * aside
+    return np.clip(6.0 * (target - stick) - 1.0 * speed, -1, 1).astype(np.float32)
+
+
+def test_make_vec_runs_them_in_processes(nothing_stays_behind):
+    env = gymnasium.make_vec("physx/Cartpole-v0", num_envs=2, processes=2, backend="dart")
+    try:
+        single = make("Cartpole", "dart")
+        first, _ = env.reset(seed=5)
+        np.testing.assert_array_equal(first[0], single.reset(seed=5)[0])
+        many, *_ = env.step(np.array([2, 0]))
+        np.testing.assert_array_equal(many[0], single.step(2)[0])
+    finally:
+        env.close()
