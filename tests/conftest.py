@@ -19,7 +19,7 @@ def nothing_stays_behind(monkeypatch):
     mark = uuid.uuid4().hex
     monkeypatch.setenv("PHYSX_TEST_MARK", mark)
     yield
-    deadline = time.monotonic() + 2  # a process that is killed takes a moment to go
+    deadline = time.monotonic() + 20  # a process that is killed takes a moment to go
     while (left := marked(mark.encode())) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not left

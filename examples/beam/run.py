@@ -49,7 +49,7 @@ class Size:
     greatest_error: float
 
 
-FULL = Size(2400, 200, 120, 24, 100, greatest_error=0.05)
+FULL = Size(2400, 200, 60, 30, 100, greatest_error=0.05)
 SMALL = Size(60, 20, 10, 2, 10, greatest_error=float("inf"))
 VALUES = int(np.prod(NODES)) * 3
 FIELDS = {"net_fields": "forces", "opt_fields": "displacement"}
@@ -125,6 +125,9 @@ def networks(size: Size) -> dict[str, tuple[NetworkConfig, int]]:
             "nb_first_layer_channels": 16,
             "nb_steps": 2,
             "border_mode": "same",
+            "two_sublayers": False,
+            "activation": "SiLU",
+            "positions": True,  # the beam is held at one end
         },
         scheduler="CosineAnnealingLR",
         scheduler_kwargs={"T_max": size.unet_epochs},
@@ -142,7 +145,7 @@ def train(name: str, network: NetworkConfig, epochs: int, sessions: str, session
         session_name=session,
         new_session=False,
         epoch_nb=epochs,
-        batch_size=32,
+        batch_size=16,
         seed=0,
     )
     begin = time.perf_counter()

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 import socket
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -11,7 +16,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import pytest
 
-from physx_core import Dataset
+from physx_core import Dataset, Field
 from physx_core.config import EnvironmentConfig
 from physx_core.sources.clients import ClientSource
 from physx_core.sources.local import LocalSource
@@ -37,6 +42,68 @@ def folder(tmp_path):
 def dataset(folder):
     with Dataset.create(folder, max_file_size=0.001) as dataset:
         yield dataset
+
+
+class Thousand:
+    """A thousand rows of two fields, and datasets of them in partitions of 340 rows.
+
+    Attributes:
+        rows: Field name to rows.
+        fields: The fields.
+        size: Size of a partition in GB.
+    """
+
+    def __init__(self, folder):
+        self.rows = {
+            "x": np.random.default_rng(0).normal(size=(1000, 5)),
+            "n": np.arange(1000, dtype="int32"),
+        }
+        self.fields = [Field("x", (5,), unit="m"), Field("n", (), "int32", role="additional")]
+        self.size = 3e-5
+        self._whole = folder / "data"
+        self._make(self._whole, self.rows)
+
+    def write(self, folder, rows=None, session="run", **options):
+        """Make a dataset; one of all rows is copied, which is quicker."""
+        if rows is None and session == "run" and not options:
+            shutil.copytree(self._whole, folder)
+        else:
+            self._make(folder, self.rows if rows is None else rows, session, **options)
+
+    def check(self, folder, rows, *, counted=True):
+        """Check rows, statistics and files; the manifest holds the statistics if `counted`."""
+        with Dataset.open(folder) as dataset:
+            assert dataset.num_samples("training") == len(rows["n"])
+            for name, values in rows.items():
+                np.testing.assert_array_equal(dataset["training"][name][:], values)
+            found = dataset.normalization["x"]
+            np.testing.assert_allclose(found.mean, rows["x"].mean(axis=0), atol=1e-12)
+            np.testing.assert_allclose(found.std, rows["x"].std(axis=0), rtol=1e-9)
+            assert dataset.verify() == []
+        plain = json.loads((folder / "dataset.json").read_text())["modes"]["training"]
+        count = plain["normalization"].get("x", {"count": 0})["count"]
+        assert count == (len(rows["n"]) if counted else count)
+        for session in {partition["session"] for partition in plain["partitions"]}:
+            assert (folder / f"{session}.h5").exists()
+
+    def part(self, start, stop):
+        return {name: values[start:stop] for name, values in self.rows.items()}
+
+    def stacked(self, *blocks):
+        """Return blocks as one; each is given as such, or as where it begins and ends."""
+        blocks = [self.part(*block) if isinstance(block, tuple) else block for block in blocks]
+        return {name: np.concatenate([block[name] for block in blocks]) for name in self.rows}
+
+    def _make(self, folder, rows, session="run", **options):
+        with Dataset.create(folder, session, max_file_size=self.size, **options) as dataset:
+            dataset.define_fields("training", self.fields)
+            dataset.append("training", rows)
+
+
+@pytest.fixture(scope="session")
+def thousand(tmp_path_factory):
+    """Rows, and datasets of them."""
+    return Thousand(tmp_path_factory.mktemp("thousand"))
 
 
 # Sources ----------------------------------------------------------------------------------------
@@ -93,6 +160,40 @@ def clients(services, nothing_stays_behind):
         return ClientSource(settings, services, SEED, run_ahead=run_ahead, total=total)
 
     return make
+
+
+@pytest.fixture
+def unhurried():
+    """Return a function that makes a client's time for silence longer, the busier the machine is.
+
+    What is added is several times as long as an interpreter takes to start here and now.
+    """
+    began = time.monotonic()
+    command = [sys.executable, "-c", "import physx_core.transport.client, h5py"]
+    subprocess.run(command, check=True)
+    starting = time.monotonic() - began
+    return lambda seconds: round(seconds + 5 * starting, 1)
+
+
+@pytest.fixture
+def process_ids():
+    """Return a function: instance number to process id of the clients that a process started."""
+
+    def find(parent=None):
+        found = {}
+        for command in Path("/proc").glob("[0-9]*/cmdline"):
+            try:
+                words = command.read_bytes().split(b"\0")
+                started_by = int(
+                    (command.parent / "stat").read_text().rpartition(")")[2].split()[1]
+                )
+            except OSError:
+                continue
+            if b"--instance" in words and started_by == (parent or os.getpid()):
+                found[int(words[words.index(b"--instance") + 1])] = int(command.parent.name)
+        return found
+
+    return find
 
 
 @pytest.fixture

@@ -89,6 +89,13 @@ class Doubling(Environment):
         return self.is_accepted()
 
 
+class Refusing(Doubling):
+    """Refuses every other sample that it makes, and all that it replays."""
+
+    def is_accepted(self):
+        return self.sample is None and self.step_index % 2 == 0
+
+
 class Asking(Doubling):
     """Keeps the network's answer for its x in the field ``answer``."""
 

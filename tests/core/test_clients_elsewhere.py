@@ -101,7 +101,7 @@ def test_clients_join_a_waiting_run_and_say_what_they_do(by_hand, join, port, ca
     assert TOKEN not in caplog.text
 
 
-def test_the_server_says_now_and_then_what_it_waits_for(by_hand, join, caplog, monkeypatch):
+def test_the_server_says_now_and_then_what_it_waits_for(by_hand, caplog, monkeypatch):
     monkeypatch.setattr("physx_core.transport.group._SAY_EVERY", 0.2)
     with (
         pytest.raises(ClientError, match=r"Client 1 did not connect for 3 s"),
@@ -109,7 +109,7 @@ def test_the_server_says_now_and_then_what_it_waits_for(by_hand, join, caplog, m
     ):
         pass
     texts = warnings(caplog)
-    assert "waits for a client to run instance 1, 2, since 0 s" in texts[1]
+    assert "waits for a client to run instance 1, 2, since " in texts[1]
     assert "waits for a client to run instance 1, 2, since 3 s" in texts[-1]
 
 
@@ -124,7 +124,7 @@ def test_another_client_takes_the_place_of_one_that_leaves(local, by_hand, join,
         for row in range(60):
             if row == 20:
                 leaver.send_signal(signal.SIGINT)
-                leaver.wait(10)
+                leaver.wait(30)
                 late = join()
             rows.append(source.batch(1)["position"][0].copy())
     assert [row.tobytes() for row in rows] == [row.tobytes() for row in expected["position"]]
@@ -135,12 +135,12 @@ def test_another_client_takes_the_place_of_one_that_leaves(local, by_hand, join,
     assert "The run waits up to 20 s for another client to go on in its place" in text
 
 
-def test_a_place_that_nobody_takes_ends_the_run(by_hand, join):
-    client = join()
+def test_a_place_that_nobody_takes_ends_the_run(by_hand, join, unhurried):
+    client, timeout = join(), unhurried(2.0)
     assert "looks for the server" in client.stdout.readline()
     with (
-        pytest.raises(ClientError, match=r"Client 1 was lost after \d+ rows, and none .* for 3 s"),
-        by_hand(timeout=3.0) as source,
+        pytest.raises(ClientError, match=r"Client 1 was lost after \d+ rows, and none .* s while"),
+        by_hand(timeout=timeout) as source,
     ):
         source.batch(1)
         client.kill()
@@ -239,26 +239,28 @@ def test_a_client_without_a_token_is_told_so(monkeypatch, port):
 # Strangers --------------------------------------------------------------------------------------
 
 
+def flood(kind, port, over, opened):
+    """Open connections until it is over, and count them."""
+    kept = []
+    while not over.is_set():
+        try:
+            kept.append(socket.create_connection(("127.0.0.1", port), timeout=1))
+            opened.append(1)
+            if kind == "talkative":
+                kept[-1].sendall(pack(Kind.HELLO, b"physxtcp" + secrets.token_bytes(36)))
+            if kind == "quick" or len(kept) > 200:
+                kept.pop(0).close()
+        except OSError:
+            over.wait(0.01)
+    for connection in kept:
+        connection.close()
+
+
 @pytest.mark.parametrize("kind", ["silent", "talkative", "quick"])
 def test_a_flood_of_strangers_does_not_keep_a_late_client_out(by_hand, join, port, kind):
     """Connections are opened as fast as it goes, and kept or closed at once."""
     over = threading.Event()
     opened = []
-
-    def flood():
-        kept = []
-        while not over.is_set():
-            try:
-                kept.append(socket.create_connection(("127.0.0.1", port), timeout=1))
-                opened.append(1)
-                if kind == "talkative":
-                    kept[-1].sendall(pack(Kind.HELLO, b"physxtcp" + secrets.token_bytes(36)))
-                if kind == "quick" or len(kept) > 200:
-                    kept.pop(0).close()
-            except OSError:
-                over.wait(0.01)
-        for connection in kept:
-            connection.close()
 
     def come_late():
         end = time.monotonic() + 20
@@ -267,7 +269,7 @@ def test_a_flood_of_strangers_does_not_keep_a_late_client_out(by_hand, join, por
         clients.extend(join("--patience", "30") for _ in range(2))
 
     clients = []
-    crowd = [threading.Thread(target=flood) for _ in range(2)]
+    crowd = [threading.Thread(target=flood, args=(kind, port, over, opened)) for _ in range(2)]
     late = threading.Thread(target=come_late)
     join()
     try:
@@ -316,7 +318,7 @@ def test_clients_by_hand_leave_when_the_server_is_killed(join, port, pace):
     started = [join(), join(start_new_session=True)]
     server = subprocess.Popen([sys.executable, "-c", SERVER, str(port), str(pace)])
     try:
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 60
         numbers = []
         while len(numbers) < 4 and time.monotonic() < deadline:
             time.sleep(0.05)
@@ -326,7 +328,7 @@ def test_clients_by_hand_leave_when_the_server_is_killed(join, port, pace):
     finally:
         server.kill()
         server.wait()
-    assert gone_after(numbers, 2.0)
+    assert gone_after(numbers, 20.0)
     assert [process.wait(1) for process in started] != [0, 0]
 
 

@@ -20,6 +20,7 @@ from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.errors import ClientError
 
 ENVS = Path(__file__).with_name("transport_envs.py")
+SOON = 30.0  # far below the time for which a client may be silent, on the busiest machine too
 
 
 @pytest.mark.parametrize(("method", "rows"), [("__init__", 0), ("step", 3)])
@@ -34,7 +35,7 @@ def test_a_client_whose_environment_exits_is_named(clients, method, rows):
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
-def test_a_client_that_is_killed_is_named_within_two_seconds(clients, number):
+def test_a_client_that_is_killed_is_named_at_once(clients, process_ids, number):
     with (
         pytest.raises(
             ClientError, match=rf"Client 2 was killed by signal .*{number.name}"
@@ -47,23 +48,9 @@ def test_a_client_that_is_killed_is_named_within_two_seconds(clients, number):
         began = time.monotonic()
         while True:
             source.batch(2)
-    assert time.monotonic() - began < 2.1
+    assert time.monotonic() - began < SOON
     assert caught.value.exit_status == -number
     timer.join()
-
-
-def process_ids():
-    """Instance number to process id, from the command lines of this process's clients."""
-    found = {}
-    for command in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = command.read_bytes().split(b"\0")
-            parent = (command.parent / "stat").read_text().rpartition(")")[2].split()[1]
-        except OSError:
-            continue
-        if b"--instance" in words and int(parent) == os.getpid():
-            found[int(words[words.index(b"--instance") + 1])] = int(command.parent.name)
-    return found
 
 
 def test_a_client_that_cannot_start_is_noticed_at_once(clients, monkeypatch, tmp_path):
@@ -74,7 +61,7 @@ def test_a_client_that_cannot_start_is_noticed_at_once(clients, monkeypatch, tmp
     began = time.monotonic()
     with pytest.raises(ClientError, match="before it connected") as caught, clients("Plain"):
         pass
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < SOON
     assert caught.value.exit_status == 1
     assert "numpy is broken today" in caught.value.stderr
 
@@ -121,7 +108,7 @@ def test_after_an_error_outside_the_clients_are_not_waited_for(clients):
     ):
         source.batch(2)
         raise KeyboardInterrupt
-    assert time.monotonic() - began < 6
+    assert time.monotonic() - began < SOON
 
 
 SERVER = """
@@ -129,7 +116,7 @@ from pathlib import Path
 from physx_core.config import EnvironmentConfig
 from physx_core.sources.clients import ClientSource
 
-kwargs = {{"fault": "raise", "place": "never"}}
+kwargs = {{"fault": {fault!r}, "place": "step"}}
 config = EnvironmentConfig({environment!r}, env_kwargs=kwargs, num_clients=2)
 with ClientSource(config, None, [0]) as source:
     while True:
@@ -138,12 +125,14 @@ with ClientSource(config, None, [0]) as source:
 """
 
 
-def test_nothing_is_left_when_the_server_is_killed(nothing_stays_behind):
+@pytest.mark.parametrize("fault", ["nothing", "stop", "hold"])
+def test_nothing_is_left_when_the_server_is_killed(nothing_stays_behind, fault):
+    """Nor a client that is stopped, or in which no Python can run."""
     # Each of the two clients has a child of its own; the fixture looks for all four.
-    Path("server.py").write_text(SERVER.format(environment=f"{ENVS}:Faulty"))
+    Path("server.py").write_text(SERVER.format(environment=f"{ENVS}:Faulty", fault=fault))
     server = subprocess.Popen([sys.executable, "server.py"])
-    deadline = time.monotonic() + 20
-    while not Path("ready").exists():
+    deadline = time.monotonic() + 60
+    while not Path("ready" if fault == "nothing" else "broke").exists():
         assert server.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)

@@ -21,11 +21,12 @@ TEXTS = {
     "raise": r"Instance 2 raised in \w+\(\).*: RuntimeError: no more beans",
     "exit": "Client 2 ended with exit status 3 after",
     "kill": r"Client 2 was killed by signal 9 \(SIGKILL\) after",
-    "stop": r"Client 2 sent nothing for 5 s while the server waited for it",
-    "spin": r"Client 2 sent nothing for 5 s while the server waited for it",
+    "stop": r"Client 2 sent nothing for [\d.]+ s while the server waited for it",
+    "spin": r"Client 2 sent nothing for [\d.]+ s while the server waited for it",
     "garbage": r"Client 2 was cut off after \d+ rows\. .*no message of physx",
-    "half": r"Client 2 sent nothing for 5 s while the server waited for it",
-    "dribble": r"Client 2 sent nothing for 5 s while the server waited for it",
+    "half": r"Client 2 sent nothing for [\d.]+ s while the server waited for it",
+    "dribble": r"Client 2 sent nothing for [\d.]+ s while the server waited for it",
+    "trickle": r"Client 2 sent nothing for [\d.]+ s while the server waited for it",
     "disconnect": r"Client 2 closed the connection after",
 }
 ALWAYS = {
@@ -35,12 +36,12 @@ ALWAYS = {
     ("spin", "create"),
     ("garbage", "step"),
     ("half", "prediction"),
+    ("trickle", "step"),
     ("disconnect", "step"),
 }
-HANGS = ("stop", "spin", "half", "dribble")
+HANGS = ("stop", "spin", "half", "dribble", "trickle")
 BATCHES = 5
-TIMEOUT = 5.0
-PROMISED = 2.0
+SOON = 30.0  # far below the 60 s for which a client may be silent
 
 
 @pytest.fixture
@@ -96,15 +97,16 @@ CASES = [
 
 @pytest.mark.parametrize(("fault", "place"), CASES)
 def test_a_client_that_breaks_is_named(
-    clients, batch_services, folder, fault, place, record_property
+    clients, batch_services, folder, fault, place, record_property, unhurried
 ):
     hangs = fault in HANGS
+    timeout = unhurried(3.0) if hangs else 60.0
     source = clients(
         "Faulty",
         num_clients=2,
         run_ahead=0,
         env_kwargs={"fault": fault, "place": place},
-        timeout=TIMEOUT if hangs else 60.0,
+        timeout=timeout,
     )
     error, came, cleared = broken_run(source, folder)
     record_property("seconds", (came, cleared))
@@ -122,7 +124,6 @@ def test_a_client_that_breaks_is_named(
         assert "last words" in error.stderr
         assert "last words" in str(error)
         assert (f"in do_{fault}" in error.stderr) == (hangs and fault != "stop")
-    deadline = TIMEOUT + 0.5 if hangs else 0.0  # a client that waits for a prediction is not late
-    assert came < deadline + PROMISED
-    assert cleared < deadline + PROMISED + 8
+    assert came < (timeout if hangs else 0.0) + SOON
+    assert cleared < (timeout if hangs else 0.0) + SOON
     check_rows(folder, {"step": 8, "prediction": 8, "close": 4 * BATCHES}.get(place, 0))

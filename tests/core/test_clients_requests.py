@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,15 +72,15 @@ def test_a_refused_prediction_is_the_error_of_the_services(local, clients, servi
         assert caught.value.__notes__ == ["in step() of instance 1"]
 
 
-def test_a_long_prediction_is_not_taken_for_silence(clients, services):
-    quick = services.predict
+def test_a_long_prediction_is_not_taken_for_silence(clients, services, unhurried):
+    quick, timeout = services.predict, unhurried(1.0)
 
     def predict(fields):
-        time.sleep(0.9)
+        time.sleep(0.4 * timeout)
         return quick(fields)
 
     services.predict = predict
-    with clients("Asking", num_clients=3, timeout=2.5, run_ahead=0) as source:
+    with clients("Asking", num_clients=3, timeout=timeout, run_ahead=0) as source:
         assert len(source.batch(3)["x"]) == 3
 
 
@@ -123,6 +124,36 @@ def test_drawing_events_arrive_exactly(local, clients, services):
             assert (a.action, a.kind, a.name) == (b.action, b.kind, b.name)
             assert a.values.keys() == b.values.keys()
             same_arrays(a.values, b.values)
+
+
+def test_a_client_at_its_end_is_not_lost_while_the_server_reads_what_it_sent(
+    clients, services, process_ids
+):
+    """The server is slow, and the client ends while thousands of messages wait to be read."""
+    shown, closing = [], []
+
+    def show(instance_id, step, events):
+        if not shown:
+            time.sleep(1.0)  # meanwhile the client gets ahead
+        while closing and has_ended(closing[0]) is False:
+            time.sleep(0.01)
+        if len(shown) % 500 == 0:
+            time.sleep(0.3)
+        shown.append(step)
+
+    services.show = show
+    with clients("Drawing", run_ahead=5000, total=5000, visualizer="any") as source:
+        source.batch(1)
+        closing.append(process_ids()[1])
+    assert shown[1:] == list(range(len(shown) - 1))  # the first is what is drawn at the beginning
+
+
+def has_ended(number):
+    """Return whether a process has ended, waited for or not."""
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
 
 
 def same_arrays(a, b):

@@ -2,13 +2,12 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from physx_core import Dataset, Field
+from physx_core import Dataset
 from physx_core.errors import (
     DatasetError,
     DatasetNotFoundError,
@@ -19,63 +18,6 @@ from physx_core.errors import (
 )
 
 N = 1000
-RNG = np.random.default_rng(0)
-ROWS = {"x": RNG.normal(size=(N, 5)), "n": np.arange(N, dtype="int32")}
-FIELDS = [Field("x", (5,), unit="m"), Field("n", (), "int32", role="additional")]
-SIZE = 3e-5  # partitions of 340 rows
-OLD = Path(__file__).parents[1] / "data" / "dataset_v1"
-
-
-@pytest.fixture(scope="module")
-def sound(tmp_path_factory):
-    """The folder of a dataset of ROWS in three partitions."""
-    folder = tmp_path_factory.mktemp("sound") / "data"
-    make(folder)
-    return folder
-
-
-@pytest.fixture
-def write(sound):
-    """Return a function that makes a dataset; one of all ROWS is copied, which is quicker."""
-
-    def write(folder, *args, **options):
-        if args or options:
-            make(folder, *args, **options)
-        else:
-            shutil.copytree(sound, folder)
-
-    return write
-
-
-def make(folder, rows=ROWS, session="run", **options):
-    with Dataset.create(folder, session, max_file_size=SIZE, **options) as dataset:
-        dataset.define_fields("training", FIELDS)
-        dataset.append("training", rows)
-
-
-def check(folder, rows, *, counted=True):
-    """Check rows, statistics and files; the manifest holds the statistics if `counted`."""
-    with Dataset.open(folder) as dataset:
-        assert dataset.num_samples("training") == len(rows["n"])
-        for name, values in rows.items():
-            assert_array_equal(dataset["training"][name][:], values)
-        found = dataset.normalization["x"]
-        np.testing.assert_allclose(found.mean, rows["x"].mean(axis=0), atol=1e-12)
-        np.testing.assert_allclose(found.std, rows["x"].std(axis=0), rtol=1e-9)
-        assert dataset.verify() == []
-    plain = json.loads((folder / "dataset.json").read_text())["modes"]["training"]
-    count = plain["normalization"].get("x", {"count": 0})["count"]
-    assert count == (len(rows["n"]) if counted else count)
-    for session in {partition["session"] for partition in plain["partitions"]}:
-        assert (folder / f"{session}.h5").exists()
-
-
-def stacked(*blocks):
-    return {name: np.concatenate([block[name] for block in blocks]) for name in ROWS}
-
-
-def part(start, stop):
-    return {name: values[start:stop] for name, values in ROWS.items()}
 
 
 # Updating ---------------------------------------------------------------------------------------
@@ -84,12 +26,12 @@ def part(start, stop):
 @pytest.mark.parametrize(
     "index", [3, -1, slice(300, 700), slice(None, None, 7), [5, 999, 340, 4], np.arange(N) % 9 == 0]
 )
-def test_updated_rows_are_read_at_once_and_later(folder, index, write):
-    write(folder)
-    rows = {name: values.copy() for name, values in ROWS.items()}
+def test_updated_rows_are_read_at_once_and_later(folder, index, thousand):
+    thousand.write(folder)
+    rows = {name: values.copy() for name, values in thousand.rows.items()}
     rows["x"][index] = -rows["x"][index]
     rows["n"][index] = 7
-    with Dataset.open(folder, writable=True, max_file_size=SIZE) as dataset:
+    with Dataset.open(folder, writable=True, max_file_size=thousand.size) as dataset:
         next(dataset.batches("training", 10))  # rows in memory are read anew
         before = dataset.normalization["x"].mean
         dataset.update("training", index, {"x": rows["x"][index], "n": rows["n"][index]})
@@ -97,13 +39,13 @@ def test_updated_rows_are_read_at_once_and_later(folder, index, write):
         assert_array_equal(next(dataset.batches("training", N))["n"], rows["n"])
         assert not np.array_equal(dataset.normalization["x"].mean, before)
         assert dataset.verify() == []
-    check(folder, rows)
+    thousand.check(folder, rows)
 
 
-def test_rows_of_the_open_partition_are_updated_too(folder):
-    rows = stacked(ROWS, ROWS)
-    with Dataset.create(folder, max_file_size=SIZE) as dataset:
-        dataset.append("training", ROWS)
+def test_rows_of_the_open_partition_are_updated_too(folder, thousand):
+    rows = thousand.stacked(thousand.rows, thousand.rows)
+    with Dataset.create(folder, max_file_size=thousand.size) as dataset:
+        dataset.append("training", thousand.rows)
         assert dataset.normalization["x"].mean.shape == (5,)
         for start in range(900, 1000, 25):
             where = slice(start, start + 25)
@@ -111,23 +53,25 @@ def test_rows_of_the_open_partition_are_updated_too(folder):
             dataset.update("training", where, {"x": rows["x"][where]})
         with Dataset.open(folder) as reader:
             assert_array_equal(reader["training"]["x"][:], rows["x"][:N])
-        dataset.append("training", ROWS)
+        dataset.append("training", thousand.rows)
     with Dataset.open(folder, writable=True) as dataset:
         dataset.update("training", [], {"x": np.zeros((0, 5))})
         assert_array_equal(dataset["training"]["x"][:], rows["x"])
 
 
-def test_waiting_samples_are_updated(folder):
+def test_waiting_samples_are_updated(folder, thousand):
     with Dataset.create(folder, durable=True) as dataset:
         for row in range(10):
-            dataset.append_sample("training", {name: values[row] for name, values in ROWS.items()})
+            dataset.append_sample(
+                "training", {name: values[row] for name, values in thousand.rows.items()}
+            )
         dataset.update("training", 9, {"x": np.ones(5)})
         assert_array_equal(dataset["training"]["x"][9], np.ones(5))
-        assert_array_equal(dataset["training"]["x"][8], ROWS["x"][8])
+        assert_array_equal(dataset["training"]["x"][8], thousand.rows["x"][8])
 
 
-def test_an_update_that_is_not_possible_changes_nothing(folder, write):
-    write(folder)
+def test_an_update_that_is_not_possible_changes_nothing(folder, thousand):
+    thousand.write(folder)
     with Dataset.open(folder, writable=True) as dataset:
         for index, rows in [
             (0, {"x": np.full(5, np.nan)}), (0, {"x": np.ones(4)}), (0, {"y": np.ones(5)}),
@@ -141,27 +85,27 @@ def test_an_update_that_is_not_possible_changes_nothing(folder, write):
                 dataset.update("training", index, {"x": np.ones((1, 5))})
         with pytest.raises(DatasetError, match="no mode"):
             dataset.update("other", 0, {"x": np.ones(5)})
-    check(folder, ROWS)
+    thousand.check(folder, thousand.rows)
     with Dataset.open(folder) as dataset, pytest.raises(UsageError, match="writable=True"):
         dataset.update("training", 0, {"x": np.ones(5)})
     with pytest.raises(NotFiniteError), Dataset.open(folder, writable=True) as dataset:
         dataset.update("training", 0, {"x": np.full(5, np.inf)})
 
 
-def test_an_update_that_was_cut_short_is_completed(folder, tmp_path, write):
-    write(folder)
-    rows = stacked(ROWS)
+def test_an_update_that_was_cut_short_is_completed(folder, tmp_path, thousand):
+    thousand.write(folder)
+    rows = thousand.stacked(thousand.rows)
     rows["x"][:400] = 1
     with Dataset.open(folder, writable=True) as dataset:
         dataset.update("training", slice(0, 400), {"x": rows["x"][:400]})
         shutil.copytree(folder, tmp_path / "killed")
-    check(tmp_path / "killed", rows, counted=False)
+    thousand.check(tmp_path / "killed", rows, counted=False)
     assert "checksums" in "".join(Dataset.repair(tmp_path / "killed"))
-    check(tmp_path / "killed", rows)
+    thousand.check(tmp_path / "killed", rows)
 
 
-def test_a_reader_sees_updates_when_it_refreshes(folder, write):
-    write(folder)
+def test_a_reader_sees_updates_when_it_refreshes(folder, thousand):
+    thousand.write(folder)
     with Dataset.open(folder) as reader, Dataset.open(folder, writable=True) as dataset:
         next(reader.batches("training", N))
         dataset.update("training", 0, {"n": 5})
@@ -173,29 +117,32 @@ def test_a_reader_sees_updates_when_it_refreshes(folder, write):
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_a_merged_dataset_holds_the_rows_of_both(folder, tmp_path, shared, write):
-    write(folder, part(0, 400))
-    write(tmp_path / "other", part(400, 1000), "other")
+def test_a_merged_dataset_holds_the_rows_of_both(folder, tmp_path, shared, thousand):
+    thousand.write(folder, thousand.part(0, 400))
+    thousand.write(tmp_path / "other", thousand.part(400, 1000), "other")
     before = {p.name: p.read_bytes() for p in (tmp_path / "other").iterdir()}
-    with Dataset.open(folder, writable=True, shared=shared, max_file_size=SIZE) as dataset:
-        dataset.append("training", part(0, 10))
+    with Dataset.open(folder, writable=True, shared=shared, max_file_size=thousand.size) as dataset:
+        dataset.append("training", thousand.part(0, 10))
         dataset.merge(tmp_path / "other")
-        assert_array_equal(dataset["training"]["n"][:], stacked(ROWS, part(0, 10))["n"][ORDER])
-        dataset.append("training", part(10, 20))
-    rows = stacked(part(0, 400), part(0, 10), part(400, 1000), part(10, 20))
-    check(folder, rows)
+        assert_array_equal(
+            dataset["training"]["n"][:],
+            thousand.stacked(thousand.rows, (0, 10))["n"][ORDER],
+        )
+        dataset.append("training", thousand.part(10, 20))
+    rows = thousand.stacked((0, 400), (0, 10), (400, 1000), (10, 20))
+    thousand.check(folder, rows)
     assert {p.name: p.read_bytes() for p in (tmp_path / "other").iterdir()} == before
     (folder / "dataset.json").unlink()
     Dataset.rebuild(folder)
-    check(folder, rows)
+    thousand.check(folder, rows)
 
 
 ORDER = np.r_[0:400, 1000:1010, 400:1000]
 
 
-def test_merging_brings_modes_and_what_a_killed_writer_left(folder, tmp_path):
-    live = Dataset.create(tmp_path / "live", max_file_size=SIZE)
-    live.append("training", ROWS)
+def test_merging_brings_modes_and_what_a_killed_writer_left(folder, tmp_path, thousand):
+    live = Dataset.create(tmp_path / "live", max_file_size=thousand.size)
+    live.append("training", thousand.rows)
     live.append("validation", {"y": [1.0, 2.0]})
     shutil.copytree(tmp_path / "live", tmp_path / "killed")
     live.close()
@@ -203,12 +150,12 @@ def test_merging_brings_modes_and_what_a_killed_writer_left(folder, tmp_path):
         dataset.merge(tmp_path / "killed")
         dataset.merge(tmp_path / "killed")
         assert_array_equal(dataset["validation"]["y"], [1, 2, 1, 2])
-    check(folder, stacked(ROWS, ROWS))
+    thousand.check(folder, thousand.stacked(thousand.rows, thousand.rows))
 
 
-def test_statistics_are_merged_and_not_computed_again(folder, tmp_path, write):
-    write(folder)
-    write(tmp_path / "other")
+def test_statistics_are_merged_and_not_computed_again(folder, tmp_path, thousand):
+    thousand.write(folder)
+    thousand.write(tmp_path / "other")
     place = tmp_path / "other" / "dataset.json"
     plain = json.loads(place.read_text())
     plain["modes"]["training"]["normalization"]["x"]["mean"] = [4.0] * 5
@@ -216,10 +163,10 @@ def test_statistics_are_merged_and_not_computed_again(folder, tmp_path, write):
     with Dataset.open(folder, writable=True) as dataset:
         dataset.merge(tmp_path / "other")
         mean = dataset.normalization["x"].mean
-        np.testing.assert_allclose(mean, (ROWS["x"].mean(axis=0) + 4) / 2)
+        np.testing.assert_allclose(mean, (thousand.rows["x"].mean(axis=0) + 4) / 2)
         found = dataset.recompute_normalization()["x"].mean
-        np.testing.assert_allclose(found, ROWS["x"].mean(axis=0), atol=1e-12)
-    check(folder, stacked(ROWS, ROWS))
+        np.testing.assert_allclose(found, thousand.rows["x"].mean(axis=0), atol=1e-12)
+    thousand.check(folder, thousand.stacked(thousand.rows, thousand.rows))
 
 
 def write_manifest(path, plain):
@@ -231,9 +178,9 @@ def write_manifest(path, plain):
     path.write_bytes(body + b',\n "crc32": "%08x"\n}' % zlib.crc32(body))
 
 
-def test_a_merge_that_is_not_possible_changes_nothing(folder, tmp_path, write):
-    write(folder)
-    write(tmp_path / "other")
+def test_a_merge_that_is_not_possible_changes_nothing(folder, tmp_path, thousand):
+    thousand.write(folder)
+    thousand.write(tmp_path / "other")
     with Dataset.create(tmp_path / "fields") as dataset:
         dataset.append("training", {"x": np.ones((2, 4))})
     path = tmp_path / "other" / "run_training_x_2.h5"
@@ -252,7 +199,7 @@ def test_a_merge_that_is_not_possible_changes_nothing(folder, tmp_path, write):
         path.unlink()
         with pytest.raises(DatasetError, match=r"run_training_x_2\.h5 is missing"):
             dataset.merge(tmp_path / "other")
-    check(folder, ROWS)
+    thousand.check(folder, thousand.rows)
     assert len(list(folder.glob("run_training_x_*.h5"))) == 3
     with Dataset.open(folder) as dataset, pytest.raises(UsageError):
         dataset.merge(tmp_path / "other")
@@ -261,27 +208,27 @@ def test_a_merge_that_is_not_possible_changes_nothing(folder, tmp_path, write):
 # Removing ---------------------------------------------------------------------------------------
 
 
-def test_a_removed_partition_is_gone(folder, write):
-    write(folder)
-    with Dataset.open(folder, writable=True, session="b", max_file_size=SIZE) as dataset:
-        dataset.append("training", part(0, 400))
+def test_a_removed_partition_is_gone(folder, thousand):
+    thousand.write(folder)
+    with Dataset.open(folder, writable=True, session="b", max_file_size=thousand.size) as dataset:
+        dataset.append("training", thousand.part(0, 400))
         next(dataset.batches("training", 5))
         assert dataset.remove_partition("training", 1, "run") == 340
         assert_array_equal(dataset["training"]["n"][335:345], [*range(335, 340), *range(680, 685)])
         assert next(dataset.batches("training", 2000))["n"][340] == 680
         assert not list(folder.glob("run_training_*_1.h5"))
         assert dataset.remove_partition("training", 1) == 60  # the open one of session b
-        dataset.append("training", part(500, 510))
-    rows = stacked(part(0, 340), part(680, 1000), part(0, 340), part(500, 510))
-    check(folder, rows)
+        dataset.append("training", thousand.part(500, 510))
+    rows = thousand.stacked((0, 340), (680, 1000), (0, 340), (500, 510))
+    thousand.check(folder, rows)
     Dataset.rebuild(folder)
-    check(folder, rows)
+    thousand.check(folder, rows)
 
 
-def test_a_partition_that_is_not_there_is_not_removed(folder, write):
-    write(folder)
+def test_a_partition_that_is_not_there_is_not_removed(folder, thousand):
+    thousand.write(folder)
     with Dataset.open(folder, writable=True, session="b") as dataset:
-        dataset.append("training", part(0, 10))
+        dataset.append("training", thousand.part(0, 10))
         for index, session, match in [
             (3, None, "no partition 3"), (0, None, "several partitions 0"), (1, "b", "no part"),
         ]:  # fmt: skip
@@ -289,19 +236,19 @@ def test_a_partition_that_is_not_there_is_not_removed(folder, write):
                 dataset.remove_partition("training", index, session)
         with pytest.raises(DatasetError, match="no mode"):
             dataset.remove_partition("other", 0)
-    check(folder, stacked(ROWS, part(0, 10)))
+    thousand.check(folder, thousand.stacked(thousand.rows, (0, 10)))
 
 
-def test_a_removal_that_was_cut_short_is_completed(folder, write):
-    write(folder)
+def test_a_removal_that_was_cut_short_is_completed(folder, thousand):
+    thousand.write(folder)
     plain = json.loads((folder / "dataset.json").read_text())
     mode = plain["modes"]["training"]
     mode["dropped"] = [mode["partitions"].pop(1)]
     mode["normalization"] = {}
     write_manifest(folder / "dataset.json", plain)
     (folder / "run_training_n_1.h5").unlink()
-    rows = stacked(part(0, 340), part(680, 1000))
-    check(folder, rows, counted=False)
+    rows = thousand.stacked((0, 340), (680, 1000))
+    thousand.check(folder, rows, counted=False)
     Dataset.open(folder, writable=True).close()
-    check(folder, rows)
+    thousand.check(folder, rows)
     assert not list(folder.glob("run_training_*_1.h5"))

@@ -17,71 +17,14 @@ from physx_core.errors import (
     DatasetNotFoundError,
 )
 
-N = 1000
-RNG = np.random.default_rng(0)
-ROWS = {"x": RNG.normal(size=(N, 5)), "n": np.arange(N, dtype="int32")}
-FIELDS = [Field("x", (5,), unit="m"), Field("n", (), "int32", role="additional")]
-SIZE = 3e-5  # partitions of 340 rows
 OLD = Path(__file__).parents[1] / "data" / "dataset_v1"
-
-
-@pytest.fixture(scope="module")
-def sound(tmp_path_factory):
-    """The folder of a dataset of ROWS in three partitions."""
-    folder = tmp_path_factory.mktemp("sound") / "data"
-    make(folder)
-    return folder
-
-
-@pytest.fixture
-def write(sound):
-    """Return a function that makes a dataset; one of all ROWS is copied, which is quicker."""
-
-    def write(folder, *args, **options):
-        if args or options:
-            make(folder, *args, **options)
-        else:
-            shutil.copytree(sound, folder)
-
-    return write
-
-
-def make(folder, rows=ROWS, session="run", **options):
-    with Dataset.create(folder, session, max_file_size=SIZE, **options) as dataset:
-        dataset.define_fields("training", FIELDS)
-        dataset.append("training", rows)
-
-
-def check(folder, rows, *, counted=True):
-    """Check rows, statistics and files; the manifest holds the statistics if `counted`."""
-    with Dataset.open(folder) as dataset:
-        assert dataset.num_samples("training") == len(rows["n"])
-        for name, values in rows.items():
-            assert_array_equal(dataset["training"][name][:], values)
-        found = dataset.normalization["x"]
-        np.testing.assert_allclose(found.mean, rows["x"].mean(axis=0), atol=1e-12)
-        np.testing.assert_allclose(found.std, rows["x"].std(axis=0), rtol=1e-9)
-        assert dataset.verify() == []
-    plain = json.loads((folder / "dataset.json").read_text())["modes"]["training"]
-    count = plain["normalization"].get("x", {"count": 0})["count"]
-    assert count == (len(rows["n"]) if counted else count)
-    for session in {partition["session"] for partition in plain["partitions"]}:
-        assert (folder / f"{session}.h5").exists()
-
-
-def stacked(*blocks):
-    return {name: np.concatenate([block[name] for block in blocks]) for name in ROWS}
-
-
-def part(start, stop):
-    return {name: values[start:stop] for name, values in ROWS.items()}
 
 
 # Repairing --------------------------------------------------------------------------------------
 
 
-def test_a_sound_dataset_needs_no_repair(folder, write):
-    write(folder)
+def test_a_sound_dataset_needs_no_repair(folder, thousand):
+    thousand.write(folder)
     before = {p.name: p.read_bytes() for p in folder.iterdir()}
     assert Dataset.repair(folder) == []
     now = {p.name: p.read_bytes() for p in folder.iterdir()}
@@ -92,8 +35,8 @@ def test_a_sound_dataset_needs_no_repair(folder, write):
         Dataset.repair(folder)
 
 
-def test_a_manifest_edited_by_hand_is_refused_and_then_checked(folder, write):
-    write(folder, info={"note": "first"})
+def test_a_manifest_edited_by_hand_is_refused_and_then_checked(folder, thousand):
+    thousand.write(folder, info={"note": "first"})
     path = folder / "dataset.json"
     text = path.read_text()
     path.write_text(text.replace('"first"', '"second"'))
@@ -102,7 +45,7 @@ def test_a_manifest_edited_by_hand_is_refused_and_then_checked(folder, write):
     assert "it fits the files and is kept" in Dataset.repair(folder)[0]
     with Dataset.open(folder) as dataset:
         assert dataset.info == {"note": "second"}
-    check(folder, ROWS)
+    thousand.check(folder, thousand.rows)
 
 
 @pytest.mark.parametrize(
@@ -110,34 +53,34 @@ def test_a_manifest_edited_by_hand_is_refused_and_then_checked(folder, write):
     [('"<f8"', '"<f4"'), ("12288", "12296"), ('"rows": 340', '"rows": 330'), ('"x"', '"z"'),
      ('"index": 1', '"index": 0')],
 )  # fmt: skip
-def test_a_wrong_edit_is_undone(folder, old, new, write):
-    write(folder)
+def test_a_wrong_edit_is_undone(folder, old, new, thousand):
+    thousand.write(folder)
     path = folder / "dataset.json"
     assert old in path.read_text()
     path.write_text(path.read_text().replace(old, new))
     done = Dataset.repair(folder)
     assert any("dataset.json.1" in each for each in done)
-    check(folder, ROWS)
+    thousand.check(folder, thousand.rows)
     assert new in (folder / "dataset.json.1").read_text()
 
 
 @pytest.mark.parametrize("text", [None, b"", b"{", b"[]", b"\xff", b"null", b"[" * 100_000])
-def test_a_lost_or_spoiled_manifest_is_made_anew(folder, text, write):
-    write(folder)
+def test_a_lost_or_spoiled_manifest_is_made_anew(folder, text, thousand):
+    thousand.write(folder)
     (folder / "dataset.json").unlink()
     if text is not None:
         (folder / "dataset.json").write_bytes(text)
         with pytest.raises(DatasetError, match=r"dataset\.json.*repair"):
             Dataset.open(folder)
     assert Dataset.repair(folder)
-    check(folder, ROWS)
+    thousand.check(folder, thousand.rows)
     assert Dataset.repair(folder) == []
 
 
 @pytest.mark.parametrize("lost", [False, True])
 @pytest.mark.parametrize("damage", ["missing", "cut", "garbage", "flipped", "link"])
-def test_a_partition_that_cannot_be_used_is_set_aside(folder, tmp_path, damage, lost, write):
-    write(folder)
+def test_a_partition_that_cannot_be_used_is_set_aside(folder, tmp_path, damage, lost, thousand):
+    thousand.write(folder)
     path = folder / "run_training_x_1.h5"
     content = path.read_bytes()
     if damage == "cut":
@@ -159,14 +102,14 @@ def test_a_partition_that_cannot_be_used_is_set_aside(folder, tmp_path, damage, 
     assert "run_training_x_1.h5" in done and "damaged" in done
     if not lost:
         assert "340 rows" in done
-        check(folder, stacked(part(0, 340), part(680, 1000)))
+        thousand.check(folder, thousand.stacked((0, 340), (680, 1000)))
         assert (folder / "damaged" / "run_training_n_1.h5").exists()
         assert Dataset.repair(folder) == []
         assert damage == "missing" or os.path.lexists(folder / "damaged" / path.name)
 
 
-def test_sound_rows_get_a_new_header(folder, write):
-    write(folder)
+def test_sound_rows_get_a_new_header(folder, thousand):
+    thousand.write(folder)
     path = folder / "run_training_x_1.h5"
     content = bytearray(path.read_bytes())
     content[100:600] = bytes(500)
@@ -174,20 +117,20 @@ def test_sound_rows_get_a_new_header(folder, write):
     with Dataset.open(folder) as dataset:
         assert len(dataset.verify()) == 1
     assert "new header" in Dataset.repair(folder)[0]
-    check(folder, ROWS)
+    thousand.check(folder, thousand.rows)
     with h5py.File(path) as file:
-        assert_array_equal(file["data"][:], ROWS["x"][340:680])
+        assert_array_equal(file["data"][:], thousand.rows["x"][340:680])
 
 
-def test_a_rebuilt_manifest_keeps_the_old_one(folder, write):
-    write(folder, info={"a": 1})
+def test_a_rebuilt_manifest_keeps_the_old_one(folder, thousand):
+    thousand.write(folder, info={"a": 1})
     before = (folder / "dataset.json").read_bytes()
     Dataset.rebuild(folder)
-    check(folder, ROWS)
+    thousand.check(folder, thousand.rows)
     assert (folder / "dataset.json.1").read_bytes() == before
     with Dataset.open(folder) as dataset:
         assert dataset.info == {}
-        assert dataset.fields("training") == {field.name: field for field in FIELDS}
+        assert dataset.fields("training") == {field.name: field for field in thousand.fields}
 
 
 # Versions ---------------------------------------------------------------------------------------
@@ -214,8 +157,8 @@ def test_version_1_is_read(folder):
             dataset.update_info(seed=1)
 
 
-def test_a_newer_version_is_refused(folder, write):
-    write(folder)
+def test_a_newer_version_is_refused(folder, thousand):
+    thousand.write(folder)
     path = folder / "dataset.json"
     plain = json.loads(path.read_text()) | {"format_version": 2}
     path.write_text(json.dumps(plain))

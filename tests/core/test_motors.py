@@ -33,7 +33,7 @@ class Held(Simulation):
         free, places = np.full(3, np.inf), {name: i for i, name in enumerate(names)}
         most = np.array([np.inf, 50.0, np.inf])
         self.layout = Layout(names, (), places, places, 3, 3, -free, free, free, most, modes=modes)
-        self.q, self.v, self.commands = np.zeros(3), np.zeros(3), np.array([7.0, 8.0, 9.0])
+        self.q, self.v, self.held = np.zeros(3), np.zeros(3), np.array([7.0, 8.0, 9.0])
         self.frames = 0
 
     frame = property(lambda self: self.frames)
@@ -45,10 +45,10 @@ class Held(Simulation):
         return self.v.copy()
 
     def set_commands(self, commands):
-        self.commands = commands
+        self.held = commands.copy()
 
     def snapshot(self):
-        return State(self.q, self.v, self.commands.copy(), self.frames)
+        return State(self.q, self.v, self.held.copy(), self.frames)
 
     def unused(self, *values):
         raise NotImplementedError
@@ -79,7 +79,7 @@ def test_limits_slope_friction_and_reduction_of_each_motor():
         ],
     )
     assert run(motors, simulation, [3.0, 0.0]) == [-15, 0]
-    assert simulation.commands.tolist() == [7, 0, -15]
+    assert simulation.held.tolist() == [7, 0, -15]
     assert run(motors, simulation, [9.0, 3.0], (0, 10, 1)) == [-20, 1]
     assert run(motors, simulation, [9.0, -3.0], (0, -10, -1.8)) == [-10, 1]
     assert run(motors, simulation, [9.0, 80.0], (0, 0, -2)) == [0, 50]
@@ -87,7 +87,7 @@ def test_limits_slope_friction_and_reduction_of_each_motor():
     assert run(motors, simulation, [-9.0, 0.0], (0, 0, -3)) == [20, 0]
     motors.set_others([1.0, 2.0, 3.0])
     run(motors, simulation, [0.0, 0.0])
-    assert simulation.commands.tolist() == [1, 0, 0]
+    assert simulation.held.tolist() == [1, 0, 0]
 
 
 def test_a_limit_without_slope_cuts_all_at_once():

@@ -277,6 +277,39 @@ def test_the_command_replays_what_a_session_holds_and_draws_it():
     assert "num_clients = 1" in Path("sessions/replay_1/config.toml").read_text()
 
 
+@pytest.mark.parametrize("over_tcp", [False, True])
+def test_refused_samples_are_replayed_once_each(over_tcp, nothing_stays_behind):
+    config = environment("Refusing", record_wrong_samples=True, num_clients=2)
+    DataGeneration(config, session_name="refused", batch_nb=1, batch_size=14).execute()
+    with Dataset.open("sessions/refused") as dataset:
+        wrong = {name: view[:] for name, view in dataset["wrong"].items()}
+    seen = []
+
+    class Mine(Replay):
+        def sample_end(self):
+            super().sample_end()
+            seen.extend(zip(self.batch["seen"][:, 0], self.batch["seen"][:, 2], strict=True))
+
+    again = environment("Refusing", num_clients=2, as_tcp_ip_client=over_tcp)
+    data = DatasetConfig(existing_dir="sessions/refused", mode="wrong")
+    Mine(data, again, session_name="replay").execute()
+    assert seen == list(zip(wrong["env_id"], wrong["step"], strict=True)) and len(seen) == 12
+    with pytest.raises(ConfigError, match='"wrong" is that of samples which check_sample refused'):
+        DataGeneration(config, DatasetConfig(mode="wrong"), batch_nb=1, batch_size=1).execute()
+    with pytest.raises(ConfigError, match="To look at them: physx replay"):
+        Training(NETWORK, DatasetConfig(mode="wrong"), config, epoch_nb=1, batch_size=1).execute()
+
+
+def test_the_command_replays_the_refused_samples(capsys):
+    config = environment("Refusing", record_wrong_samples=True)
+    DataGeneration(config, session_name="refused", batch_nb=1, batch_size=4).execute()
+    words = ["sessions/refused", "--environment.no-as-tcp-ip-client"]
+    assert main(["replay", *words, "--mode", "wrong"]) == 0
+    assert "3 steps of" in capsys.readouterr().out
+    assert main(["replay", *words, "--mode", "validation"]) == 1
+    assert 'no samples of mode "validation"' in capsys.readouterr().err
+
+
 def test_replay_needs_to_know_samples_and_environment():
     with pytest.raises(ConfigError, match="name them in existing_dir"):
         Replay(DatasetConfig()).execute()

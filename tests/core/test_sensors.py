@@ -58,7 +58,11 @@ class Signal(Simulation):
         return np.array([[0, 0, 0, 0, 0, np.sin(angle), np.cos(angle)]] * len(names))
 
     def body_velocities(self, names=None, positions=None, velocities=None):
-        return np.array([[0, 0, 0, 0, 0, velocities[0]]] * len(names))
+        v = self.velocities() if velocities is None else velocities
+        return np.array([[0, 0, 0, 0, 0, v[0]]] * len(names))
+
+    def body_accelerations(self, names=None):
+        return np.zeros((len(names), 6))
 
     def snapshot(self):
         return State(self.positions(), self.velocities(), np.array([3.0, 4.0]), self._frame)

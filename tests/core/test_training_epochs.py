@@ -101,7 +101,7 @@ def test_all_entries_of_the_loss_are_recorded_by_batch_epoch_and_validation(vali
     assert found["learning_rate"] == [1, 0.5]
 
 
-def test_the_variance_is_that_of_the_last_fifty_batches(data):
+def test_the_variance_is_that_of_the_last_fifty_batches_and_epochs(data):
     rng = np.random.default_rng(1)
 
     class Random(Scripted):
@@ -117,6 +117,12 @@ def test_the_variance_is_that_of_the_last_fifty_batches(data):
         window = losses[max(0, count - 50) : count]
         assert math.isclose(found["loss/mean"][count - 1], statistics.fmean(window))
         assert math.isclose(found["loss/variance"][count - 1], statistics.variance(window))
+    epochs = found["loss/training"]
+    assert len(epochs) == 35 and found["loss/training_variance"][0] == 0
+    for count in (2, 35):
+        assert math.isclose(found["loss/training_mean"][count - 1], np.mean(epochs[:count]))
+        variance = statistics.variance(epochs[:count])
+        assert math.isclose(found["loss/training_variance"][count - 1], variance)
 
 
 def test_validation_every_k_epochs(validated):
@@ -278,9 +284,15 @@ def test_what_cannot_be_trained_by_several_processes(data, monkeypatch):
             return Pair()
 
     options = {"epoch_nb": 1, "batch_nb": 1, "batch_size": 2}
-    spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)
-    with pytest.raises(ConfigError, match="train on stored samples only"):
-        Training(NetworkConfig(Joins), None, spring, **options).execute()
+    for data, choice, advice in (
+        (None, {}, "let them make the samples in one process, with epoch_nb=1"),
+        (None, {"always_produce": True}, "Leave out always_produce"),
+        (DATA, {"load_samples": True}, "send the stored samples through them in one process"),
+        (DATA, {"load_samples": True, "only_first_epoch": False}, "or train in one process"),
+    ):
+        spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, **choice)
+        with pytest.raises(ConfigError, match=f"train on stored samples only.*{advice}"):
+            Training(NetworkConfig(Joins), data, spring, **options).execute()
     with pytest.raises(ConfigError, match="LeastSquares cannot work in several processes"):
         Training(NetworkConfig(Joins), DATA, **options).execute()
     assert not Path("sessions/training").exists()

@@ -19,6 +19,7 @@ from physx_core.errors import (
 )
 from physx_core.transport.failures import decode_error, encode_error
 from physx_core.transport.frames import HEADER, FrameReader, Kind, pack
+from physx_core.transport.link import Link
 
 # Frames -----------------------------------------------------------------------------------------
 
@@ -151,3 +152,23 @@ def test_an_error_class_of_a_plugin_comes_back_as_its_base():
     assert type(back) is ConfigError
     assert str(back) == "mine"
     assert vars(back) == {}
+
+
+def test_a_message_in_many_parts_arrives_whole():
+    """More parts than a system call takes, and more bytes than the connection does at once."""
+    parts = [bytes([number % 251]) * (number % 7 * 1000) for number in range(1500)]
+    received = bytearray()
+
+    def receive():
+        while len(received) < sum(map(len, parts)):
+            received.extend(there.recv(1 << 20))
+
+    here, there = socket.socketpair()
+    with there:
+        link = Link(here, FrameReader(100))
+        thread = threading.Thread(target=receive)
+        thread.start()
+        link.send_parts(parts)
+        thread.join()
+        link.close()
+    assert received == b"".join(parts)

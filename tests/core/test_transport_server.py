@@ -51,9 +51,9 @@ def test_strangers_do_not_disturb_a_run(clients, port):
         thread.start()
     try:
         with clients(num_clients=2, port=port) as source:
-            deadline = time.monotonic() + 0.5
+            deadline = time.monotonic() + 30
             row = 0
-            while time.monotonic() < deadline:
+            while len(talked) <= 8 and time.monotonic() < deadline:
                 assert list(source.batch(2)["x"][:, 1]) == [row, row]
                 row += 1
     finally:

@@ -315,6 +315,12 @@ class Faulty(Plain):
     def do_stop(self):
         os.kill(os.getpid(), signal.SIGSTOP)
 
+    def do_nothing(self):
+        """All is well."""
+
+    def do_hold(self):
+        ctypes.PyDLL(None).pause()  # a call that does not let Python's other threads run
+
     def do_spin(self):
         while True:
             pass
@@ -333,6 +339,13 @@ class Faulty(Plain):
         for _ in range(600):
             time.sleep(0.1)
             connection.sendall(b"x")
+
+    def do_trickle(self):
+        connection = own_connection()
+        connection.sendall(struct.pack("<IHHQ", 1_000_000, 8, 0, 1))
+        for _ in range(600):
+            time.sleep(0.1)
+            connection.sendall(bytes(200))
 
     def do_disconnect(self):
         own_connection().shutdown(socket.SHUT_RDWR)

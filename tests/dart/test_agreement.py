@@ -76,7 +76,11 @@ def test_states_and_poses_agree(pair):
             simulation.set_state(q, v)
             np.testing.assert_allclose(simulation.positions(), q, atol=1e-14)
             np.testing.assert_allclose(simulation.velocities(), v, atol=1e-14)
-        np.testing.assert_allclose(one.body_poses(), other.body_poses(), atol=1e-13)
+            poses = simulation.body_poses()
+            np.testing.assert_allclose(poses, simulation.body_poses(positions=q), atol=1e-13)
+        np.testing.assert_allclose(
+            one.body_poses(positions=q), other.body_poses(positions=q), atol=1e-13
+        )
 
 
 def test_motions_agree_through_limits_and_friction(pair):

@@ -183,6 +183,22 @@ def test_a_ball_rolls_down_a_height_field(engine):
         np.testing.assert_allclose(z, -0.3 * x + 0.1 * np.sqrt(1.09), atol=2e-3)
 
 
+@pytest.mark.parametrize("engine", [*BOTH, ("pinocchio", None, "admm")], ids=str)
+def test_light_wheels_under_a_heavy_base_are_no_springboard(engine):
+    """Gauss-Seidel alone does not come to an end at this impact, and drives the wheels."""
+    name, _, solver = engine
+    base = Robot("wheeled_base", fixed_base=False, position=(0, 0, 0.6))
+    world = World([base], ground=Ground(), solver=solver)
+    with plugins.resolve("backend", name).build(world) as simulation:
+        fastest = 0.0
+        for _ in range(45):
+            simulation.step(10)
+            fastest = max(fastest, np.abs(simulation.velocities()).max())
+        assert fastest < np.sqrt(2 * 9.81 * 0.6)
+        assert np.abs(simulation.velocities()).max() < 1e-2
+        assert np.abs(simulation.positions()[:2]).max() < 1e-4
+
+
 @pytest.mark.parametrize("engine", BOTH, ids=str)
 def test_a_quadruped_stands(engine, example):
     robot = Robot(

@@ -233,7 +233,7 @@ def test_without_the_robots_the_arm_says_what_to_install(monkeypatch):
     def missing(name):
         raise importlib.metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr(importlib.metadata, "files", missing)
+    monkeypatch.setattr(importlib.metadata, "distribution", missing)
     with pytest.raises(ModelError, match=r'pip install "physx-dart\[robots\]"'):
         DartArm().create()
 

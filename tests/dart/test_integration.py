@@ -108,6 +108,30 @@ def test_rk4_of_a_spring_with_a_rotor_follows_its_solution(pinocchio, write_urdf
             np.testing.assert_allclose(state, exact, atol=1e-7)
 
 
+def test_rk4_follows_the_solution_under_forces_that_are_held(pinocchio, write_urdf):
+    """Two masses on springs; a controller sets their forces every 10 ms."""
+    joints = {"first": JointSettings(stiffness=40), "second": JointSettings(stiffness=25)}
+    world = World([Robot(write_urdf(SLIDERS), joints=joints)], gravity=(0, 0, 0), integrator="rk4")
+    with pinocchio.build(world) as simulation:
+        inverse = np.linalg.inv([[2.2, 0.7], [0.7, 0.7]])
+        system = np.block(
+            [[np.zeros((2, 2)), np.eye(2)], [-inverse @ np.diag([40.0, 25.0]), np.zeros((2, 2))]]
+        )
+        values, vectors = np.linalg.eig(system)
+        over = (vectors * np.exp(0.01 * values) @ np.linalg.inv(vectors)).real
+        x = np.array([0.3, -0.1, 0.0, 0.2])
+        simulation.set_state(x[:2], x[2:])
+        for _ in range(200):
+            q, v = simulation.positions(), simulation.velocities()
+            forces = -5.0 * q - 2.0 * v
+            simulation.set_torques(forces)
+            simulation.step(10)
+            rest = np.array([*(forces / [40.0, 25.0]), 0.0, 0.0])
+            x = rest + over @ (x - rest)
+            state = np.concatenate([simulation.positions(), simulation.velocities()])
+            np.testing.assert_allclose(state, x, atol=1e-7)
+
+
 def test_an_impulse_has_its_edges_and_its_size(backend, write_urdf):
     world = World([Robot(write_urdf(SLIDERS))], gravity=(0, 0, 0))
     with backend.build(world) as simulation:

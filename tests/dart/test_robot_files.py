@@ -154,7 +154,7 @@ def test_the_package_of_robots_is_asked_for_by_its_pip_line(monkeypatch):
     def missing(name):
         raise importlib.metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr(importlib.metadata, "files", missing)
+    monkeypatch.setattr(importlib.metadata, "distribution", missing)
     with pytest.raises(ModelError, match=r'pip install "physx-dart\[robots\]"'):
         example_robot("panda_description/urdf/panda.urdf")
 

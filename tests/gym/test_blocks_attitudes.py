@@ -30,10 +30,10 @@ def test_one_and_many_agree():
     measured[4, 3:] = 0.0  # weightless
     for _ in range(20):
         alone = [
-            mahony.advanced(row.tolist(), seen.tolist(), 1.3, 0.2, DT, 9.81)
+            mahony.advanced(row.tolist(), seen.tolist(), mahony.Gains.of(1.3, 0.2, DT, 9.81))
             for row, seen in zip(states, measured, strict=True)
         ]
-        states = mahony.advanced_rows(states, measured, 1.3, 0.2, DT, 9.81)
+        states = mahony.advanced_rows(states, measured, mahony.Gains.of(1.3, 0.2, DT, 9.81))
         np.testing.assert_allclose(states, alone, rtol=0, atol=1e-13)
 
 
@@ -42,9 +42,17 @@ def test_follows_a_turn_exactly_without_gains():
     begin = quaternions(1)[0]
     state = [*begin, *rate, 0, 0, 0, *rate]
     for _ in range(400):
-        state = mahony.advanced(state, [*rate, 0, 0, 0], 0.0, 0.0, DT, 9.81)
+        state = mahony.advanced(state, [*rate, 0, 0, 0], mahony.Gains.of(0.0, 0.0, DT, 9.81))
     end = product(begin, from_rotation_vectors(400 * DT * rate))
     assert angle(end, np.array(state[:4])) < 1e-7
+
+
+def test_fast_turns_are_exact_too():
+    rate = np.array([150.0, -200.0, 90.0])
+    state = mahony.advanced(
+        [0, 0, 0, 1.0, *rate, 0, 0, 0, *rate], [*rate, 0, 0, 0], mahony.Gains.of(0, 0, DT, 9.81)
+    )
+    assert angle(from_rotation_vectors(DT * rate), np.array(state[:4])) < 1e-7
 
 
 def test_finds_up_and_bias_from_acceleration():
@@ -53,7 +61,7 @@ def test_finds_up_and_bias_from_acceleration():
     bias = np.array([0.02, -0.01, 0.03])
     state = [0.0, 0.0, 0.0, 1.0, *bias, 0, 0, 0, *bias]
     for _ in range(int(120 / DT)):
-        state = mahony.advanced(state, [*bias, *seen], 1.0, 0.1, DT, 9.81)
+        state = mahony.advanced(state, [*bias, *seen], mahony.Gains.of(1.0, 0.1, DT, 9.81))
     found = turned_back(np.array(state[:4]), UP)
     np.testing.assert_allclose(found, seen / 9.81, atol=1e-3)
     across = bias - np.dot(bias, found) * found  # a bias about the vertical cannot be seen
@@ -65,8 +73,8 @@ def test_finds_up_and_bias_from_acceleration():
 def test_accelerations_count_as_far_as_they_have_the_size_of_gravity(size, share):
     still = [0.0, 0.0, 0.0, 1.0, *[0.0] * 9]
     seen = 9.81 * np.array([0.1, 0.0, 0.99**0.5])
-    moved = mahony.advanced(still, [0, 0, 0, *(size * seen)], 1.0, 0, DT, 9.81)
-    full = mahony.advanced(still, [0, 0, 0, *seen], 1.0, 0, DT, 9.81)
+    moved = mahony.advanced(still, [0, 0, 0, *(size * seen)], mahony.Gains.of(1.0, 0, DT, 9.81))
+    full = mahony.advanced(still, [0, 0, 0, *seen], mahony.Gains.of(1.0, 0, DT, 9.81))
     assert abs(moved[1] / full[1] - share) < 1e-3
     np.testing.assert_allclose(full[1], -0.5 * DT * 0.1, rtol=1e-3)
 

@@ -98,9 +98,7 @@ def test_gears_and_the_order_of_encoders_do_not_matter():
         return env.robot_state.q.copy()
 
     joints = simulator().layout.joints
-    plain = run(
-        [Motor(joint=name) for name in joints], [Encoder(name=n, joint=n) for n in joints]
-    )
+    plain = run([Motor(joint=name) for name in joints], [Encoder(name=n, joint=n) for n in joints])
     ratios = [-6.0, 9.0] * 4
     geared = run(
         [Motor(joint=n, reduction=r) for n, r in zip(joints, ratios, strict=True)],

@@ -171,7 +171,9 @@ def test_quantities_as_features():
         features = env.step(np.zeros(8))[0]["features"]
         assert features["height"].shape == ()
         np.testing.assert_array_equal(features["height"], env.quantities.get_value(BaseHeight()))
-        np.testing.assert_array_equal(features["touching"], env.quantities.get_value(Touching(bodies)))
+        np.testing.assert_array_equal(
+            features["touching"], env.quantities.get_value(Touching(bodies))
+        )
 
 
 def test_what_observers_need():

@@ -31,6 +31,8 @@ NETWORKS = {
             "nb_first_layer_channels": 2,
             "nb_steps": 1,
             "data_scale": 3.0,
+            "normalization": "batch",
+            "positions": True,
         },
         [Field("input", (5, 4, 2)), Field("ground_truth", (20, 1))],
     ),

@@ -3,6 +3,7 @@
 import csv
 import os
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,12 +16,15 @@ import torch
 from safetensors.torch import load_file
 
 from physx_core import Dataset
+from physx_core.checkpoint import read
 
 pytest.importorskip("torch.distributed")
 
 SCRIPT = '''
-import os, sys, torch
-from physx_core import DatasetConfig, NetworkConfig, Training
+import os, signal, sys, torch
+from physx_core import (
+    DatasetConfig, Environment, EnvironmentConfig, Field, NetworkConfig, Training)
+from physx_core.errors import ConfigError
 from physx_torch import FC, TorchOptimization
 
 class Net(FC):
@@ -34,27 +38,63 @@ class Extra(TorchOptimization):
     def transform_loss(self, loss, data):
         return {"loss": loss.item(), "size": float(data["x"].abs().mean())}
 
-def training(batch_size, name, epochs=4, seed=3, **more):
+class Halves(Environment):
+    """Makes of each stored sample one with half the target."""
+
+    def create(self):
+        pass
+
+    def init_database(self):
+        self.define_training_fields([Field("x", (3,)), Field("y", (2,))])
+
+    def step(self):
+        self.set_training_data(x=self.sample["x"], y=self.sample["y"] / 2)
+
+halves = EnvironmentConfig(Halves, as_tcp_ip_client=False, load_samples=True)
+
+def training(batch_size, name, epochs=4, seed=3, environment=None, kind=Training, **more):
     network = NetworkConfig(
         Net, optimization=Extra, loss="MSELoss", optimizer="Adam", lr=1e-2, data_type="float64",
         device="cpu", scheduler="ReduceLROnPlateau", scheduler_kwargs={"patience": 0},
         optimization_kwargs={"gradient_clip": 0.5, "accumulate": 2})
-    return Training(network, DatasetConfig(existing_dir="data", normalize=True), epoch_nb=epochs,
-                    batch_size=batch_size, seed=seed, session_name=name, **more)
+    return kind(network, DatasetConfig(existing_dir="data", normalize=True), environment,
+                epoch_nb=epochs, batch_size=batch_size, seed=seed, session_name=name, **more)
+
+class Cut(Training):
+    """Ctrl-C comes to one of the processes, within an epoch."""
+
+    def batch_begin(self):
+        if self.group.rank == 1 and (self.epoch_id, self.batch_id) == (1, 2):
+            os.kill(os.getpid(), signal.SIGINT)
+
+class Dies(Training):
+    def batch_begin(self):
+        if self.group.rank == 1 and self.batch_id == 3:
+            os._exit(7)
+
+def together():
+    training(5, "two", 2).execute()
+    training(5, "two", 4, resume=True).execute()
+    try:
+        training(5, "cut", kind=Cut).execute()
+    except KeyboardInterrupt:
+        training(5, "cut", resume=True).execute()
+    try:
+        training(5, "sent", environment=halves).execute()
+        raise SystemExit("environments took part")
+    except ConfigError as error:
+        assert "Several processes train on stored samples only" in str(error)
+    training(5, "sent", 3, environment=halves, resume=True).execute()
+    with training(5, "free", 2, seed=None) as made:
+        made.execute()
+        mine = [float(p.detach().abs().sum()) for p in made.learner.network.parameters()]
+        assert mine == made.group.tell(mine), "without a seed they do not begin alike"
+    training(5, "dies", kind=Dies).execute()
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
     exec(sys.argv[1])
 '''
-DIES = """
-class Dies(Training):
-    def batch_begin(self):
-        if self.group.rank == 1 and self.batch_id == 3:
-            os._exit(7)
-made = training(5, "dies")
-made.__class__ = Dies
-made.execute()
-"""
 
 
 @pytest.fixture(autouse=True)
@@ -70,6 +110,11 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+def alone():
+    """What the script defines, for one process."""
+    return runpy.run_path("script.py", run_name="script")
+
+
 def start(code):
     launcher = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     return subprocess.Popen(
@@ -79,10 +124,6 @@ def start(code):
         stderr=subprocess.STDOUT,
         text=True,
     )
-
-
-def run(code):
-    return ended(start(code))
 
 
 def ended(process):
@@ -99,47 +140,42 @@ def parameters(session, number=0):
     return load_file(f"sessions/{session}/network/network_{number}/parameters.safetensors")
 
 
+def agree(session, other, number=0):
+    """Whether one process and two came to the same network."""
+    one, two = parameters(session, number), parameters(other, 1)
+    return all(torch.allclose(value, two[name], rtol=0, atol=1e-6) for name, value in one.items())
+
+
 def numbers(session):
     with Path(f"sessions/{session}/stats/scalars.csv").open() as stream:
         return {tuple(row[:3]): float(row[3]) for row in list(csv.reader(stream))[1:]}
 
 
-FREE = """
-made = training(5, "free", 2, seed=None)
-with made:
-    made.execute()
-    mine = [float(p.detach().abs().sum()) for p in made.learner.network.parameters()]
-    assert mine == made.group.tell(mine), mine
-"""
-
-
-def test_two_processes_equal_one_with_the_doubled_batch():
-    runpy.run_path("script.py", run_name="script")["training"](10, "one").execute()
-    code = "training(5, 'two', 2).execute(); training(5, 'two', 4, resume=True).execute()"
-    status, text = run(f"{code}\n{FREE}")  # without a seed they begin alike too
-    assert status == 0, text
-    assert sorted(p.name for p in Path("sessions").iterdir()) == ["free", "one", "two"]
-    networks = sorted(p.name for p in Path("sessions/two/network").iterdir())
-    assert networks == ["network_0", "network_1", "network_best"]
-    one, two = parameters("one"), parameters("two", 1)
-    for name, value in one.items():
-        assert torch.allclose(value, two[name], rtol=0, atol=1e-6), name
-    apart, together = numbers("one"), numbers("two")
-    assert apart.keys() == together.keys()
-    assert ("epoch", "4", "size/validation") in apart
-    for name, value in apart.items():
-        assert abs(value - together[name]) < 1e-6, name
-
-
-def test_a_process_that_dies_ends_all():
-    began = time.monotonic()
-    status, text = run(DIES)
-    assert status != 0 and "exitcode  : 7" in text
-    assert time.monotonic() - began < 60
+def test_two_processes_train_as_one_with_the_doubled_batch():
+    training = (script := alone())["training"]
+    training(10, "one").execute()
+    training(10, "sent", 1, environment=script["halves"]).execute()
+    shutil.copytree("sessions/sent", "sessions/sent_alone")
+    training(10, "sent_alone", 3, environment=script["halves"], resume=True).execute()
+    status, text = ended(start("together()"))
+    assert status != 0 and "exitcode  : 7" in text, text  # the process that died ended the other
     assert not list(Path("sessions/dies").glob("network/network_0"))
+    names = ["cut", "dies", "free", "one", "sent", "sent_alone", "two"]
+    assert sorted(path.name for path in Path("sessions").iterdir()) == names
+    networks = sorted(path.name for path in Path("sessions/two/network").iterdir())
+    assert networks == ["network_0", "network_1", "network_best"]
+    assert agree("one", "two")
+    assert agree("sent_alone", "sent", 1) and not agree("one", "sent")
+    apart, both = numbers("one"), numbers("two")
+    assert apart.keys() == both.keys() and ("epoch", "4", "size/validation") in apart
+    assert all(abs(value - both[name]) < 1e-6 for name, value in apart.items())
+    cut = read(Path("sessions/cut/network/network_0")).progress
+    assert (cut.epoch, cut.batch) == (1, 3)  # both ended after the same batch
+    resumed = parameters("cut", 1)
+    assert all(torch.equal(value, resumed[name]) for name, value in parameters("two", 1).items())
 
 
-def test_ctrl_c_keeps_a_checkpoint_that_can_be_resumed():
+def test_ctrl_c_at_the_launcher_keeps_a_checkpoint_that_can_be_resumed():
     process = start("training(5, 'cut', 100_000).execute()")
     stats, deadline = Path("sessions/cut/stats/scalars.csv"), time.monotonic() + 60
     while not (stats.exists() and stats.stat().st_size > 3000) and time.monotonic() < deadline:
@@ -149,10 +185,8 @@ def test_ctrl_c_keeps_a_checkpoint_that_can_be_resumed():
     assert status != 0
     assert Path("sessions/cut/network/network_0/checkpoint.toml").exists(), text
     assert "interrupted after" in Path("sessions/cut/info.txt").read_text()
-    last = [line for line in stats.read_text().splitlines() if line.startswith("batch,")][-1]
-    epochs = int(last.split(",")[1]) // 5 + 2
-    resumed = f"training(5, 'cut', {epochs}, resume=True).execute()"
-    status, text = run(f"{resumed}; training(5, 'whole', {epochs}).execute()")
-    assert status == 0, text
-    one, two = parameters("whole"), parameters("cut", 1)
-    assert all(torch.equal(value, two[name]) for name, value in one.items())
+    training = alone()["training"]
+    epochs = read(Path("sessions/cut/network/network_0")).progress.epoch + 2
+    training(10, "cut", epochs, resume=True).execute()
+    training(10, "whole", epochs).execute()
+    assert agree("whole", "cut")

@@ -157,7 +157,8 @@ def test_a_training_sends_numbers_weights_and_gradients():
     )
     pipeline.execute()
     found = read("sessions/training")
-    scalars = ["learning_rate", "loss/batch", "loss/mean", "loss/training", "loss/variance"]
+    numbers = ("batch", "mean", "training", "training_mean", "training_variance", "variance")
+    scalars = ["learning_rate", *(f"loss/{name}" for name in numbers)]
     assert sorted(found.Tags()["scalars"]) == scalars
     assert len(points(found, "loss/batch")) == 16
     names = [

@@ -116,7 +116,7 @@ def test_padding_is_the_least():
 def _halves(points, network):
     """Return whether no level loses a point when it is halved."""
     for _ in range(len(network.up)):
-        points -= 2 * (len(network.down[0]) // 3)
+        points -= 2 * (len(network.down[0]) // 2)
         if points % 2:
             return False
         points //= 2
@@ -131,9 +131,65 @@ def test_channels_double_and_layers_follow_the_options():
     assert [m.in_channels for m in network.up] == [16, 8]
     assert [level[0].in_channels for level in network.join] == [16, 8]
     single = UNet(3, nb_first_layer_channels=4, nb_steps=2, two_sublayers=False, skip_merge=True)
-    assert [len(level) for level in single.down] == [3, 3, 3]
+    assert [len(level) for level in single.down] == [2, 2, 2]
     assert [level[0].in_channels for level in single.join] == [8, 4]
     assert single.last.out_channels == 3
+
+
+@pytest.mark.parametrize(
+    ("normalization", "kind"),
+    [("none", ()), ("batch", torch.nn.BatchNorm3d), ("group", torch.nn.GroupNorm)],
+)
+def test_normalization_and_activation_are_chosen(normalization, kind):
+    network = UNet(
+        3, nb_first_layer_channels=12, nb_steps=1, normalization=normalization, activation="PReLU"
+    )
+    found = [
+        m for m in network.modules() if isinstance(m, (torch.nn.BatchNorm3d, torch.nn.GroupNorm))
+    ]
+    assert len(found) == (6 if kind else 0) and all(isinstance(module, kind) for module in found)
+    if normalization == "group":
+        assert [module.num_groups for module in found[:3]] == [4, 4, 8]
+    slopes = [m.num_parameters for m in network.modules() if isinstance(m, torch.nn.PReLU)]
+    assert slopes == [12, 12, 24, 24, 12, 12]
+
+
+def test_batches_are_normalized_by_all_of_them_for_predictions():
+    options = {"nb_output_channels": 1, "nb_first_layer_channels": 2, "border_mode": "same"}
+    network = UNet(2, normalization="batch", nb_steps=1, **options)
+    network.set_eval()
+    grids = torch.randn(6, 4, 4, 1)
+    whole = network.predict({"input": grids})["prediction"]
+    parts = [network.predict({"input": grid[None]})["prediction"] for grid in grids]
+    torch.testing.assert_close(whole, torch.cat(parts))
+    network.set_train()
+    assert not torch.allclose(network.predict({"input": grids[:2]})["prediction"], whole[:2])
+
+
+def test_without_normalization_what_goes_through_keeps_its_size():
+    torch.manual_seed(0)
+    network = UNet(
+        2, nb_output_channels=4, nb_first_layer_channels=32, nb_steps=3, border_mode="same"
+    )
+    output = network.forward(torch.randn(4, 32, 32, 1))
+    assert 0.1 < output.std() < 10
+
+
+def test_positions_tell_points_apart():
+    plain, knowing = (
+        made((8, 8), positions=positions, border_mode="same", nb_first_layer_channels=2)[0]
+        for positions in (False, True)
+    )
+    assert knowing.down[0][0].in_channels == plain.down[0][0].in_channels + 2
+    torch.manual_seed(0)
+    network = UNet(2, positions=True, nb_output_channels=2, border_mode="same", nb_steps=1)
+    seen = []
+    network.down[0][0].register_forward_hook(lambda module, given, output: seen.append(given[0]))
+    network.forward(torch.zeros(3, 4, 6, 1))
+    (grids,) = seen
+    assert grids.shape == (3, 3, 4, 6)
+    assert torch.equal(grids[1, 1, :, 2], torch.linspace(-1, 1, 4))
+    assert torch.equal(grids[2, 2, 3], torch.linspace(-1, 1, 6))
 
 
 # Fields -----------------------------------------------------------------------------------------
@@ -195,6 +251,7 @@ def test_fields_that_are_no_grid_of_the_network(shapes, told):
         {"nb_first_layer_channels": 1.5},
         {"nb_input_channels": 0},
         {"border_mode": "full"},
+        {"normalization": "layer"},
         {"data_scale": 0.0},
         {"input_size": [4]},
         {"input_size": [4, -4]},
@@ -235,9 +292,15 @@ def test_scale_is_applied_to_targets_and_taken_back():
 
 
 @pytest.mark.parametrize(
-    ("size", "mode"), [((9, 10), "same"), ((6, 5), "valid"), ((4, 5, 6), "same")]
+    ("size", "mode", "normalization"),
+    [
+        ((9, 10), "same", "none"),
+        ((6, 5), "valid", "batch"),
+        ((4, 5, 6), "same", "none"),
+        ((4, 5, 6), "same", "group"),
+    ],
 )
-def test_unet_learns_to_blur(size, mode, tmp_path, monkeypatch):
+def test_unet_learns_to_blur(size, mode, normalization, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
     sharp = rng.standard_normal((96, *size, 1))
@@ -256,6 +319,8 @@ def test_unet_learns_to_blur(size, mode, tmp_path, monkeypatch):
             "nb_steps": 1,
             "two_sublayers": False,
             "border_mode": mode,
+            "normalization": normalization,
+            "positions": len(size) == 3,
             "net_fields": "sharp",
             "opt_fields": "blurred",
         },

@@ -89,7 +89,9 @@ def at_least(minimum: float, default: Any = dataclasses.MISSING) -> Any:
 
 
 MODES = ("training", "validation", "prediction")
-"""The modes of a dataset."""
+"""The modes of a dataset that samples are made for."""
+WRONG = "wrong"
+"""Mode of the samples that `check_sample` refused."""
 
 
 @configuration
@@ -155,8 +157,9 @@ class DatasetConfig:
 
     existing_dir: str | None = None
     """Folder of an existing session or dataset to read; it is never modified."""
-    mode: str = field(default="training", metadata={"choices": MODES})
-    """Mode that is written or read: "training", "validation" or "prediction"."""
+    mode: str = field(default="training", metadata={"choices": (*MODES, WRONG)})
+    """Mode that is written or read: "training", "validation" or "prediction"; "wrong", which holds
+    what `check_sample` refused, is only read."""
     max_file_size: float = at_least(1e-6, 0.25)
     """Size in GB at which a partition is full and the next one begins."""
     shuffle: bool = True

@@ -6,10 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from physx_core.errors import ComponentNotFoundError, ConfigError, SimulationError
-from physx_core.interfaces.backend import Vector
+from physx_core.errors import ComponentNotFoundError, ConfigError
 
 
 def steps_of(option: str, period: float | None, physics: float) -> int:
@@ -54,21 +52,12 @@ def places_of(kind: str, names: Iterable[str], known: Mapping[str, int] | Sequen
     return np.array(found, np.intp)
 
 
-def finite_vector(name: str, given: ArrayLike, length: int) -> Vector:
-    """Return finite numbers as a new vector of a length.
-
-    Raises:
-        SimulationError: They are none.
-    """
-    try:
-        numbers = np.array(given, np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise SimulationError(f"{name} are no numbers: {error}.") from error
-    if numbers.shape != (length,):
-        raise SimulationError(f"{name} have the shape {numbers.shape} but need ({length},).")
-    if not np.isfinite(numbers).all():
-        raise SimulationError(f"{name} must be finite numbers, not {numbers}.")
-    return numbers
+def as_slice(places: Any) -> Any:
+    """Return places as a slice if they follow each other, which is quicker to use."""
+    first = int(places[0])
+    if (places == np.arange(first, first + len(places))).all():
+        return slice(first, first + len(places))
+    return places
 
 
 def check_unique(kind: str, names: Sequence[str]) -> None:

@@ -319,6 +319,10 @@ class ActionError(PhysxError):
         super().__init__(message)
 
 
+class LogError(PhysxError):
+    """The log of an episode is missing or damaged, or lacks what was asked of it."""
+
+
 class VisualizerError(PhysxError):
     """A viewer cannot be started, reached or written to."""
 
@@ -343,4 +347,4 @@ class RemoteProtocolError(RemoteError):
 
 
 class RequestError(RemoteError):
-    """A request cannot be carried out; the environment is as it was before, and lives on."""
+    """A request to an environment cannot be carried out; the environment lives on."""

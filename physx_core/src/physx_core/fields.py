@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -69,7 +70,7 @@ class Field:
                 raise ConfigError(f'Field "{self.name}": {self.shape!r} is no shape.')
             object.__setattr__(self, "shape", tuple(int(n) for n in shape))
 
-    @property
+    @cached_property
     def nbytes(self) -> int:
         """Bytes of one sample's value; 0 while the shape is unknown."""
         count = math.prod(self.shape) if self.shape is not None else 0

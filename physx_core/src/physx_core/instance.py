@@ -39,6 +39,7 @@ class Instance:
         simulations_per_step: int = 1,
         max_wrong_samples: int = 10,
         record_wrong: bool = False,
+        accept_all: bool = False,
     ) -> None:
         """Keep what the environment is made from.
 
@@ -51,6 +52,7 @@ class Instance:
             simulations_per_step: Calls of `step` for one sample.
             max_wrong_samples: How many samples in a row `check_sample` may refuse.
             record_wrong: Whether the samples that it refuses are kept in `refused`.
+            accept_all: Whether a sample counts whatever `check_sample` says, as in a replay.
         """
         self.instance_id = instance_id
         self.environment: Environment | None = None
@@ -67,6 +69,7 @@ class Instance:
         }
         self._sub_steps = simulations_per_step - 1
         self._max_wrong_samples = max_wrong_samples
+        self._accepts_all = accept_all
         self._runner: Any = None
 
     def open(self, services: Services, draw: bool) -> None:
@@ -120,7 +123,7 @@ class Instance:
             self.last_step = environment.step_index
             self.last_episode = environment.sample_episode
             environment.step_index += 1
-            if accepted:
+            if accepted or self._accepts_all:
                 return sample
             if self.refused is not None:
                 self.refused.note(sample, self.last_episode, self.last_step)

@@ -61,7 +61,7 @@ KINDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "text": (("content",), (*_LOOK,)),
     "scalars": (("labels",), ("values",)),
     "robot": (("urdf", "bodies"), (*_LOOK, "package_dirs", "poses")),
-    "view": (("title",), ("eye", "target")),
+    "view": (("title",), ("eye", "target", "follow")),
 }
 """Kinds of objects: options that must be given when one is added, and those that may be."""
 
@@ -198,15 +198,17 @@ class Factory:
         """Place a robot's links: ``poses`` (bodies, 7), x, y, z in m and quaternion x, y, z, w."""
         self._update("robot", name, changes)
 
-    def set_view(self, title: str, **camera: ArrayLike) -> None:
+    def set_view(self, title: str, follow: str | None = None, **camera: ArrayLike) -> None:
         """Name the environment's window and place its camera; to be called once.
 
         Args:
             title: What stands above the window.
+            follow: Name of an object that the camera moves along with.
             camera: ``eye`` (3,) and ``target`` (3,), where the camera is and what it looks at, in
                 m; without them it looks at all objects.
         """
-        self._add("view", "view", title=title, **camera)
+        wanted = {} if follow is None else {"follow": follow}
+        self._add("view", "view", title=title, **wanted, **camera)
 
     def _add(self, kind: str, name: str, **values: Any) -> str:
         if name in self._kinds:

@@ -6,7 +6,7 @@ C order, so that ``torch.from_numpy`` takes them as they are.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -14,12 +14,12 @@ import pinocchio
 
 from physx_core.interfaces.backend import Vector
 from physx_core.world import World
-from physx_dart.parts import Mover, Parts, read_parts
+from physx_dart.parts import Mover, Parts, read_parts, static_poses
 from physx_dart.pinocchio_models import frames_of, load_model
 from physx_dart.resistance import Resistance
-from physx_dart.rotations import poses_from_matrices
 
 _WORLD_AXES = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
+_velocity, _acceleration = pinocchio.getFrameVelocity, pinocchio.getFrameClassicalAcceleration
 
 
 class MoverAlgorithms:
@@ -41,17 +41,28 @@ class MoverAlgorithms:
 
     def poses(self, q: Vector) -> Vector:
         """Return the poses of all links, shape (links, 7)."""
-        pinocchio.framesForwardKinematics(self.model, self.data, q)
-        placements = self.data.oMf
-        return poses_from_matrices(np.array([placements[i].homogeneous for i in self.frames]))
+        pinocchio.forwardKinematics(self.model, self.data, q)
+        return np.array([self.pose(frame) for frame in self.frames])
 
-    def velocities(self, q: Vector, v: Vector) -> Vector:
-        """Return the velocities of all links' origins along the world's axes, (links, 6)."""
+    def write_motion(self, frame: int, out: Vector) -> None:
+        """Write pose, velocity and acceleration of a frame after `pinocchio.forwardKinematics`.
+
+        Args:
+            frame: The frame.
+            out: Shape (19,), along the world's axes.
+        """
         model, data = self.model, self.data
-        pinocchio.forwardKinematics(model, data, q, v)
-        pinocchio.updateFramePlacements(model, data)
-        found = [pinocchio.getFrameVelocity(model, data, i, _WORLD_AXES) for i in self.frames]
-        return np.array([velocity.vector for velocity in found])
+        out[:7] = self.pose(frame)
+        out[7:13] = _velocity(model, data, frame, _WORLD_AXES).vector
+        out[13:] = _acceleration(model, data, frame, _WORLD_AXES).vector
+
+    def pose(self, frame: int) -> Vector:
+        """Return the pose of a frame, shape (7,), after `pinocchio.forwardKinematics`."""
+        placement = pinocchio.updateFramePlacement(self.model, self.data, frame)
+        pose = pinocchio.SE3ToXYZQUAT(placement)
+        if pose[6] < 0:
+            pose[3:] *= -1
+        return pose
 
     def forward(self, q: Vector, v: Vector, tau: Vector) -> Vector:
         """Return the accelerations that torques cause, resistance included."""
@@ -62,19 +73,27 @@ class MoverAlgorithms:
         """Return the torques that cause accelerations, resistance included."""
         return pinocchio.rnea(self.model, self.data, q, v, a) + self.resistance.torques(q, v)
 
-    def joint_wrenches(self, q: Vector, v: Vector, a: Vector, outer: Vector) -> Vector:
-        """Return what each joint carries, shape (joints, 6); `outer` acts on the links."""
+    def joint_wrenches(
+        self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
+    ) -> Vector:
+        """Return what each joint carries, shape (joints, 6); `outer` acts on links."""
         model, data = self.model, self.data
-        pinocchio.framesForwardKinematics(model, data, q)
-        forces = pinocchio.StdVec_Force()
-        forces.extend(pinocchio.Force.Zero() for _ in range(model.njoints))
-        for link in np.flatnonzero(outer.any(axis=1)):
-            frame = self.frames[link]
-            joint = model.frames[frame].parentJoint
-            place = pinocchio.SE3(np.eye(3), data.oMf[frame].translation)
-            forces[joint] += data.oMi[joint].actInv(place.act(pinocchio.Force(outer[link])))
-        pinocchio.rnea(model, data, q, v, a, forces)
-        found = [data.f[i].vector for i in range(self._first, model.njoints)]
+        if outer:
+            pinocchio.forwardKinematics(model, data, q)
+            forces = [pinocchio.Force.Zero() for _ in range(model.njoints)]
+            for link, wrench in outer.items():
+                frame = self.frames[link]
+                joint = model.frames[frame].parentJoint
+                origin = pinocchio.updateFramePlacement(model, data, frame).translation
+                place = pinocchio.SE3(np.eye(3), origin)
+                acting = place.act(pinocchio.Force(np.array(wrench)))
+                forces[joint] += data.oMi[joint].actInv(acting)
+            more = pinocchio.StdVec_Force()
+            more.extend(forces)
+            pinocchio.rnea(model, data, q, v, a, more)
+        else:
+            pinocchio.rnea(model, data, q, v, a)
+        found = [force.vector for force in data.f.tolist()[self._first :]]
         return np.array(found).reshape(-1, 6)
 
     def mass(self, q: Vector) -> Vector:
@@ -115,6 +134,10 @@ class Algorithms:
 
     def __init__(self, parts: Parts) -> None:
         self.movers = tuple(MoverAlgorithms(each, parts.world.gravity) for each in parts.movers)
+        self._places = list(self._slices())
+        self._links = [(i, frame) for i, each in enumerate(self.movers) for frame in each.frames]
+        self._still = np.zeros((len(parts.statics), 19))
+        self._still[:, :7] = static_poses(parts)
 
     @classmethod
     def of(cls, world: World) -> Self:
@@ -125,13 +148,47 @@ class Algorithms:
         """
         return cls(read_parts(world))
 
-    def body_poses(self, q: Vector) -> Vector:
-        """Return the poses of all bodies, shape (bodies, 7)."""
-        return np.concatenate([each.poses(q[a]) for each, a, _ in self._slices()])
+    def body_poses(self, q: Vector, bodies: Sequence[int]) -> Vector:
+        """Return the poses of bodies, shape (bodies, 7), by their places in `Layout.names`."""
+        found = np.empty((len(bodies), 7))
+        known: set[int] = set()
+        for row, body in zip(found, bodies, strict=True):
+            if body >= len(self._links):
+                row[:] = self._still[body - len(self._links), :7]
+                continue
+            mover, frame = self._links[body]
+            each, x, _ = self._places[mover]
+            if mover not in known:
+                pinocchio.forwardKinematics(each.model, each.data, q[x])
+                known.add(mover)
+            row[:] = each.pose(frame)
+        return found
 
-    def body_velocities(self, q: Vector, v: Vector) -> Vector:
-        """Return the velocities of all bodies' origins along the world's axes, (bodies, 6)."""
-        return np.concatenate([each.velocities(q[a], v[b]) for each, a, b in self._slices()])
+    def motions(self, q: Vector, v: Vector, a: Vector, bodies: Sequence[int]) -> Vector:
+        """Return how bodies move, shape (bodies, 19), along the world's axes.
+
+        Args:
+            q: Positions.
+            v: Velocities.
+            a: Accelerations.
+            bodies: Their places in `Layout.names`.
+
+        Returns:
+            In each row the pose (7), and velocity (6) and acceleration (6) of the body's origin.
+        """
+        found = np.empty((len(bodies), 19))
+        known: set[int] = set()
+        for row, body in zip(found, bodies, strict=True):
+            if body >= len(self._links):
+                row[:] = self._still[body - len(self._links)]
+                continue
+            mover, frame = self._links[body]
+            each, x, y = self._places[mover]
+            if mover not in known:
+                pinocchio.forwardKinematics(each.model, each.data, q[x], v[y], a[y])
+                known.add(mover)
+            each.write_motion(frame, row)
+        return found
 
     def forward_dynamics(self, q: Vector, v: Vector, tau: Vector) -> Vector:
         """Return the accelerations, shape (nv,), that torques (nv,) cause in a state."""
@@ -142,20 +199,23 @@ class Algorithms:
         slices = self._slices()
         return np.concatenate([x.inverse(q[a], v[b], acceleration[b]) for x, a, b in slices])
 
-    def joint_wrenches(self, q: Vector, v: Vector, a: Vector, outer: Vector) -> Vector:
+    def joint_wrenches(
+        self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
+    ) -> Vector:
         """Return what the joints carry in a state, shape (joints, 6).
 
         Args:
             q: Positions.
             v: Velocities.
             a: Accelerations.
-            outer: What acts on the bodies from outside, shape (bodies, 6): force, and torque about
-                the body's origin, along the world's axes.
+            outer: What acts on bodies from outside, by their places: force, and torque about the
+                body's origin, 6 numbers along the world's axes.
         """
         found, begin = [], 0
         for each, x, y in self._slices():
             end = begin + len(each.frames)
-            found.append(each.joint_wrenches(q[x], v[y], a[y], outer[begin:end]))
+            mine = {body - begin: outer[body] for body in outer if begin <= body < end}
+            found.append(each.joint_wrenches(q[x], v[y], a[y], mine))
             begin = end
         return np.concatenate(found)
 
@@ -182,6 +242,7 @@ class Algorithms:
         return by_q, by_v, by_tau
 
     def _slices(self) -> Iterator[tuple[MoverAlgorithms, slice, slice]]:
+        """Return each mover, its part of the positions, and that of the velocities."""
         nq = nv = 0
         for each in self.movers:
             yield each, slice(nq, nq + each.model.nq), slice(nv, nv + each.model.nv)

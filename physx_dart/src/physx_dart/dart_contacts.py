@@ -21,25 +21,27 @@ class ContactReader:
 
     def __init__(self, world: Any, bodies: list[Any], period: float) -> None:
         self._world = world
-        self._bodies = bodies  # as long as they are kept, DART gives the same Python objects
-        self._places = {body: place for place, body in enumerate(bodies)}
+        # As long as Python's objects for them are kept, DART gives the same ones again.
+        self._bodies = {body: place for place, body in enumerate(bodies)}
+        self._places: dict[Any, int] = {}
 
     def contacts(self) -> Records:
         """Return the contacts of the last step: an array of `CONTACT` records."""
         found = self._world.getLastCollisionResult().getContacts()
         records = np.zeros(len(found), CONTACT)
+        bodies_a, bodies_b = records["body_a"], records["body_b"]
+        points, forces, normals = records["point"], records["force"], records["normal"]
+        depths = records["depth"]
         for row, contact in enumerate(found):
             first = self._place(contact.collisionObject1)
             second = self._place(contact.collisionObject2)
-            sign = 1.0 if first <= second else -1.0
-            records[row] = (
-                min(first, second),
-                max(first, second),
-                contact.point,
-                sign * contact.force,
-                sign * contact.normal,
-                contact.penetrationDepth,
-            )
+            if first <= second:
+                bodies_a[row], bodies_b[row] = first, second
+                forces[row], normals[row] = contact.force, contact.normal
+            else:
+                bodies_a[row], bodies_b[row] = second, first
+                forces[row], normals[row] = -contact.force, -contact.normal
+            points[row], depths[row] = contact.point, contact.penetrationDepth
         return records
 
     def raycast(self, begins: Vector, ends: Vector) -> Records:
@@ -60,4 +62,8 @@ class ContactReader:
         return records
 
     def _place(self, collision_object: Any) -> int:
-        return self._places[collision_object.getShapeFrame().getBodyNode()]
+        place = self._places.get(collision_object)
+        if place is None:
+            place = self._bodies[collision_object.getShapeFrame().getBodyNode()]
+            self._places[collision_object] = place
+        return place

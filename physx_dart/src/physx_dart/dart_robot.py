@@ -9,14 +9,15 @@ import numpy as np
 from dartpy import dynamics
 
 from physx_core.interfaces.backend import Vector
+from physx_core.world.rotations import turned_back
 from physx_dart.dart_loading import link_name, load_skeleton
 from physx_dart.engine import RobotEngine
 from physx_dart.parts import Mover
 from physx_dart.rotations import (
+    base_accelerations,
     matrix_from_quaternion,
     poses_from_matrices,
     quaternion_of,
-    turned_back,
     vector_from_quaternion,
 )
 from physx_dart.urdf import Joint
@@ -67,6 +68,7 @@ class DartRobot(RobotEngine):
         """Take the state from DART; to be called after each change of it."""
         self._q, self._v = self.skeleton.getPositions(), self.skeleton.getVelocities()
         self._quaternion: tuple[float, ...] | None = None
+        self._twist: Vector | None = None
 
     def _attitude(self) -> tuple[float, ...]:
         """Return the base's quaternion x, y, z, w."""
@@ -80,21 +82,25 @@ class DartRobot(RobotEngine):
         if not self.base:
             return q.copy()
         found = np.empty(self.nq)
-        found[:3], found[3:7], found[7:] = q[3:6], self._attitude(), q[6:]
+        found[:7], found[7:] = (*q[3:6].tolist(), *self._attitude()), q[6:]
         return found
 
     def velocities(self) -> Vector:
         """Return the present velocities, shape (nv,), in a vector of its own."""
-        v = self._v.copy() if self._sorted else self._v[self._native]
-        return self._in_base(v) if self.base else v
+        if self._twist is None:
+            v = self._v if self._sorted else self._v[self._native]
+            self._twist = self._in_base(v.copy()) if self.base else v
+        return self._twist.copy()
 
     def accelerations(self) -> Vector:
         """Return the accelerations of the last step, shape (nv,)."""
         a = self._ordered(self.skeleton.getAccelerations())
         if not self.base:
             return a
-        a, v = self._in_base(a), self.velocities()
-        a[:3] -= np.cross(v[3:6], v[:3])
+        x, y, z, *linear = a[:6].tolist()
+        attitude = self._attitude()
+        change = base_accelerations(attitude, linear, self.velocities())
+        a[:6] = (*change, *turned_back(attitude, x, y, z))
         return a
 
     def _in_base(self, v: Vector) -> Vector:
@@ -122,8 +128,8 @@ class DartRobot(RobotEngine):
     def speed(self) -> float:
         """Return the length of the velocities; NaN or inf where the state is broken."""
         self._read()
-        speed = math.hypot(*self._v.tolist())
-        return speed if math.isfinite(sum(self._q.tolist())) else math.nan
+        q, v = self._q, self._v
+        return math.sqrt(v.dot(v)) if math.isfinite(q.dot(q)) else math.nan
 
     def can_move(self, link: int) -> bool:
         """Return whether a link, by its place in the model, can move at all."""

@@ -23,9 +23,9 @@ from physx_core.interfaces.backend import (
     Simulation,
     Vector,
 )
+from physx_core.interfaces.vectors import finite_rows
 from physx_core.world import World
 from physx_dart import catalog
-from physx_dart.checks import rows
 from physx_dart.dart_contacts import ContactReader
 from physx_dart.dart_loading import attach_shapes, static_skeleton
 from physx_dart.dart_robot import DartRobot
@@ -147,7 +147,7 @@ class DartSimulation(RobotSimulation):
         self._check_open()
         if "raycast" not in self.features:
             raise self._lacks("raycast")
-        first, last = rows("begins", begins, 3), rows("ends", ends, 3)
+        first, last = finite_rows("begins", begins, 3), finite_rows("ends", ends, 3)
         if len(first) != len(last):
             raise SimulationError(f"There are {len(first)} begins of rays but {len(last)} ends.")
         return self._reader.raycast(first, last)

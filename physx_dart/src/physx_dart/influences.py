@@ -102,6 +102,10 @@ class Hooks:
         """Forget all."""
         self._hooks.clear()
 
+    def pause(self, frame: int) -> int:
+        """Return after how many steps from a frame the next one is due, at least 1."""
+        return min((every - frame % every for _, every in self._hooks), default=2**30)
+
     def call(self, simulation: Simulation, frame: int) -> None:
         """Call those that are due at a frame."""
         for hook, every in tuple(self._hooks):

@@ -118,6 +118,14 @@ def _object(thing: WorldObject) -> Mover:
     return Mover(thing.name, model, False, thing.position, thing.orientation, is_object=True)
 
 
+def static_poses(parts: Parts) -> np.ndarray:
+    """Return the poses of what never moves, shape (statics, 7)."""
+    poses = [[*static.position, *static.orientation] for static in parts.statics]
+    found = np.array(poses, np.float64).reshape(-1, 7)
+    found[found[:, 6] < 0, 3:] *= -1
+    return found
+
+
 def layout_of(parts: Parts) -> Layout:
     """Return names and places of everything in the state.
 
@@ -169,9 +177,10 @@ def _column(joints: Sequence[Joint], name: str) -> np.ndarray:
 
 
 def _check_names(names: Sequence[str]) -> None:
-    for name in names:
-        if names.count(name) > 1:
-            raise ModelError(
-                f'A link and an object, or the ground, have the same name "{name}". '
-                "Give the object another one."
-            )
+    if len(set(names)) == len(names):
+        return
+    name = next(name for name in names if names.count(name) > 1)
+    raise ModelError(
+        f'A link and an object, or the ground, have the same name "{name}". '
+        "Give the object another one."
+    )

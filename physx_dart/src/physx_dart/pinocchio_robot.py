@@ -13,9 +13,11 @@ from typing import Any
 
 import numpy as np
 import pinocchio
+from numpy import add, multiply
 
 from physx_core.interfaces.backend import CONTACT, Records, Vector
 from physx_core.world import World
+from physx_core.world.rotations import turned, turned_back
 from physx_dart.algorithms import MoverAlgorithms
 from physx_dart.engine import RobotEngine
 from physx_dart.limits import JointConstraints, solve
@@ -23,7 +25,7 @@ from physx_dart.parts import Mover, Static
 from physx_dart.pinocchio_contacts import ContactFinder, Touching
 from physx_dart.pinocchio_models import frames_of, load_stepping_model
 from physx_dart.pinocchio_solver import ImpulseSolver
-from physx_dart.rotations import matrix_from_quaternion, turned_back
+from physx_dart.rotations import base_accelerations, matrix_from_quaternion
 
 _UNSEEN = 10
 """Steps after which it is seen whether a limit might have acted."""
@@ -74,6 +76,10 @@ class PinocchioRobot(RobotEngine):
         self._positions, self._velocities = np.zeros(self.nq), np.zeros(self.nv)
         self._earlier, self._before = self._positions, self._velocities
         self._safe_steps, self._bound = 0, 0.0
+        # Arrays multiply each other in half the time that a number and an array take.
+        self._periods, self._motion = np.full(self.nv, dt), np.zeros(self.nv)
+        self._turned: Vector | None = None  # the velocities that `_twist` was made of
+        self._twist = self._velocities
         self._torques = np.zeros(self.nv)
         self._smooth = bool(resists.damping.any() or resists.stiffness.any())
         self._touching: Touching | None = None
@@ -125,7 +131,8 @@ class PinocchioRobot(RobotEngine):
 
     def _step_free(self, count: int, torques: Vector) -> None:
         """Simulate steps, at least one, in which nothing acts but torques and wrenches."""
-        model, data, dt, more = self._free, self._free_data, self._period, self._more
+        model, data, more = self._free, self._free_data, self._more
+        periods, motion = self._periods, self._motion
         aba, integrate = pinocchio.aba, pinocchio.integrate
         q, v = self._positions, self._velocities
         earlier, before = q, v
@@ -133,9 +140,9 @@ class PinocchioRobot(RobotEngine):
             earlier, before = q, v
             # An array of its own, in which the new velocities are made.
             v = aba(model, data, q, v, torques, *more) if more else aba(model, data, q, v, torques)
-            v *= dt
-            v += before
-            q = integrate(model, q, dt * v)
+            multiply(v, periods, v)
+            add(v, before, v)
+            q = integrate(model, q, multiply(v, periods, motion))
         self._positions, self._velocities = q, v
         self._earlier, self._before = earlier, before
 
@@ -264,20 +271,24 @@ class PinocchioRobot(RobotEngine):
 
     def velocities(self) -> Vector:
         """Return the present velocities, shape (nv,), in a vector of its own."""
-        v = self._velocities.copy()
-        if self.base:
-            v[:3] = turned_back(self._positions[3:7].tolist(), *v[:3].tolist())
-        return v
+        if not self.base:
+            return self._velocities.copy()
+        if self._turned is not self._velocities:
+            self._turned, self._twist = self._velocities, self._velocities.copy()
+            self._twist[:3] = turned_back(self._positions[3:7].tolist(), *self._twist[:3].tolist())
+        return self._twist.copy()
 
     def accelerations(self) -> Vector:
         """Return the accelerations of the last step, shape (nv,)."""
         a = (self._velocities - self._before) / self._period
-        if self.base:
-            v = self.velocities()
-            before, now = (matrix_from_quaternion(q[3:7]) for q in (self._earlier, self._positions))
-            turning = now @ self._velocities[3:6] - before @ self._before[3:6]
-            a[:3] = a[:3] @ now - np.cross(v[3:6], v[:3])
-            a[3:6] = turning @ now / self._period
+        if not self.base:
+            return a
+        earlier, now = self._earlier[3:7].tolist(), self._positions[3:7].tolist()
+        x, y, z = turned_back(now, *turned(earlier, *self._before[3:6].tolist()))
+        p, q, r = self._velocities[3:6].tolist()
+        change = base_accelerations(now, a[:3].tolist(), self.velocities())
+        pace = 1 / self._period
+        a[:6] = (*change, pace * (p - x), pace * (q - y), pace * (r - z))
         return a
 
     def write(self, positions: Vector, velocities: Vector) -> None:
@@ -301,8 +312,8 @@ class PinocchioRobot(RobotEngine):
 
     def speed(self) -> float:
         """Return the length of the velocities; NaN or inf where the state is broken."""
-        speed = math.hypot(*self._velocities.tolist())
-        return speed if math.isfinite(sum(self._positions.tolist())) else math.nan
+        v = self._velocities  # positions come from these, so they are finite if these are
+        return math.sqrt(v.dot(v))
 
     # Any state ------------------------------------------------------------------------------
 

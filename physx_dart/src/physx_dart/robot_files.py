@@ -32,8 +32,10 @@ def find_robot(urdf: str | Path) -> Path:
     own = OWN_ROBOTS / f"{urdf}.urdf"
     if own.is_file() and "/" not in urdf:
         return own
-    known = named_robots()
+    family, _, name = urdf.partition("/")
+    known = _installed(family) if name else {}
     if urdf not in known:
+        known = named_robots()
         raise ModelError(
             f'There is no URDF file {path}, and no robot has the name "{urdf}".'
             f"{nearest(urdf, known)} The command  physx robots  lists their names."
@@ -43,24 +45,32 @@ def find_robot(urdf: str | Path) -> Path:
 
 def named_robots() -> dict[str, Path]:
     """Return the files of all robots that have a name: own ones, then installed ones."""
-    found = {path.stem: path for path in sorted(OWN_ROBOTS.glob("*.urdf"))}
+    own = {path.stem: path for path in sorted(OWN_ROBOTS.glob("*.urdf"))}
+    return own | _installed()
+
+
+def _installed(wanted: str | None = None) -> dict[str, Path]:
+    """Return the files of installed robots by name, of one family or of all."""
     folder = example_data_dir()
-    if folder is not None:
-        root = folder / "robots"
-        for path in sorted(root.glob("**/*.urdf")):
-            family = path.relative_to(root).parts[0].removesuffix("_description")
-            found[f"{family}/{path.stem}"] = path
+    found: dict[str, Path] = {}
+    for root in sorted((folder / "robots").iterdir()) if folder is not None else ():
+        family = root.name.removesuffix("_description")
+        if wanted in (None, family):
+            found |= {f"{family}/{path.stem}": path for path in sorted(root.glob("**/*.urdf"))}
     return found
 
 
 def example_data_dir() -> Path | None:
     """Return the folder of the package ``example-robot-data``, None where it is not installed."""
     try:
-        files = importlib.metadata.files(EXAMPLE_DATA) or []
+        distribution = importlib.metadata.distribution(EXAMPLE_DATA)
     except importlib.metadata.PackageNotFoundError:
         return None
+    usual = Path(str(distribution.locate_file(f"cmeel.prefix/share/{EXAMPLE_DATA}")))
+    if (usual / "robots").is_dir():
+        return usual
     marker = f"share/{EXAMPLE_DATA}/robots/"
-    for file in files:
+    for file in distribution.files or []:
         if marker in file.as_posix():
             path = Path(str(file.locate())).as_posix()
             return Path(path[: path.rindex(marker)]) / "share" / EXAMPLE_DATA
@@ -133,7 +143,7 @@ def mesh_path(model: Path, name: str, package_dirs: Mapping[str, str | Path]) ->
 def _package_dir(model: Path, package: str, package_dirs: Mapping[str, str | Path]) -> Path | None:
     if package in package_dirs:
         return Path(package_dirs[package])
-    for folder in model.parents:
-        if folder.name == package:
-            return folder
+    above = model.parts[:-1]
+    if package in above:  # the nearest one
+        return model.parents[above[::-1].index(package)]
     return example_data_dir() if package == EXAMPLE_DATA else None

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from physx_core.interfaces.backend import Vector
+from physx_core.world.rotations import cross, turned_back
 
 
 def quaternion_of(x: float, y: float, z: float) -> tuple[float, float, float, float]:
@@ -20,13 +21,20 @@ def quaternion_of(x: float, y: float, z: float) -> tuple[float, float, float, fl
     return scale * x, scale * y, scale * z, w
 
 
-def turned_back(
-    quaternion: Sequence[float], a: float, b: float, c: float
+def base_accelerations(
+    attitude: Sequence[float], linear: Sequence[float], twist: Vector
 ) -> tuple[float, float, float]:
-    """Return a vector of the outer frame along the axes that a unit quaternion turns it to."""
-    x, y, z, w = quaternion
-    s, t, u = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
-    return a + w * s + (t * z - u * y), b + w * t + (u * x - s * z), c + w * u + (s * y - t * x)
+    """Return the change of the linear part of a base's twist, along its own axes.
+
+    Args:
+        attitude: Quaternion x, y, z, w of the base.
+        linear: Acceleration of its origin along the world's axes.
+        twist: Its velocities: linear, angular, along its own axes; more may follow.
+    """
+    u, v, w, p, q, r = twist[:6].tolist()
+    a, b, c = turned_back(attitude, *linear)
+    x, y, z = cross(p, q, r, u, v, w)
+    return a - x, b - y, c - z
 
 
 def vector_from_quaternion(quaternion: Vector) -> Vector:
@@ -38,9 +46,9 @@ def vector_from_quaternion(quaternion: Vector) -> Vector:
     return scale * xyz
 
 
-def matrix_from_quaternion(quaternion: Vector) -> Vector:
+def matrix_from_quaternion(quaternion: Vector | Sequence[float]) -> Vector:
     """Return the matrix, shape (3, 3), of a unit quaternion."""
-    x, y, z, w = (float(part) for part in quaternion)
+    x, y, z, w = map(float, quaternion)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
@@ -51,7 +59,7 @@ def matrix_from_quaternion(quaternion: Vector) -> Vector:
 
 
 def poses_from_matrices(transforms: Vector) -> Vector:
-    """Return rows x, y, z and quaternion, shape (n, 7), of transforms, shape (n, 4, 4)."""
+    """Return rows x, y, z and quaternion (w not negative), (n, 7), of transforms (n, 4, 4)."""
     poses = np.empty((len(transforms), 7))
     poses[:, :3] = transforms[:, :3, 3]
     # Each row is the quaternion times 4 times one of its parts; the largest is divided by.
@@ -69,5 +77,6 @@ def poses_from_matrices(transforms: Vector) -> Vector:
     )
     largest = np.argmax(np.einsum("iin->in", rows), axis=0)
     quaternions = rows[largest, :, np.arange(len(m))]
-    poses[:, 3:] = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    poses[:, 3:] = quaternions / np.where(quaternions[:, 3:] < 0, -lengths, lengths)
     return poses

@@ -16,6 +16,15 @@ from physx_dart.meshes import bounding_box, bounding_capsule, read_vertices
 from physx_dart.robot_files import mesh_path
 from physx_dart.rotations import matrix_from_quaternion
 
+_OPTIONS: dict[str, tuple[str, ...]] = {
+    "box": ("size",),
+    "sphere": ("radius",),
+    "mesh": ("filename",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+}
+"""What the element of each kind of shape says, as URDF files have it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Shape:
@@ -125,18 +134,15 @@ def _read(robot: Robot, path: Path, link: str, element: Element) -> Shape:
     geometry = element.find("geometry")
     shape = None if geometry is None or not len(geometry) else geometry[0]
     tag = "none" if shape is None else str(shape.tag)
-    options: dict[str, tuple[str, ...]]
-    options = {"box": ("size",), "sphere": ("radius",), "mesh": ("filename",)}
-    options |= dict.fromkeys(("cylinder", "capsule"), ("radius", "length"))
-    if shape is None or tag not in options:
-        raise ModelError(f'link "{link}" has a collision shape "{tag}"; known: {listed(options)}')
+    if shape is None or tag not in _OPTIONS:
+        raise ModelError(f'link "{link}" has a collision shape "{tag}"; known: {listed(_OPTIONS)}')
     if tag == "mesh":
         size = tuple(_floats(link, "scale", shape.get("scale", "1 1 1"), 3))
         mesh = mesh_path(path, shape.get("filename", ""), robot.package_dirs)
     else:
-        parts = [_floats(link, name, shape.get(name, ""), None) for name in options[tag]]
+        parts = [_floats(link, name, shape.get(name, ""), None) for name in _OPTIONS[tag]]
         size, mesh = tuple(number for part in parts for number in part), None
-        wanted = 3 if tag == "box" else len(options[tag])
+        wanted = 3 if tag == "box" else len(_OPTIONS[tag])
         if len(size) != wanted or not min(size) > 0:
             raise ModelError(f'link "{link}" has a {tag} of size {size}')
     origin = element.find("origin")
@@ -184,9 +190,11 @@ def _replaced(shape: Shape, collisions: str) -> Shape:
 
 def rotation_of(rpy: list[float]) -> Vector:
     """Return the matrix, shape (3, 3), of roll, pitch and yaw as URDF files give them, in rad."""
+    if not any(rpy):
+        return np.eye(3)
     roll, pitch, yaw = (0.5 * angle for angle in rpy)
     cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)
     x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
     z, w = cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy
-    return matrix_from_quaternion(np.array([x, y, z, w]))
+    return matrix_from_quaternion((x, y, z, w))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -20,8 +20,10 @@ from physx_core.interfaces.backend import (
     State,
     Vector,
 )
+from physx_core.interfaces.vectors import finite_vector
 from physx_core.world import Wrench
-from physx_dart.checks import integer, joined, vector
+from physx_core.world.rotations import cross
+from physx_dart.checks import integer
 from physx_dart.engine import RobotEngine
 from physx_dart.influences import Hooks, Wrenches
 from physx_dart.parts import Parts
@@ -51,7 +53,7 @@ class RobotSimulation(WorldState):
         super().__init__(parts, robots)
         self.features = frozenset(FEATURES) - self.lacks - set(lacks)
         self._frame = 0
-        self._stepping = self._stepped = False
+        self._stepping = False
         self._wrenches, self._hooks = Wrenches(self.period), Hooks()
         self._set_command_limits()
         self._watch()
@@ -69,7 +71,9 @@ class RobotSimulation(WorldState):
             most, least = np.where(modes == mode, high, most), np.where(modes == mode, low, least)
         self._least, self._most = least, most
         self._forces_only = bool((modes == "force").all())
-        self._limited = bool(np.isfinite([least, most]).any())
+        tame = min(most.min(initial=np.inf), -least.max(initial=-np.inf))
+        # Square of a length up to which no command needs to be cut.
+        self._tame = tame**2 if tame > 0 else -1.0
         self._positioned = np.flatnonzero(modes == "position")
 
     def _neutral_commands(self) -> Vector:
@@ -106,16 +110,22 @@ class RobotSimulation(WorldState):
                 f"set_torques: these joints are not driven by torques: {listed(others)}. "
                 "Use set_commands."
             )
-        self._hold(vector("torques", torques, self._joint_count))
+        self._hold(finite_vector("torques", torques, self._joint_count))
 
     def set_commands(self, commands: Vector) -> None:
         """Hold commands, shape (joints,), each as its joint's mode says; the limits cut them."""
         if self._closed:
             self._check_open()
-        self._hold(vector("commands", commands, self._joint_count))
+        self._hold(finite_vector("commands", commands, self._joint_count))
+
+    def commands(self) -> Vector:
+        """Return the held commands as the joints' limits cut them, shape (joints,)."""
+        if self._closed:
+            self._check_open()
+        return self._commands.copy()
 
     def _hold(self, commands: Vector) -> None:
-        if self._limited:
+        if commands.dot(commands) > self._tame:
             np.maximum(commands, self._least, out=commands)
             np.minimum(commands, self._most, out=commands)
         self._commands = commands
@@ -137,7 +147,7 @@ class RobotSimulation(WorldState):
             self._step_watched(n)
             return
         while n > 0:
-            block = min(n, _BLOCK)
+            block = n if n < _BLOCK else _BLOCK
             self.advance(block)
             n -= block
             self._frame += block
@@ -147,13 +157,18 @@ class RobotSimulation(WorldState):
     def _step_watched(self, n: int) -> None:
         self._stepping = True
         try:
-            for _ in range(n):
+            while n > 0:
                 self._hooks.call(self, self._frame)
                 self._check_open()
-                self._push()
-                self._steer()
-                self.advance(1)
-                self._frame += 1
+                block = 1
+                if len(self._wrenches) or len(self._positioned):
+                    self._push()
+                    self._steer()
+                else:
+                    block = min(n, _BLOCK, self._hooks.pause(self._frame))
+                self.advance(block)
+                n -= block
+                self._frame += block
                 self._stepped = True
                 self._check_finite()
         finally:
@@ -244,18 +259,11 @@ class RobotSimulation(WorldState):
 
     # State ----------------------------------------------------------------------------------
 
-    def accelerations(self) -> Vector:
-        """Return the change of the velocities in the last step by the period, shape (nv,)."""
-        self._check_open()
-        if not self._stepped:
-            return np.zeros(self.layout.nv)
-        return joined([robot.accelerations() for robot in self._robots])
-
     def set_state(self, positions: Vector, velocities: Vector) -> None:
         """Put the world into a state; time goes on."""
         self._check_open()
         q = self._checked_positions(positions)
-        self._write(q, vector("velocities", velocities, self.layout.nv))
+        self._write(q, finite_vector("velocities", velocities, self.layout.nv))
 
     def _write(self, q: Vector, v: Vector) -> None:
         self._stepped = False
@@ -280,9 +288,9 @@ class RobotSimulation(WorldState):
         self._check_open()
         if not isinstance(state, State):
             raise SimulationError(f"restore takes what snapshot returned, not {state!r}.")
-        commands = vector("state.commands", state.commands, len(self.layout.joints))
+        commands = finite_vector("state.commands", state.commands, len(self.layout.joints))
         q = self._checked_positions(state.positions)
-        v = vector("state.velocities", state.velocities, self.layout.nv)
+        v = finite_vector("state.velocities", state.velocities, self.layout.nv)
         frame = integer("state.frame", state.frame, 0)
         for applied in state.wrenches:
             self._check_wrench(applied.wrench)
@@ -301,7 +309,7 @@ class RobotSimulation(WorldState):
         if not isinstance(state.native, tuple) or len(state.native) != len(wanted):
             raise SimulationError("The snapshot is of another world: its native state differs.")
         given = [
-            vector("state.native", values, length)
+            finite_vector("state.native", values, length)
             for values, length in zip(state.native, wanted, strict=True)
         ]
         return list(zip(given[::2], given[1::2], strict=True))
@@ -319,24 +327,26 @@ class RobotSimulation(WorldState):
         q, v, a = self.positions(), self.velocities(), self.accelerations()
         return self._algorithms.joint_wrenches(q, v, a, self._outer(q))
 
-    def _outer(self, q: Vector) -> Vector:
-        """Return what acted on the bodies in the last step: force, torque about their origins."""
-        found, poses = np.zeros((len(self.layout.names), 6)), self.body_poses(positions=q)
-        origins = np.concatenate([poses[:, :3], np.zeros((len(self.layout.statics), 3))])
+    def _outer(self, q: Vector) -> dict[int, list[float]]:
+        """Return what acted on bodies in the last step: force, torque about their origins."""
+        found: dict[int, list[float]] = {}
         if not self._stepped:
             return found
+        poses = self._algorithms.body_poses(q, range(len(self.layout.bodies)))
         contacts = self.contacts() if "contacts" in self.features else np.zeros(0, CONTACT)
-        for side, sign in (("body_a", 1.0), ("body_b", -1.0)):
-            bodies, forces = contacts[side], sign * contacts["force"]
-            arms = contacts["point"] - origins[bodies]
-            np.add.at(found, bodies, np.column_stack([forces, np.cross(arms, forces)]))
+        for first, second, (x, y, z), force, *_ in contacts.tolist():
+            for body, sign in ((first, 1.0), (second, -1.0)):
+                if body < len(poses):
+                    a, b, c = poses[body, :3].tolist()
+                    acting = [sign * part for part in force]
+                    _add(found, body, acting, cross(x - a, y - b, z - c, *acting))
         for wrench, force, torque in self._wrenches.before(self._frame):
             body = self._places[wrench.body]
             turn = matrix_from_quaternion(poses[body, 3:])
             if wrench.frame == "body":
                 force, torque = turn @ force, turn @ torque
-            found[body, :3] += force
-            found[body, 3:] += torque + np.cross(turn @ wrench.point, force)
+            arm = turn @ wrench.point
+            _add(found, body, force, torque + cross(*arm.tolist(), *force.tolist()))
         return found
 
     @abstractmethod
@@ -350,3 +360,9 @@ class RobotSimulation(WorldState):
         self._bodies = {}
         self._hooks.clear()
         self._made_algorithms = self._made_batches = None
+
+
+def _add(wrenches: dict[int, list[float]], body: int, force: Any, torque: Any) -> None:
+    """Add a force and a torque to those of a body."""
+    before = wrenches.get(body, (0.0,) * 6)
+    wrenches[body] = [a + b for a, b in zip(before, (*force, *torque), strict=True)]

@@ -13,6 +13,7 @@ place and axis. Everything else is read here, so that it means the same in both:
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,8 @@ from physx_dart.shapes import Shape, shapes_of_robot
 
 _MOVING = ("revolute", "continuous", "prismatic")
 _UNLIMITED = '<limit lower="-1e9" upper="1e9" effort="1e9" velocity="1e9"/>'
+_PLAIN = JointSettings()
+_SPECIAL = re.compile('[&<>"\t\n\r]')
 _MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 _NEGLIGIBLE = (
     '<inertial><mass value="1e-9"/><inertia ixx="1e-12" iyy="1e-12" izz="1e-12" '
@@ -218,7 +221,7 @@ def _joint(joint: Element, all_settings: Mapping[str, JointSettings]) -> Joint:
     if lower > upper:
         raise ModelError(f'joint "{name}" has the lower limit {lower} above the upper {upper}')
     limited = joint.get("type") != "continuous" and lower < upper
-    settings = all_settings.get(name, JointSettings())
+    settings = all_settings.get(name, _PLAIN)
     damping, friction = settings.damping, settings.friction
     return Joint(
         name,
@@ -250,19 +253,23 @@ def _engine_text(tree: _Tree) -> str:
     parts = ['<robot name="robot">']
     for name in tree.links:
         link = _inertial(name, tree.elements[name])
-        parts.append(f"<link name={quoteattr(name)}>{link}</link>")
+        parts.append(f"<link name={_quoted(name)}>{link}</link>")
     for joint in tree.joints:
         moving = joint.get("type") in _MOVING
         kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
         name = joint.get("name", "")
-        parts.append(f'<joint name={quoteattr(name)} type="{kind if moving else "fixed"}">')
+        parts.append(f'<joint name={_quoted(name)} type="{kind if moving else "fixed"}">')
         parts.append(_origin(f'joint "{name}"', joint))
         for tag in ("parent", "child"):
-            parts.append(f"<{tag} link={quoteattr(link_of(joint, tag))}/>")
+            parts.append(f"<{tag} link={_quoted(link_of(joint, tag))}/>")
         if moving:
             parts.append(f'<axis xyz="{_axis(joint)}"/>{_UNLIMITED}')
         parts.append("</joint>")
     return "".join([*parts, "</robot>"])
+
+
+def _quoted(name: str) -> str:
+    return quoteattr(name) if _SPECIAL.search(name) else f'"{name}"'
 
 
 def _inertial(name: str, link: Element) -> str:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from physx_core.errors import SimulationError, listed, nearest
 from physx_core.interfaces.backend import Simulation, Vector
-from physx_dart.algorithms import Algorithms
-from physx_dart.batches import Batches
-from physx_dart.checks import joined, rows, vector
+from physx_core.interfaces.vectors import finite_rows, finite_vector, written
+from physx_dart.checks import joined
 from physx_dart.engine import RobotEngine
-from physx_dart.parts import Parts, layout_of
+from physx_dart.parts import Parts, layout_of, static_poses
+from physx_dart.reaching import Reach
+
+if TYPE_CHECKING:
+    from physx_dart.algorithms import Algorithms
+    from physx_dart.batches import Batches
 
 
 class WorldState(Simulation):
@@ -33,7 +37,7 @@ class WorldState(Simulation):
         self._robots = tuple(robots)
         self._only = robots[0] if len(robots) == 1 else None
         self._joint_count = len(self.layout.joints)
-        self._closed = False
+        self._closed = self._stepped = False
         places = self.layout.parts.values()
         self._q = [place.positions for place in places]
         self._v = [place.velocities for place in places]
@@ -44,11 +48,10 @@ class WorldState(Simulation):
             for link, name in enumerate(self.layout.bodies[place.bodies])
         }
         self._places = {name: i for i, name in enumerate(self.layout.names)}
-        self._static_poses = np.array(
-            [[*static.position, *static.orientation] for static in parts.statics], np.float64
-        ).reshape(-1, 7)
+        self._static_poses = static_poses(parts)
         self._made_algorithms: Algorithms | None = None
         self._made_batches: Batches | None = None
+        self._reaches: dict[int, Reach] = {}
         for robot in robots:
             robot.write(robot.neutral(), np.zeros(robot.nv))
 
@@ -56,17 +59,26 @@ class WorldState(Simulation):
         """Return the positions, shape (nq,), written into `out` if it is given."""
         if self._closed:
             self._check_open()
-        if out is None and self._only is not None:
-            return self._only.positions()
-        return joined([robot.positions() for robot in self._robots], out)
+        only = self._only
+        found = only.positions() if only else joined([robot.positions() for robot in self._robots])
+        return found if out is None else written(found, out)
 
     def velocities(self, out: Vector | None = None) -> Vector:
         """Return the velocities, shape (nv,), written into `out` if it is given."""
         if self._closed:
             self._check_open()
-        if out is None and self._only is not None:
-            return self._only.velocities()
-        return joined([robot.velocities() for robot in self._robots], out)
+        only = self._only
+        found = only.velocities() if only else joined([each.velocities() for each in self._robots])
+        return found if out is None else written(found, out)
+
+    def accelerations(self) -> Vector:
+        """Return the change of the velocities in the last step by the period, shape (nv,)."""
+        if self._closed:
+            self._check_open()
+        if not self._stepped:
+            return np.zeros(self.layout.nv)
+        only = self._only
+        return only.accelerations() if only else joined([r.accelerations() for r in self._robots])
 
     # Bodies and dynamics of any state -------------------------------------------------------
 
@@ -74,13 +86,12 @@ class WorldState(Simulation):
         self, names: Sequence[str] | None = None, positions: Vector | None = None
     ) -> Vector:
         """Return the poses of bodies, shape (names, 7): x, y, z and quaternion x, y, z, w."""
+        if positions is None:
+            return self._algorithms.body_poses(self.positions(), self._chosen(names))
         self._check_open()
-        q = self.positions() if positions is None else self._checked_positions(positions)
+        q = self._checked_positions(positions)
         rows = joined([r.poses(q[part]) for r, part in zip(self._robots, self._q, strict=True)])
-        if names is None:
-            return rows
-        places = [self._place(name) for name in _names(names)]
-        return np.concatenate([rows, self._static_poses])[places]
+        return np.concatenate([rows, self._static_poses])[self._chosen(names)]
 
     def body_velocities(
         self,
@@ -89,16 +100,42 @@ class WorldState(Simulation):
         velocities: Vector | None = None,
     ) -> Vector:
         """Return the velocities of bodies' origins, shape (names, 6): linear, angular."""
+        if positions is None and velocities is None:
+            return self.body_motions(names)[:, 7:13].copy()
         self._check_open()
         q = self.positions() if positions is None else self._checked_positions(positions)
         v = self.velocities()
         if velocities is not None:
-            v = vector("velocities", velocities, self.layout.nv)
-        rows = self._algorithms.body_velocities(q, v)
-        if names is None:
-            return rows
-        places = [self._place(name) for name in _names(names)]
-        return np.concatenate([rows, np.zeros((len(self.layout.statics), 6))])[places]
+            v = finite_vector("velocities", velocities, self.layout.nv)
+        chosen = self._chosen(names)
+        nothing = np.zeros(self.layout.nv)
+        return self._algorithms.motions(q, v, nothing, chosen)[:, 7:13].copy()
+
+    def body_accelerations(self, names: Sequence[str] | None = None) -> Vector:
+        """Return the accelerations of bodies' origins, shape (names, 6): linear, angular."""
+        return self.body_motions(names)[:, 13:].copy()
+
+    def body_motions(self, names: Sequence[str] | None = None) -> Vector:
+        """Return poses, velocities and accelerations of bodies at present, shape (names, 19)."""
+        if self._closed:
+            self._check_open()
+        q, v, a = self.positions(), self.velocities(), self.accelerations()
+        return self._algorithms.motions(q, v, a, self._chosen(names))
+
+    def reach(self, name: str, direction: Vector, positions: Vector | None = None) -> float:
+        """Return how far the collision shapes of a robot or object reach along a direction."""
+        self._check_open()
+        known = list(self.layout.parts)
+        if name not in known:
+            raise SimulationError(
+                f'There is no robot or object "{name}" that moves.{nearest(str(name), known)} '
+                f"There are: {listed(known)}."
+            )
+        place, along = known.index(name), finite_vector("direction", direction, 3)
+        if place not in self._reaches:
+            self._reaches[place] = Reach(self.parts.movers[place])
+        q = self.positions() if positions is None else self._checked_positions(positions)
+        return self._reaches[place].along(along, self._robots[place].poses(q[self._q[place]]))
 
     def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
         """Return the accelerations, shape (nv,), that torques (nv,) cause in a state."""
@@ -123,7 +160,7 @@ class WorldState(Simulation):
         """Return the Jacobian, shape (6, nv), of a point of a link or object."""
         self._check_open()
         place = self._place(body)
-        at = vector("point", point, 3)
+        at = finite_vector("point", point, 3)
         q = self._checked_positions(positions)
         if place >= len(self.layout.bodies):
             return np.zeros((6, self.layout.nv))
@@ -151,12 +188,16 @@ class WorldState(Simulation):
     @property
     def _batches(self) -> Batches:
         if self._made_batches is None:
+            from physx_dart.batches import Batches
+
             self._made_batches = Batches(self._algorithms)
         return self._made_batches
 
     @property
     def _algorithms(self) -> Algorithms:
         if self._made_algorithms is None:
+            from physx_dart.algorithms import Algorithms  # its library loads slowly
+
             self._made_algorithms = Algorithms(self.parts)
         return self._made_algorithms
 
@@ -171,7 +212,7 @@ class WorldState(Simulation):
         self._check_open()
         nv = self.layout.nv
         q = self._checked_positions(positions)
-        return q, vector("velocities", velocities, nv), vector(name, third, nv)
+        return q, finite_vector("velocities", velocities, nv), finite_vector(name, third, nv)
 
     def _place(self, name: Any) -> int:
         place = self._places.get(name) if isinstance(name, str) else None
@@ -182,12 +223,27 @@ class WorldState(Simulation):
             )
         return place
 
+    def _chosen(self, names: Any) -> list[int]:
+        """Return the places of bodies in `Layout.names`; None: all that move."""
+        if names is None:
+            return list(range(len(self.layout.bodies)))
+        if isinstance(names, str):
+            raise SimulationError(f'names is the text "{names}" but must be a list of names.')
+        try:
+            return [self._places[name] for name in names]
+        except (KeyError, TypeError):
+            pass
+        try:
+            return [self._place(name) for name in names]
+        except TypeError:
+            raise SimulationError(f"names is {names!r} but must be a list of names.") from None
+
     def _check_open(self) -> None:
         if self._closed:
             raise SimulationError("The simulation is closed; build a new one.")
 
     def _checked_positions(self, positions: Any) -> Vector:
-        q = vector("positions", positions, self.layout.nq)
+        q = finite_vector("positions", positions, self.layout.nq)
         for place in self.layout.parts.values():
             if place.floating:
                 base = slice(place.positions.start + 3, place.positions.start + 7)
@@ -204,8 +260,8 @@ class WorldState(Simulation):
         self, positions: Any, velocities: Any, torques: Any
     ) -> tuple[Vector, Vector, Vector]:
         self._check_open()
-        q, nv = rows("positions", positions, self.layout.nq), self.layout.nv
-        v, tau = rows("velocities", velocities, nv), rows("torques", torques, nv)
+        q, nv = finite_rows("positions", positions, self.layout.nq), self.layout.nv
+        v, tau = finite_rows("velocities", velocities, nv), finite_rows("torques", torques, nv)
         if not len(q) == len(v) == len(tau):
             raise SimulationError(
                 f"There are {len(q)} positions, {len(v)} velocities and {len(tau)} torques; each "
@@ -222,12 +278,3 @@ class WorldState(Simulation):
                     )
                 quaternions /= lengths
         return q, v, tau
-
-
-def _names(names: Any) -> list[Any]:
-    if isinstance(names, str):
-        raise SimulationError(f'names is the text "{names}" but must be a list of names.')
-    try:
-        return list(names)
-    except TypeError:
-        raise SimulationError(f"names is {names!r} but must be a list of names.") from None

@@ -14,7 +14,7 @@ from physx_core.fields import Array
 from physx_core.scene import Event
 from physx_rerun import colors
 from physx_rerun.layout import Layout
-from physx_rerun.robot import draw_robot, tint_robot
+from physx_rerun.robot import corners_of, draw_robot, tint_robot
 from physx_rerun.rows import Rows, Times
 
 DEFAULT_COLOR = "silver"
@@ -65,6 +65,7 @@ class Drawing:
         self._frames: list[str] = []
         self._poses: list[Array] = []
         self._has_world = False
+        self._followed: str | None = None
         self._ways: dict[str, Callable[[Drawn, dict[str, Any], Times], None]] = {
             "mesh": self._mesh,
             "points": self._points,
@@ -87,6 +88,7 @@ class Drawing:
         """
         for event in events:
             self._draw(event, times)
+        self._follow()
         if self._frames:
             poses = np.concatenate(self._poses)
             self._rows.add_many(
@@ -109,7 +111,9 @@ class Drawing:
         if not self._in_full and event.kind not in ("scalars", "text"):
             return
         if event.kind == "view" and event.action == "add":
-            self._layout.set_view(self._id, **event.values)
+            values = dict(event.values)
+            self._followed = values.pop("follow", None)
+            self._layout.set_view(self._id, **values)
             return
         if event.action == "add":
             entity = "/".join(rr.escape_entity_path_part(part) for part in event.name.split("/"))
@@ -126,6 +130,15 @@ class Drawing:
             self._announce(drawn)
         self._ways[event.kind](drawn, changes, times)
         drawn.is_new = False
+
+    def _follow(self) -> None:
+        """Let the camera follow the object that it shall, once that is drawn."""
+        drawn = self._drawn.get(self._followed or "")
+        if drawn is not None:
+            # The first shape of a robot is one of its root link, if that has any.
+            shapes = drawn.values.get("shapes", ())
+            self._layout.follow(self._id, shapes[0][0] if shapes else drawn.entity)
+            self._followed = None
 
     # The ground that all shapes stand on -----------------------------------------------------
 
@@ -320,7 +333,9 @@ class Drawing:
                 f'The robot "{drawn.name}" has {len(frames)} bodies but got {len(poses)} poses.'
             )
         self._set_poses(frames, poses)
-        self._layout.place(self._id, drawn.name, poses[:, :3])
+        if drawn.is_new:
+            corners = corners_of([shape for _, shape in values["shapes"]], poses)
+            self._layout.place(self._id, drawn.name, corners)
 
 
 def _normals(positions: Array, cells: Array) -> Array:

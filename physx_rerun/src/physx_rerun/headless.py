@@ -50,10 +50,10 @@ def render_picture(
     if not rrd_path.is_file():
         raise VisualizerError(f"There is no recording {rrd_path}.")
     with tempfile.TemporaryDirectory(prefix="physx-rerun-") as folder:
-        viewer = _start(rrd_path, size, Path(folder))
+        viewer = start(size, Path(folder), str(rrd_path))
         try:
             viewer.wait_until_ready(timeout)
-            camera = _Camera(viewer, time.monotonic() + timeout)
+            camera = Camera(viewer, time.monotonic() + timeout)
             camera.wait_for_recording()
             camera.go_to(timeline, step)
             picture = Image.open(io.BytesIO(camera.shoot()))
@@ -67,24 +67,28 @@ def render_picture(
     return png_path
 
 
-def _start(rrd_path: Path, size: tuple[int, int], folder: Path) -> Viewer:
+def start(size: tuple[int, int], folder: Path, *options: str) -> Viewer:
     """Start a viewer that knows no earlier layouts and has no settings of the user's."""
     window = f"{size[0]}x{size[1] + _TOP_BAR}"
     places = {"XDG_DATA_HOME": str(folder), "XDG_CONFIG_HOME": str(folder)}
-    return Viewer(0, ("--headless", "--window-size", window, str(rrd_path)), environment=places)
+    return Viewer(0, ("--headless", "--window-size", window, *options), environment=places)
 
 
-class _Camera:
-    """Asks a viewer for its state and for pictures, with patience while it is busy drawing."""
+class Camera:
+    """Asks a viewer for its state and for pictures, with patience while it is busy drawing.
+
+    Attributes:
+        deadline: When patience ends, as `time.monotonic` counts.
+    """
 
     def __init__(self, viewer: Viewer, deadline: float) -> None:
-        self._viewer, self._deadline = viewer, deadline
+        self._viewer, self.deadline = viewer, deadline
         self._client = ViewerClient.connect(f"rerun+http://{viewer.address}/proxy")
 
     def _ask(self, question: Callable[[], T]) -> T:
         while True:
             self._viewer.check()
-            if time.monotonic() > self._deadline:
+            if time.monotonic() > self.deadline:
                 raise VisualizerError("The Rerun viewer took too long to draw the picture.")
             try:
                 return question()
@@ -115,8 +119,26 @@ class _Camera:
         position = known[timeline].end or 0 if step is None else step
         self._ask(lambda: self._client.set_time(timeline, sequence=position, play_state="paused"))
 
-    def shoot(self) -> bytes:
-        """Return a picture once everything is drawn.
+    def wait_for_position(self, timeline: str, position: int) -> None:
+        """Wait until the viewer has what was recorded up to a position on a timeline."""
+        while True:
+            state = self._ask(self._client.get_state)
+            lines = [line for recording in state.recordings for line in recording.timelines]
+            if any(line.name == timeline and (line.end or 0) >= position for line in lines):
+                return
+            time.sleep(0.002)
+
+    def scene(self) -> str | None:
+        """Return the identity of the first three-dimensional view, None where there is none."""
+        views = self._ask(self._client.get_state).views
+        return next((view.view_id for view in views if view.view_class == "3D"), None)
+
+    def glance(self, view_id: str | None = None) -> bytes:
+        """Return a picture of what is drawn by now, of one view or of everything."""
+        return self._ask(lambda: self._client.take_screenshot(view_id))
+
+    def shoot(self, view_id: str | None = None) -> bytes:
+        """Return a picture once everything is drawn, of one view or of everything.
 
         Rows and meshes come in while the viewer draws already: it is ready when two pictures in
         a row are equal and no view complains of something that it lacks.
@@ -125,7 +147,7 @@ class _Camera:
         while True:
             state = self._ask(self._client.get_state)
             lacks = any(view.reports for view in state.views)
-            last, picture = picture, self._ask(self._client.take_screenshot)
+            last, picture = picture, self.glance(view_id)
             repeats = repeats + 1 if picture == last else 0
             if repeats > (_PATIENCE if lacks else 0):
                 return picture

@@ -34,10 +34,12 @@ class Layout:
     Attributes:
         instance_nb: How many environment instances may draw.
         changed: Whether something was added since `blueprint` was asked for.
+        has_time_panel: Whether the panel with the time is shown.
     """
 
     instance_nb: int
     changed: bool = False
+    has_time_panel: bool = True
     _kinds: set[tuple[str, str]] = field(default_factory=set)
     _scenes: dict[int, dict[str, Box]] = field(default_factory=dict)
     _plots: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -46,12 +48,19 @@ class Layout:
     _timelines: set[str] = field(default_factory=set)
     _titles: dict[int, str] = field(default_factory=dict)
     _cameras: dict[int, dict[str, Array]] = field(default_factory=dict)
+    _followed: dict[int, str] = field(default_factory=dict)
 
     def set_view(self, instance_id: int, title: str, **camera: Array) -> None:
-        """Name the window of an instance and place its camera: see `Factory.set_view`."""
+        """Name the window of an instance and place its camera."""
         self._titles[instance_id] = title
         self._cameras[instance_id] = camera
         self._kinds.add(("view", title))
+        self.changed = True
+
+    def follow(self, instance_id: int, entity: str) -> None:
+        """Let the camera of an instance move along with an entity."""
+        self._followed[instance_id] = entity
+        self._kinds.add(("follow", entity))
         self.changed = True
 
     def title(self, instance_id: int) -> str:
@@ -145,7 +154,9 @@ class Layout:
             rrb.Vertical(*parts, row_shares=shares)
             if in_a_row
             else rrb.Horizontal(*parts, column_shares=shares),
-            rrb.TimePanel(timeline=self.timeline, state="collapsed"),
+            rrb.TimePanel(
+                timeline=self.timeline, state="collapsed" if self.has_time_panel else "hidden"
+            ),
             auto_layout=False,
             auto_views=False,
             collapse_panels=True,
@@ -169,9 +180,10 @@ class Layout:
         target = camera.get("target", (low + high) / 2)
         eye = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=camera.get("eye", target + 1.1 * size * _VIEW_FROM),
+            position=camera.get("eye", target + 1.3 * size * _VIEW_FROM),
             look_target=target,
             eye_up=(0.0, 0.0, 1.0),
+            tracking_entity=self._followed.get(instance_id),
         )
         default = f"environment {instance_id}" if self.instance_nb > 1 else "environment"
         return rrb.Spatial3DView(

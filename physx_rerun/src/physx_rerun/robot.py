@@ -94,6 +94,38 @@ _LOOKS: dict[str, tuple[type[Any], str]] = {
 }
 
 
+def corners_of(shapes: Sequence[Shape], poses: Array) -> Array:
+    """Return points that a robot spans: its bodies' origins, and the corners around its shapes.
+
+    Args:
+        shapes: Its shapes; of a mesh just the origin is known.
+        poses: Poses of the bodies, shape (bodies, 7).
+    """
+    found = [poses[:, :3]]
+    for shape in shapes:
+        points = _SIGNS * _reach(shape) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+        if shape.body is not None:
+            axis, w = poses[shape.body, 3:6], poses[shape.body, 6]
+            across = 2 * np.cross(axis, points)
+            points = points + w * across + np.cross(axis, across) + poses[shape.body, :3]
+        found.append(points)
+    return np.concatenate(found)
+
+
+_SIGNS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+
+
+def _reach(shape: Shape) -> Array:
+    """Return how far a shape reaches from its origin along its axes."""
+    if shape.kind == "mesh":
+        return np.zeros(3)
+    if shape.kind == "box":
+        return np.array(shape.size)
+    radius, length = shape.size
+    ends = {"sphere": radius, "cylinder": 0.5 * length, "capsule": 0.5 * length + radius}
+    return np.array([radius, radius, ends[shape.kind]])
+
+
 def _center(shape: Shape) -> Array:
     if shape.kind != "capsule":
         return shape.pose[:3, 3]

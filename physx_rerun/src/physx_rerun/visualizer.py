@@ -20,15 +20,17 @@ from physx_rerun import colors
 from physx_rerun.drawing import Drawing
 from physx_rerun.headless import render_picture
 from physx_rerun.layout import Layout
+from physx_rerun.offscreen import OffscreenViewer
 from physx_rerun.rows import TIME, Rows
 from physx_rerun.streams import Recording
 from physx_rerun.viewer import Viewer, has_display, listens
 
-MODES = ("save", "spawn", "connect", "headless")
+MODES = ("save", "spawn", "connect", "headless", "offscreen")
 BINS = 30
 FLUSH_SECONDS = 0.2
 FLUSH_STEPS = 100
 FLUSH_BYTES = 8_000_000
+_MARK = "picture"
 
 
 @options
@@ -43,7 +45,8 @@ class RerunVisualizer(Visualizer):
 
     mode: str = field(default="save", metadata={"choices": MODES})
     """"save": only write a file; "spawn": open a viewer; "connect": show in a viewer that runs;
-    "headless": write a file, and a picture of it at the end."""
+    "headless": write a file, and a picture of it at the end; "offscreen": draw pictures for
+    `capture`."""
     path: str | Path | None = None
     """The .rrd file; None: a new one in the session's folder, named like the run."""
     save: bool = True
@@ -57,7 +60,7 @@ class RerunVisualizer(Visualizer):
     picture: str | Path | None = None
     """Picture of the headless mode; None: beside the file, ending in .png."""
     picture_size: tuple[int, int] = (1600, 900)
-    """Its width and height in pixels."""
+    """Width and height, in pixels, of this picture and of those of the offscreen mode."""
     max_instances: int = at_least(0, 4)
     """Environment instances drawn in full; of the others only numbers and texts are recorded."""
 
@@ -72,6 +75,8 @@ class RerunVisualizer(Visualizer):
 
     def _reset(self) -> None:
         self.viewer: Viewer | None = None
+        self._offscreen: OffscreenViewer | None = None
+        self._step, self._pictures = 0, 0
         self.file: Path | None = None
         self._run_name = "run"
         self._address: str | None = None
@@ -106,6 +111,7 @@ class RerunVisualizer(Visualizer):
         """
         self._reset()
         self._run_name, self._layout = run_name, Layout(instance_nb)
+        self._layout.has_time_panel = self.mode != "offscreen"
         if self.mode == "connect":
             self._address = str(self.address)
             if not listens(self._address):
@@ -115,6 +121,9 @@ class RerunVisualizer(Visualizer):
                 )
         if self.mode == "spawn":
             self._spawn()
+        if self.mode == "offscreen":
+            self._offscreen = OffscreenViewer(self.picture_size, self.memory_limit)
+            self._address = self._offscreen.address
         if self.save:
             self.file = Path(self.path) if self.path else _unused(Path(session_dir), run_name)
         self._is_open = True
@@ -145,12 +154,27 @@ class RerunVisualizer(Visualizer):
         """
         if not self._is_open:
             return
+        self._step = step
         if instance_id not in self._drawings:
             self._drawings[instance_id] = Drawing(
                 instance_id, self._rows, self._layout, in_full=instance_id <= self.max_instances
             )
         self._drawings[instance_id].draw(events, {"step": step, TIME: self._now()})
         self._flush_if_due()
+
+    def capture(self) -> Array | None:
+        """Return what was drawn at the last step in the offscreen mode; see `Visualizer.capture`.
+
+        Raises:
+            VisualizerError: The viewer ended or takes too long, or nothing was drawn.
+        """
+        if self._offscreen is None:
+            return None
+        self._pictures += 1
+        # What is sent last arrives last: once it is there, all that belongs to the picture is.
+        self._rows.add(_MARK, rr.Scalars, {_MARK: self._pictures}, scalars=[0.0])
+        self._flush()
+        return self._offscreen.picture(self._step, _MARK, self._pictures)
 
     def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
         """Add points to the curves of the training; see `Observer.scalars`."""
@@ -196,11 +220,16 @@ class RerunVisualizer(Visualizer):
         if not self._is_open:
             return
         self._is_open = False
-        self._flush()
+        try:
+            self._flush()
+        finally:
+            if self._recording is not None:
+                self._recording.close()
+            if self._offscreen is not None:
+                self._offscreen.close()
         if self._recording is None:
             return
-        self._recording.close()
-        self._recording = None
+        self._recording = self._offscreen = None
         if self.mode == "headless" and self.file is not None:
             picture = Path(self.picture) if self.picture else self.file.with_suffix(".png")
             render_picture(self.file, picture, self.picture_size, timeline=self._layout.timeline)
@@ -227,7 +256,7 @@ class RerunVisualizer(Visualizer):
                 self._run_name,
                 self.file,
                 self._address,
-                owns_viewer=self.viewer is not None,
+                owns_viewer=self.viewer is not None or self._offscreen is not None,
             )
         self._recording.write(chunks)
         if self._layout.changed:

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from types import ModuleType
 from typing import Any
 
+import torch
+
 from physx_core.errors import ComponentNotFoundError, ConfigError, listed, nearest
 from physx_core.plugins import resolve
 
@@ -66,6 +68,27 @@ def make(what: str, factory: Callable[..., Any], *args: Any, **kwargs: Any) -> A
             f"The {what} {name} refuses its arguments: {error}. "
             f"It takes: {', '.join(parameters_of(factory)) or 'what its documentation says'}."
         ) from error
+
+
+def make_activation(option: str, given: Any, channels: int) -> torch.nn.Module:
+    """Return an activation.
+
+    Args:
+        option: What was given, for messages, for example ``"FC.activation"``.
+        given: Name of a class in `torch.nn` such as ``"SiLU"``, ``"package.module:Class"``, or a
+            class.
+        channels: How many channels it works on: `torch.nn.PReLU` learns a slope for each.
+
+    Raises:
+        ConfigError: There is no such activation.
+    """
+    known = classes_in(torch.nn.modules.activation, torch.nn.Module)
+    chosen = choose("activation", given, {**known, "Identity": torch.nn.Identity})
+    slopes = {"num_parameters": channels} if chosen is torch.nn.PReLU else {}
+    made = make("activation", chosen, **slopes)
+    if not isinstance(made, torch.nn.Module):
+        raise ConfigError(f"{option} is {given!r} but must be a torch.nn.Module class.")
+    return made
 
 
 def parameters_of(factory: Callable[..., Any]) -> list[str]:

@@ -18,9 +18,10 @@ def run(words: Sequence[str]) -> None:
     """Replay as the words say; the first is a session's or dataset's folder.
 
     The environment is the second word, or else what the dataset says to have been made with. It is
-    drawn with the visualizer that is chosen, or else with Rerun, if that is installed.
+    drawn with the visualizer that is chosen, or else with Rerun, if that is installed. ``--mode``
+    is short for ``--dataset.mode``.
     """
-    words = list(words)
+    words = ["--dataset.mode" if word == "--mode" else word for word in words]
     place = ("dataset.existing_dir", "environment.environment")
     pipeline = pipeline_from(Replay, "replay", place, words, _given(words))
     pipeline.execute()

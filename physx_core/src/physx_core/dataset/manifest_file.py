@@ -10,12 +10,12 @@ from __future__ import annotations
 import json
 import re
 import uuid
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from physx_core.dataset import files, parsing
+from physx_core.dataset.checksums import crc32
 from physx_core.dataset.manifest import Manifest
 from physx_core.errors import ConfigError, DatasetError
 
@@ -44,7 +44,7 @@ def save(directory: Path, manifest: Manifest) -> None:
         "modes": {name: mode.to_dict() for name, mode in manifest.modes.items()},
     }
     body = _text(plain).encode()[:-2]
-    end = f',\n "crc32": "{zlib.crc32(body):08x}"\n}}'.encode()
+    end = f',\n "crc32": "{crc32(body):08x}"\n}}'.encode()
     files.replace(directory / FILE, body + end)
 
 
@@ -118,7 +118,7 @@ def _text(plain: Mapping[str, Any]) -> str:
 
 def _is_whole(content: bytes) -> bool:
     end = _END.search(content, max(0, len(content) - _END_NBYTES))
-    return end is not None and int(end[1], 16) == zlib.crc32(content[: end.start()])
+    return end is not None and int(end[1], 16) == crc32(content[: end.start()])
 
 
 def _newer(path: Path, version: int) -> DatasetError:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
-import zlib
 from pathlib import Path
 
 from physx_core.dataset import files
+from physx_core.dataset.checksums import crc32
 from physx_core.dataset.layout import Header, Identity, make_header
 from physx_core.fields import Array
 
@@ -198,7 +198,7 @@ def _copy(source: Path, source_offset: int, target: int, target_offset: int, cou
                 raise OSError(errno.EIO, f"{source} became shorter while it was read")
             if not shared:
                 files.write_at(target, part, there)
-            crc, done = zlib.crc32(part, crc), done + len(part)
+            crc, done = crc32(part, crc), done + len(part)
     finally:
         os.close(origin)
     return crc

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import FileIO
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from physx_core.dataset import files
+from physx_core.dataset.checksums import crc32
 from physx_core.dataset.layout import (
     SIGNATURE,
     inspect_open,
@@ -216,7 +216,7 @@ def _compare(
     """Add rows to the checksum of their segment, and compare it when they are the last ones."""
     if segment.checksum is None or (first > segment.start and segment.start not in sums):
         return
-    crc = zlib.crc32(part, sums.pop(segment.start, 0))
+    crc = crc32(part, sums.pop(segment.start, 0))
     if first + count < segment.start + segment.rows:
         sums[segment.start] = crc
     elif crc != segment.checksum:

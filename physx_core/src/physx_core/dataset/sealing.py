@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from physx_core.dataset import files
+from physx_core.dataset.checksums import crc32
 from physx_core.dataset.layout import inspect
 from physx_core.dataset.manifest import Mode, Partition, has_statistics
 from physx_core.dataset.partition import rewrite
@@ -70,7 +70,7 @@ def scanned(
         statistics = running[name] = RunningStatistics()
         crc[name] = 0
         for block in _blocks(rows, field):
-            crc[name] = zlib.crc32(files.raw(block), crc[name])
+            crc[name] = crc32(files.raw(block), crc[name])
             if has_statistics(field):
                 statistics.update(block)
     return replace(partition, checksums=crc, running=running, counted=False)
@@ -90,7 +90,7 @@ def checksum(segment: Segment, row_nbytes: int) -> int:
             part = buffer[:left]
             if not files.read_at(file.fileno(), part, place):
                 raise DatasetError(f"{segment.path} became shorter while it was read.")
-            crc = zlib.crc32(part, crc)
+            crc = crc32(part, crc)
             left, place = left - len(part), place + len(part)
     return crc
 

@@ -84,7 +84,12 @@ def written(path: Path) -> str:
 
 
 class ObservationChecks(SharedArrays):
-    """Finds what is no number in observations of a space, and what is outside of it."""
+    """Finds what is no number in observations of a space, and what is outside of it.
+
+    Attributes:
+        space: The space.
+        tells_nan: Whether nothing that is inside holds a NaN.
+    """
 
     def __init__(self, space: spaces.Space[Any], flat: NDArray[Any] | None = None) -> None:
         """Prepare for observations of a space.
@@ -103,6 +108,7 @@ class ObservationChecks(SharedArrays):
         high = np.concatenate([np.ravel(each.high) for each in boxes]) if boxes else np.zeros(0)
         self._low, self._high = low, high
         self._bounded = bool(np.isfinite(low).any() or np.isfinite(high).any())
+        self.tells_nan = self._even and self._bounded
         self._within = np.empty((2, len(low)), np.bool_)
         self._above, self._below = self._within
 

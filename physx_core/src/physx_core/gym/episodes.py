@@ -56,7 +56,7 @@ class Episodes(PipelineEnv):
             step_dt: Time of a step, in s; a multiple of the control and observation periods.
             simulation_duration_max: Time, in s, after which an episode is truncated.
             debug: Whether every physics step is recorded, in training too.
-            render_mode: ``"human"``, ``"rgb_array"``, or None: no pictures.
+            render_mode: ``"human"``, ``"rgb_array"``, or None: what `render` finds possible.
             kwargs: Options of `Simulator.build` or `Simulator`, where one is made; otherwise those
                 of the next of several classes that an environment inherits from.
 
@@ -81,7 +81,7 @@ class Episodes(PipelineEnv):
         self._renderer: Any = None
         self._quantities: Any = None
         self._training, self._ready, self._why = True, False, "Call reset() before step()."
-        self._builds, self._count = -1, -1
+        self._builds, self._count, self._is_sound = -1, -1, False
         self._flat_observation: Any = None
         self._set_periods()
         self._initialize_spaces()
@@ -270,9 +270,11 @@ class Episodes(PipelineEnv):
         try:
             self._run(top)
             top.refresh_observation(self.measurements)
-            self._checks.check_finite(top.observation)
             info: Info = {}
+            self._is_sound = False
             terminated, truncated = top.has_terminated(info)
+            if not self._is_sound or top is not self:
+                self._checks.check_finite(top.observation)
             if self.stepper_state.iter >= self._last_step:
                 truncated = True
             reward = float(top.compute_reward(terminated, info))
@@ -321,7 +323,9 @@ class Episodes(PipelineEnv):
 
     def is_inside(self) -> bool:
         """Return whether `observation` is within its space."""
-        return self._own_checks.inside(self.observation)
+        inside = self._own_checks.inside(self.observation)
+        self._is_sound = inside and self._own_checks.tells_nan
+        return inside
 
     def stop(self) -> None:
         """End the episode; what was recorded is written. To go on, call `reset`."""
@@ -345,7 +349,7 @@ class Episodes(PipelineEnv):
         """Go back to a snapshot of a layer and all below; see `restore`."""
         layers = top.layers
         names = [type(layer).__name__ for layer in layers]
-        if not isinstance(state, dict) or state.get("layers") != names:
+        if not isinstance(state, dict) or state.get("layers") != names or "own" not in state:
             given = state.get("layers") if isinstance(state, dict) else state
             raise SimulationError(f"The snapshot is of {given}, not of {names}.")
         if self.num_steps < 0 or self.derived is not top or not self.is_simulation_running:

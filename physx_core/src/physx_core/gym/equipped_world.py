@@ -41,8 +41,6 @@ class EquippedWorld(SharedArrays):
     Attributes:
         world: What is simulated; motors' rotors come on top.
         backend: Reference of the engine.
-        motors: The motors of the robot that acts, in the order of its command.
-        sensors: The sensors, those of a kind side by side.
         control_period: Time between two commands, in s; None: a step of the environment.
         observe_period: Time between two observations, in s; None: as between two commands.
         builds: How often the engine was built.
@@ -86,8 +84,8 @@ class EquippedWorld(SharedArrays):
         self._robot_name = names[0] if robot is None else robot
         self._given_motors = None if motors is None else tuple(motors)
         self._given_sensors = None if sensors is None else tuple(sensors)
-        self.motors: tuple[Motor, ...] = self._given_motors or ()
-        self.sensors: tuple[Sensor, ...] = self._given_sensors or ()
+        self._motors: tuple[Motor, ...] = self._given_motors or ()
+        self._sensors: tuple[Sensor, ...] = self._given_sensors or ()
         self.control_period = positive_or_none("control_period", control_period)
         self.observe_period = positive_or_none("observe_period", observe_period)
         self.builds = 0
@@ -117,11 +115,12 @@ class EquippedWorld(SharedArrays):
         simulation: Simulation = plugins.resolve("backend", self.backend).build(world)
         part = simulation.layout.parts[self._robot_name]
         if self._given_motors is None:
-            self.motors = default_motors(simulation.layout, part)
+            self._motors = default_motors(simulation.layout, part)
         if self._given_sensors is None:
-            self.sensors = default_sensors(simulation, part, self.motors)
-        equipment = Equipment(simulation, world, self.motors, self.sensors, self._random)
-        self.sensors = equipment.sensor_list
+            self._sensors = default_sensors(simulation, part, self._motors)
+        random = np.random.default_rng(0)  # biases are drawn again at each start
+        equipment = Equipment(simulation, world, self._motors, self._sensors, random)
+        self._sensors = equipment.sensor_list
         self._engine = Engine(simulation, equipment, part)
         self._stale = False
         self.builds += 1
@@ -141,7 +140,7 @@ class EquippedWorld(SharedArrays):
         self.velocities = self.values[self._sizes[0] : self._sizes[1]]
         self._sensed, self._state = self.values[self._sizes[1] :], self.values[1 : self._sizes[1]]
         q, v = self.positions[part.positions], self.velocities[part.velocities]
-        self.robot_state = RobotState(q, v, len(self.motors), self.stepper_state)
+        self.robot_state = RobotState(q, v, len(self._motors), self.stepper_state)
         self.robot_state.connect(engine.simulation, engine.equipment, part)
         self.measurements = self.views_of(self.values)
         np.copyto(self.positions, engine.first.positions)
@@ -156,6 +155,18 @@ class EquippedWorld(SharedArrays):
         if sensed:
             found["measurements"] = sensed
         return found
+
+    @property
+    def motors(self) -> tuple[Motor, ...]:
+        """The motors of the robot that acts, in the order of its command."""
+        self._know()
+        return self._motors
+
+    @property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """The sensors, those of a kind side by side."""
+        self._know()
+        return self._sensors
 
     @property
     def sensed(self) -> dict[str, Vector]:
@@ -188,6 +199,11 @@ class EquippedWorld(SharedArrays):
     def period(self) -> float:
         """Time of a physics step, in s."""
         return self.world.period
+
+    def _know(self) -> None:
+        """Build the engine, if it was never built: it alone knows the robot's joints."""
+        if not self.builds:
+            self.prepare()
 
     def prepare(self) -> None:
         """Build the engine now, if it is not there."""

@@ -47,7 +47,7 @@ class Keyboard:
 
             self._descriptor = sys.stdin.fileno() if self._given is None else self._given
             self._before = termios.tcgetattr(self._descriptor)
-            tty.setcbreak(self._descriptor)
+            tty.setcbreak(self._descriptor, termios.TCSANOW)
         except (ImportError, OSError, ValueError, AttributeError) as error:
             raise _no_terminal() from error
         except termios.error as error:

@@ -52,9 +52,9 @@ def as_logs(sources: Source | Sequence[Source], more: Sequence[Source] = ()) -> 
     Raises:
         LogError: Something is none of them, a file cannot be read, or nothing was recorded.
     """
-    if isinstance(sources, (Log, Mapping, str, Path)):
-        sources = [sources]
-    logs = [_log(each) for each in (*sources, *more)]
+    several = isinstance(sources, Sequence) and not isinstance(sources, str)
+    given: Any = sources if several else [sources]
+    logs = [_log(each) for each in (*given, *more)]
     if not logs:
         raise LogError("There is no log: give one or several.")
     return logs

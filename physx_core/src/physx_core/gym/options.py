@@ -43,18 +43,22 @@ def changed_world(world: World, options: Mapping[str, Any]) -> World:
         ConfigError: A value cannot be.
     """
     options = dict(_mapping("world", options))
-    ground, changes = options.pop("ground", None), {}
+    ground = options.pop("ground", None)
+    changes: dict[str, Any] = {}
     if ground:
         if world.ground is None:
             raise ConfigError('The world has no ground, so ["world"]["ground"] has no options.')
-        changes["ground"] = _changed("world.ground", world.ground, ground)
+        new_ground = _changed("world.ground", world.ground, ground)
+        changes = {} if new_ground is world.ground else {"ground": new_ground}
     for part in _PARTS:
         given = options.pop(part, None)
         if given:
             things = {thing.name: thing for thing in getattr(world, part)}
-            changes[part] = tuple(changed_each(f"world.{part}", things, given).values())
+            new = changed_each(f"world.{part}", things, given)
+            if any(new[name] is not thing for name, thing in things.items()):
+                changes[part] = tuple(new.values())
     changed: World = _changed("world", world, options, (*_PARTS, "ground"))
-    return dataclasses.replace(changed, **changes)
+    return dataclasses.replace(changed, **changes) if changes else changed
 
 
 def changed_each(where: str, things: Mapping[str, Any], options: Any) -> dict[str, Any]:
@@ -92,8 +96,13 @@ def _plain(thing: Any, without: set[str] | None = None) -> dict[str, Any]:
 def _changed(where: str, thing: Any, options: Any, without: Sequence[str] = ()) -> Any:
     known = _plain(thing, set(without))
     check_known(where, options, (*known, *without))
-    new = {name: value for name, value in options.items() if value is not known[name]}
+    new = {name: value for name, value in options.items() if not _same(value, known.get(name))}
     return dataclasses.replace(thing, **new) if new else thing
+
+
+def _same(value: Any, known: Any) -> bool:
+    plain = isinstance(value, (bool, int, float, str, tuple, type(None)))
+    return value is known or (plain and type(value) is type(known) and value == known)
 
 
 def _mapping(where: str, options: Any) -> Mapping[str, Any]:

@@ -72,7 +72,7 @@ def _written(made: PipelineType) -> Any:
     return _rebuilt, (made.recipe,)
 
 
-copyreg.pickle(PipelineType, _written)  # type: ignore[arg-type]
+copyreg.pickle(PipelineType, _written)
 
 
 def build_pipeline(

@@ -68,7 +68,6 @@ class Simulator(EquippedWorld):
             ``"world"`` with ``"ground"``, and ``"robots"`` and ``"objects"`` by name;
             ``"stepper"``; ``"motors"`` by joint; ``"sensors"`` by name.
         """
-        self.prepare()
         return {
             "world": plain.world_options(self.world),
             "stepper": {name: getattr(self, name) for name in _STEPPER},
@@ -88,7 +87,6 @@ class Simulator(EquippedWorld):
             ConfigError: A value cannot be.
         """
         self._check_stopped("set_options")
-        self.prepare()
         plain.check_known("", options, ("world", "stepper", "motors", "sensors"))
         world = plain.changed_world(self.world, options.get("world", {}))
         motors = {motor.joint: motor for motor in self.motors}
@@ -102,10 +100,10 @@ class Simulator(EquippedWorld):
         if world is not self.world:
             self.world, self._stale, self.stepper_state.dt = world, True, world.period
         if tuple(motors.values()) != self.motors:
-            self.motors = self._given_motors = tuple(motors.values())
+            self._motors = self._given_motors = tuple(motors.values())
             self._stale = True
         if tuple(sensors.values()) != self.sensors:
-            self.sensors = self._given_sensors = tuple(sensors.values())
+            self._sensors = self._given_sensors = tuple(sensors.values())
             self._stale = True
 
     def seed(self, seed: Any) -> None:

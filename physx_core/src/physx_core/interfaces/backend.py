@@ -12,7 +12,8 @@ from typing import Self
 
 import numpy as np
 
-from physx_core.errors import FeatureNotSupportedError
+from physx_core.interfaces.dynamics import Dynamics
+from physx_core.interfaces.features import FEATURES
 from physx_core.interfaces.layout import (
     CONTACT,
     RAY_HIT,
@@ -42,33 +43,6 @@ __all__ = [
     "Vector",
 ]
 
-FEATURES = {
-    "accelerations": "accelerations of the last step",
-    "actuators": "joint modes servo, velocity and position",
-    "armature": "JointSettings.armature",
-    "body_contacts": "contacts between things that both move",
-    "contacts": "contacts with what does not move",
-    "derivatives": "derivatives of the forward dynamics",
-    "exact_restore": "restore goes on bit for bit",
-    "forward_dynamics": "forward dynamics of any state",
-    "hooks": "functions called at physics steps",
-    "inverse_dynamics": "inverse dynamics of any state",
-    "isotropic_friction": "friction that is the same in all directions",
-    "jacobian": "Jacobians of links",
-    "joint_friction": "Coulomb friction in joints",
-    "joint_wrenches": "what joints carry, on the link behind: at its origin, along its axes",
-    "limits": "limits of joints' positions and velocities stop them",
-    "mass_matrix": "mass matrix of any state",
-    "mesh_contacts": "meshes as collision shapes",
-    "raycast": "rays",
-    "restitution": "things bounce",
-    "rk4": 'World(integrator="rk4")',
-    "self_collisions": "Robot(self_collisions=True)",
-    "springs": "springs and damping in joints",
-    "wrenches": "forces from outside",
-}
-"""Every feature that a simulation's `features` may name, and what it means."""
-
 
 class Backend(ABC):
     """A physics engine."""
@@ -91,7 +65,7 @@ class Backend(ABC):
         return ()
 
 
-class Simulation(ABC):
+class Simulation(Dynamics):
     """One running world. A context manager; after `close` every call raises `SimulationError`.
 
     A method whose feature is not in `features` raises `FeatureNotSupportedError`.
@@ -103,10 +77,7 @@ class Simulation(ABC):
         features: What this simulation can do: names of `FEATURES`.
     """
 
-    engine: str = ""
     period: float
-    layout: Layout
-    features: frozenset[str]
 
     @property
     @abstractmethod
@@ -137,11 +108,16 @@ class Simulation(ABC):
         """Hold these commands until they are changed; the joints' limits cut them.
 
         Args:
-            commands: Shape (joints,): torque, velocity or position, as each joint's mode says.
+            commands: Shape (joints,): torque, velocity or position, as each joint's mode says; it
+                is copied.
 
         Raises:
             SimulationError: The shape is wrong or a value is not finite.
         """
+
+    def commands(self) -> Vector:
+        """Return the held commands as the joints' limits cut them, shape (joints,)."""
+        return self.snapshot().commands
 
     @abstractmethod
     def step(self, n: int = 1) -> None:
@@ -256,7 +232,7 @@ class Simulation(ABC):
             positions: State to compute them for, shape (nq,); None: the present one.
 
         Returns:
-            In each row x, y, z in m and quaternion x, y, z, w.
+            In each row x, y, z in m and quaternion x, y, z, w, with w not negative.
 
         Raises:
             SimulationError: There is no body of that name.
@@ -284,87 +260,49 @@ class Simulation(ABC):
             SimulationError: There is no body of that name.
         """
 
-    # Dynamics of any state ------------------------------------------------------------------
+    def body_accelerations(self, names: Sequence[str] | None = None) -> Vector:
+        """Return the accelerations of links' and objects' origins, shape (names, 6).
 
-    @abstractmethod
-    def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
-        """Return the accelerations, shape (nv,), that torques (nv,) cause in a state.
-
-        Damping, springs and Coulomb friction of the joints act; contacts and limits do not. All
-        joints are driven by torques here, whatever their mode. Accelerations are derivatives of
-        the velocities, so a base's are in its own frame.
-        """
-
-    @abstractmethod
-    def inverse_dynamics(
-        self, positions: Vector, velocities: Vector, accelerations: Vector
-    ) -> Vector:
-        """Return the torques, shape (nv,), that cause accelerations (nv,) in a state."""
-
-    def mass_matrix(self, positions: Vector) -> Vector:
-        """Return the mass matrix, shape (nv, nv)."""
-        raise self._lacks("mass_matrix")
-
-    def jacobian(
-        self, body: str, positions: Vector, point: Sequence[float] = (0.0, 0.0, 0.0)
-    ) -> Vector:
-        """Return the Jacobian, shape (6, nv), of a point of a link or object.
-
-        Times the velocities it gives the point's linear velocity, then the body's angular velocity,
-        both along the world's axes.
+        Those of `accelerations`, in the present state: 0 before the first step, but for what the
+        motion itself makes of them.
 
         Args:
-            body: Name of the link or object.
-            positions: Shape (nq,).
-            point: In the body's frame, in m.
-        """
-        raise self._lacks("jacobian")
-
-    def forward_dynamics_derivatives(
-        self, positions: Vector, velocities: Vector, torques: Vector
-    ) -> tuple[Vector, Vector, Vector]:
-        """Return the derivatives of `forward_dynamics` by positions, velocities and torques.
+            names: Their names, static ones too; None: all of `layout.bodies`.
 
         Returns:
-            Three arrays of shape (nv, nv), rows are accelerations. Those by the positions are by a
-            small motion along each velocity, so a base has six columns, not seven. Coulomb friction
-            counts as constant.
-        """
-        raise self._lacks("derivatives")
+            In each row the linear acceleration in m/s², then the angular one in rad/s², both along
+            the world's axes.
 
-    def forward_dynamics_batch(
-        self, positions: Vector, velocities: Vector, torques: Vector
-    ) -> Vector:
-        """Return `forward_dynamics` of many states, shape (n, nv); each row is a state.
+        Raises:
+            SimulationError: There is no body of that name.
+        """
+        raise self._lacks("accelerations")
+
+    def body_motions(self, names: Sequence[str] | None = None) -> Vector:
+        """Return all of how links and objects move at present, shape (names, 19).
+
+        One call costs less than the three whose results it joins: a pose (7) as `body_poses` has
+        it, a velocity (6) as `body_velocities`, an acceleration (6) as `body_accelerations`.
+        """
+        found = self.body_poses(names), self.body_velocities(names), self.body_accelerations(names)
+        return np.concatenate(found, axis=1)
+
+    def reach(self, name: str, direction: Vector, positions: Vector | None = None) -> float:
+        """Return how far the collision shapes of a robot or object reach along a direction.
 
         Args:
-            positions: Shape (n, nq).
-            velocities: Shape (n, nv).
-            torques: Shape (n, nv).
-        """
-        states = zip(positions, velocities, torques, strict=True)
-        found = [self.forward_dynamics(*state) for state in states]
-        return np.array(found, np.float64).reshape(-1, self.layout.nv)
-
-    def forward_dynamics_derivatives_batch(
-        self, positions: Vector, velocities: Vector, torques: Vector
-    ) -> tuple[Vector, Vector]:
-        """Return accelerations of many states, and their derivatives.
-
-        Args:
-            positions: Shape (n, nq); each row is a state.
-            velocities: Shape (n, nv).
-            torques: Shape (n, nv).
+            name: Of the robot or object, as in `layout.parts`.
+            direction: Shape (3,), of length 1, in the world frame.
+            positions: State to compute it for, shape (nq,); None: the present one.
 
         Returns:
-            Accelerations, shape (n, nv), and the derivatives of `forward_dynamics_derivatives` by
-            positions, velocities and torques, shape (3, n, nv, nv).
+            The largest product of the direction with a point of the shapes, in m; -inf where
+            nothing of it can be touched.
+
+        Raises:
+            SimulationError: There is nothing of that name that moves.
         """
-        states = zip(positions, velocities, torques, strict=True)
-        found = [self.forward_dynamics_derivatives(*state) for state in states]
-        shape = (len(found), 3, self.layout.nv, self.layout.nv)
-        derivatives = np.array(found, np.float64).reshape(shape).swapaxes(0, 1)
-        return self.forward_dynamics_batch(positions, velocities, torques), derivatives
+        raise self._lacks("contacts")
 
     # ----------------------------------------------------------------------------------------
 
@@ -384,9 +322,6 @@ class Simulation(ABC):
     ) -> None:
         """Close the simulation."""
         self.close()
-
-    def _lacks(self, feature: str) -> FeatureNotSupportedError:
-        return FeatureNotSupportedError(self.engine or type(self).__name__, feature, self.features)
 
 
 Hook = Callable[[Simulation], None]

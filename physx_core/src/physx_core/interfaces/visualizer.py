@@ -72,3 +72,7 @@ class Observer:
 
 class Visualizer(Observer):
     """An observer that draws what the environments' factories emit."""
+
+    def capture(self) -> Array | None:
+        """Return a picture of what it shows, shape (height, width, 3), uint8; None: it makes none."""
+        return None

@@ -71,10 +71,8 @@ class Motor:
         where = f'Motor of "{self.joint}": '
         if not isinstance(self.joint, str):
             raise ConfigError(f"{where}joint must be a name.")
-        for option in ("max_torque", "max_velocity", "slope"):
-            _positive_or_inf(where + option, getattr(self, option))
-        for option in ("inertia", "damping", "backlash"):
-            numbers.not_negative(where + option, getattr(self, option))
+        numbers.options(_positive_or_inf, where, self, "max_torque", "max_velocity", "slope")
+        numbers.options(numbers.not_negative, where, self, "inertia", "damping", "backlash")
         for option in ("viscous", "dry"):
             object.__setattr__(self, option, _both_ways(where + option, getattr(self, option)))
         numbers.positive(f"{where}dry_velocity", self.dry_velocity)
@@ -134,9 +132,8 @@ def _robot_of(world: World, joint: str) -> tuple[int, str]:
     )
 
 
-def _positive_or_inf(option: str, value: Any) -> None:
-    if value != math.inf:
-        numbers.positive(option, value)
+def _positive_or_inf(option: str, value: Any) -> float:
+    return math.inf if value == math.inf else numbers.positive(option, value)
 
 
 def _both_ways(option: str, value: Any) -> tuple[float, float]:

@@ -9,9 +9,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from physx_core.devices import check_unique, finite_vector, places_of, steps_of
+from physx_core.devices import as_slice, check_unique, places_of, steps_of
 from physx_core.errors import ConfigError, FeatureNotSupportedError, SimulationError
 from physx_core.interfaces.backend import Simulation, Vector
+from physx_core.interfaces.vectors import overwrite
 from physx_core.motors.description import Motor, armature_in
 from physx_core.motors.shaft import Friction, Rotors, TorqueLimits, column
 from physx_core.world import World
@@ -46,13 +47,14 @@ class Motors:
     As a hook of the simulation they run by themselves, and command all of its joints from then on::
 
         motors = Motors(simulation, world, [Motor(joint="knee", max_torque=30.0)])
-        simulation.add_hook(motors)
+        motors.attach(simulation)
         motors.set_commands([12.0])
         simulation.step(10)
 
-    Or call them before each single `step`. They keep no reference to the simulation and can be
-    pickled. After `Simulation.set_state` call `reset`, and beside its `snapshot` and `restore`
-    their own, so that rotors behind elastic gears stay with their joints.
+    Or call them before each single `step`. Attached motors without friction and with rigid gears
+    run at their periods only, and cost nothing at the steps between. Motors keep no reference to
+    the simulation and can be pickled. After `Simulation.set_state` call `reset`, and beside its
+    `snapshot` and `restore` their own, so that rotors behind elastic gears stay with their joints.
 
     Attributes:
         motors: The motors, in the order of the commands.
@@ -96,10 +98,13 @@ class Motors:
         if elastic:
             self._rotors = Rotors(elastic, period, self._joint_limit[self._elastic])
         self._reads = self._friction.acts or self._rotors is not None
+        self._geared = bool((self._reduction != 1).any()) or self._rotors is not None
+        self._limited = bool(np.isfinite(self._joint_limit).any())
+        self._hook_every = 1 if self._reads else int(np.gcd.reduce(self._every))
         self._commands, self._drives = np.zeros(len(motors)), np.zeros(len(motors))
-        self._torques, self._fresh = np.zeros(len(motors)), True
-        self._whole = simulation.snapshot().commands
-        self._whole[self._places] = 0.0
+        self._torques, self._nothing = np.zeros(len(motors)), np.zeros(0)
+        self._fresh = True
+        self._sent, self._span = simulation.commands(), as_slice(self._places)
         self.reset(simulation)
 
     def _check(self, simulation: Simulation, world: World) -> None:
@@ -136,7 +141,7 @@ class Motors:
         Raises:
             SimulationError: The shape is wrong or a value is not finite.
         """
-        self._commands = finite_vector("commands", commands, len(self.motors))
+        overwrite("commands", self._commands, commands)
 
     def set_others(self, commands: ArrayLike) -> None:
         """Hold commands of the joints without motors, until then those when these were made.
@@ -147,9 +152,8 @@ class Motors:
         Raises:
             SimulationError: The shape is wrong or a value is not finite.
         """
-        whole = finite_vector("commands", commands, len(self._whole))
-        whole[self._places] = 0.0
-        self._whole = whole
+        overwrite("commands", self._sent, commands)
+        self._sent[self._span] = self._torques
 
     @property
     def commands(self) -> Vector:
@@ -161,6 +165,13 @@ class Motors:
         """Torques on the joints in the last step, shape (motors,), in N m or N; a copy."""
         return self._torques.copy()
 
+    @property
+    def torques_view(self) -> Vector:
+        """The same as `torques`, without a copy: read-only, the same memory for life."""
+        found = self._torques.view()
+        found.flags.writeable = False
+        return found
+
     # Running --------------------------------------------------------------------------------
 
     def __call__(self, simulation: Simulation) -> None:
@@ -168,7 +179,7 @@ class Motors:
         due = self._due(simulation.frame)
         if due is False and not self._reads:
             return
-        velocities = joint_velocities = np.zeros(0)
+        velocities = joint_velocities = self._nothing
         if self._reads or self._limits.needs_velocity:
             joint_velocities = simulation.velocities()[self._v]
             velocities = joint_velocities * self._reduction
@@ -177,21 +188,26 @@ class Motors:
             velocities[elastic] = self._rotors.velocities * self._reduction[elastic]
         if due is not False:
             drives = self._limits.cut(self._commands, velocities)
-            self._drives = drives if due is True else np.where(due, drives, self._drives)
-        shafts = self._drives
+            np.copyto(self._drives, drives, where=due)
+        torques = self._drives
         if self._friction.acts:
-            shafts = shafts - self._friction.torques(velocities)
-        torques = shafts * self._reduction
+            torques = torques - self._friction.torques(velocities)
+        if self._geared:
+            torques = torques * self._reduction
         if self._rotors is not None:
             positions = simulation.positions()[self._q[self._elastic]]
             torques[self._elastic] = self._rotors.step(
                 torques[self._elastic], positions, joint_velocities[self._elastic]
             )
-        limit = self._joint_limit  # that of elastic gears has acted on the rotors already
-        self._torques = np.minimum(np.maximum(torques, -limit), limit)
-        whole = self._whole.copy()
-        whole[self._places] = self._torques
-        simulation.set_commands(whole)
+        self._send(simulation, torques)
+
+    def _send(self, simulation: Simulation, torques: Vector) -> None:
+        """Cut torques at the joints' limits, and command them and the joints without motors."""
+        if self._limited:  # those of elastic gears have acted on the rotors already
+            torques = np.minimum(np.maximum(torques, -self._joint_limit), self._joint_limit)
+        self._torques[:] = torques
+        self._sent[self._span] = torques
+        simulation.set_commands(self._sent)
 
     def _due(self, frame: int) -> Vector | bool:
         """Return which motors take over their commands at a frame."""
@@ -207,8 +223,8 @@ class Motors:
 
     def reset(self, simulation: Simulation) -> None:
         """Begin anew from the simulation's present state: commands are 0, rotors in mid gear."""
-        self.set_commands(np.zeros(len(self.motors)))
-        self._drives, self._torques = np.zeros(len(self.motors)), np.zeros(len(self.motors))
+        self._commands[:] = self._drives[:] = 0.0
+        self._send(simulation, self._drives)
         self._fresh = True
         if self._rotors is not None:
             self._rotors.positions = simulation.positions()[self._q[self._elastic]]
@@ -216,11 +232,12 @@ class Motors:
 
     def snapshot(self) -> MotorState:
         """Return everything that `restore` needs to go on exactly from here."""
-        rotors, none = self._rotors, np.zeros(0)
+        rotors, none, others = self._rotors, np.zeros(0), self._sent.copy()
+        others[self._span] = 0.0
         return MotorState(
             self._commands.copy(),
             self._drives.copy(),
-            self._whole.copy(),
+            others,
             self._torques.copy(),
             none if rotors is None else rotors.positions.copy(),
             none if rotors is None else rotors.velocities.copy(),
@@ -238,14 +255,15 @@ class Motors:
             given: Any = getattr(state, name, None)
             if type(given) is not type(value) or np.shape(given) != np.shape(value):
                 raise SimulationError(f"The snapshot is not of these motors: {name} differs.")
-        self._commands, self._whole = state.commands.copy(), state.others.copy()
-        self._drives, self._torques = state.drives.copy(), state.torques.copy()
+        self._commands[:], self._drives[:] = state.commands, state.drives
+        self._torques[:], self._sent[:] = state.torques, state.others
+        self._sent[self._span] = self._torques
         self._fresh = state.fresh
         if self._rotors is not None:
             self._rotors.positions = state.rotor_positions.copy()
             self._rotors.velocities = state.rotor_velocities.copy()
 
     def attach(self, simulation: Simulation) -> Self:
-        """Run before each physics step of a simulation from now on; return these motors."""
-        simulation.add_hook(self)
+        """Run before a simulation's physics steps from now on; return these motors."""
+        simulation.add_hook(self, self._hook_every)
         return self

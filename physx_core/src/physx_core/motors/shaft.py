@@ -30,9 +30,12 @@ class TorqueLimits:
         self._fastest = column(motors, "max_velocity")
         self._slope = np.minimum(column(motors, "slope"), _SUDDEN)
         self.needs_velocity = bool(np.isfinite(self._fastest).any())
+        self._acts = self.needs_velocity or bool(np.isfinite(self._most).any())
 
     def cut(self, commands: Vector, velocities: Vector) -> Vector:
         """Return the torques of commands, shape (motors,), at the shafts' velocities."""
+        if not self._acts:
+            return commands
         if not self.needs_velocity:
             return np.minimum(np.maximum(commands, -self._most), self._most)
         forward = self._left(self._fastest - velocities)

@@ -40,9 +40,10 @@ class ProgressBar(Observer):
             self._bar.update(count)
 
     def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
-        """Show the numbers of an epoch behind the bar."""
+        """Show the numbers of an epoch behind the bar, but for those of several epochs."""
         if self._bar is not None and timeline == "epoch":
-            self._bar.set_postfix_str(", ".join(f"{k} {v:.3g}" for k, v in values.items()), False)
+            shown = {k: v for k, v in values.items() if not k.endswith(("_mean", "_variance"))}
+            self._bar.set_postfix_str(", ".join(f"{k} {v:.3g}" for k, v in shown.items()), False)
 
     def note(self, text: str) -> None:
         """Print the text above the bar."""

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from typing import ClassVar
 
-from physx_core.config import MODES, DatasetConfig, EnvironmentConfig, at_least, options
+from physx_core.config import MODES, WRONG, DatasetConfig, EnvironmentConfig, at_least, options
 from physx_core.dataset import Dataset
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, listed
 from physx_core.fields import Batch
 from physx_core.pipelines.description import describe_dataset, describe_environment_config
 from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
@@ -120,6 +120,11 @@ class DataGeneration(Pipeline):
             raise ConfigError(
                 "DataGeneration makes new samples, so it takes no load_samples: that works in "
                 "Training, Prediction and Replay."
+            )
+        if self._mode == WRONG:
+            raise ConfigError(
+                'The mode "wrong" is that of samples which check_sample refused. Make samples for '
+                f"{listed(MODES)}, with record_wrong_samples=True to keep those that are refused."
             )
         seed = chosen_seed(config.seed)
         self.session = Session.create(self.session_dir, self.session_name, self.new_session)

@@ -152,6 +152,7 @@ class Pipeline(ABC):
         total: int | None = None,
         in_process: bool = False,
         replayed: Path | None = None,
+        accept_all: bool = False,
     ) -> Source:
         """Open the environments, in this process or in clients.
 
@@ -164,19 +165,22 @@ class Pipeline(ABC):
             in_process: Whether they must run in this process.
             replayed: Folder of the dataset whose samples they replay; what its environments saved
                 can be loaded. None: they make new samples.
+            accept_all: Whether samples that `check_sample` refuses count like the others.
         """
         services = RunServices(self.session.dataset_dir, self.observers, predict, replayed)
         source: Source
         if in_process or not config.as_tcp_ip_client:
             from physx_core.sources.local import LocalSource
 
-            source = LocalSource(config, services, seed)
+            source = LocalSource(config, services, seed, accept_all=accept_all)
         else:
             from physx_core.sources.clients import ClientSource
 
             # A network that learns changes its answers; a row to replay is sent when it is due.
             ahead = None if predict is None and replayed is None else 0
-            source = ClientSource(config, services, seed, run_ahead=ahead, total=total)
+            source = ClientSource(
+                config, services, seed, run_ahead=ahead, total=total, accept_all=accept_all
+            )
         return resources.enter_context(source)
 
     def _record_config(self, seed: int) -> None:

@@ -27,7 +27,9 @@ class Replay(Pipeline):
 
     The samples of ``dataset_config.existing_dir``, mode ``dataset_config.mode``, come in the order
     of writing; the environments find them in `Environment.sample`, as in a `Prediction` with
-    ``load_samples``. The dataset is only read; the session keeps what the visualizer records.
+    ``load_samples``. What `Environment.check_sample` says of them does not count, so that those of
+    the mode "wrong" can be looked at too. The dataset is only read; the session keeps what the
+    visualizer records.
 
     Attributes:
         source: The environments.
@@ -121,6 +123,7 @@ class Replay(Pipeline):
             stream_seed(seed, "prediction", 0),
             in_process=environment.num_clients == 1,
             replayed=dataset.directory,
+            accept_all=True,
         )
 
 

@@ -8,15 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from physx_core.config import DatasetConfig, EnvironmentConfig, to_plain
+from physx_core.config import WRONG, DatasetConfig, EnvironmentConfig, to_plain
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DatasetNotFoundError, UsageError, WrongSamplesError
 from physx_core.plugins import reference_of
 from physx_core.session import Session, installed_versions
 from physx_core.sources.source import Source
 
-WRONG = "wrong"
-"""Mode of the samples that `check_sample` refused."""
 PARAMETERS = "parameters_{}.bin"
 """Name of the file beside a dataset that holds what an instance saved."""
 
@@ -64,6 +62,11 @@ def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) 
     """
     if environment is None:
         return
+    if config.mode == WRONG:
+        raise ConfigError(
+            'The mode "wrong" holds samples that check_sample refused: environments neither make '
+            "them nor replay them for a training. To look at them: physx replay."
+        )
     if environment.load_samples and environment.always_produce:
         raise ConfigError(
             "load_samples replays stored samples and always_produce makes new ones: choose one. "
@@ -74,6 +77,30 @@ def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) 
             "A training takes its samples from existing_dir or from an environment, not both. To "
             "send the stored samples through the environment, set load_samples=True."
         )
+
+
+def refuse_environments(environment: EnvironmentConfig) -> None:
+    """Tell why environments cannot take part in a training of several processes.
+
+    Raises:
+        ConfigError: Always, with the way to the same training.
+    """
+    replays = environment.load_samples
+    if environment.always_produce or (replays and not environment.only_first_epoch):
+        advice = (
+            "take part in every epoch. Leave out always_produce and only_first_epoch=False, or "
+            "train in one process."
+        )
+    else:
+        what = "send the stored samples through them" if replays else "let them make the samples"
+        advice = (
+            f"take part in the first epoch. First {what} in one process, with epoch_nb=1; then "
+            "several go on with resume=True (physx train --resume)."
+        )
+    raise ConfigError(
+        "Several processes train on stored samples only, each on its share, but environments "
+        f"shall {advice}"
+    )
 
 
 def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:

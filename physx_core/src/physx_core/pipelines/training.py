@@ -12,7 +12,6 @@ from physx_core import checkpoint
 from physx_core.checkpoint import Progress
 from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, at_least, options
 from physx_core.dataset import Dataset
-from physx_core.errors import ConfigError
 from physx_core.fields import Batch
 from physx_core.interfaces.group import Group
 from physx_core.interfaces.network import Network
@@ -28,6 +27,7 @@ from physx_core.pipelines.storage import (
     describe_environment,
     open_existing,
     open_own,
+    refuse_environments,
 )
 from physx_core.pipelines.training_data import TrainingData
 from physx_core.pipelines.training_record import BestEpoch, TrainingRecord
@@ -55,7 +55,8 @@ class Training(Pipeline):
 
     Several processes that ``torchrun`` starts train one network together on stored samples: each
     learns from its share of every batch, which is ``batch_size`` times the number of processes, and
-    the first one writes the session.
+    the first one writes the session. Where environments make or replay the samples of the first
+    epoch, one process trains that, and several go on with ``resume``.
 
     Attributes:
         group: The processes that train together.
@@ -200,9 +201,8 @@ class Training(Pipeline):
 
     def epoch_end(self) -> None:
         """Validate, record the epoch's losses, and keep a checkpoint if that is wanted."""
-        means = self._record.take_means()
-        self.training_loss = means.get("loss", float("nan"))
-        values = {f"{name}/training": value for name, value in means.items()}
+        values = self._record.take_epoch()
+        self.training_loss = values.get("loss/training", float("nan"))
         if self.learner.learning_rate is not None:
             values["learning_rate"] = self.learner.learning_rate
         every, judged = self.validation_every, self.training_loss
@@ -331,10 +331,7 @@ class Training(Pipeline):
         self.group = join(config.device)
         self._leads = self.group.leads
         if self.group.size > 1 and self.environment_config is not None and not self.resume:
-            raise ConfigError(
-                "Several processes train on stored samples only, each on its share: make the "
-                "samples with physx generate first, and leave the environment out."
-            )
+            refuse_environments(self.environment_config)
 
     def _begin_with(self, last: checkpoint.Checkpoint | None) -> None:
         """Begin at the first epoch, or where a checkpoint was written."""

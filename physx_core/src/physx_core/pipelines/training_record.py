@@ -4,26 +4,32 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 RECENT = 50
-"""Number of batches that the running mean and variance are of."""
+"""Number of batches, or of epochs, that the running mean and variance are of."""
 
 
 class TrainingRecord:
-    """Sums over the present epoch, and the losses of the last batches."""
+    """Sums over the present epoch, and the losses of the last batches and epochs."""
 
     def __init__(self, state: Mapping[str, Any]) -> None:
         """Begin, or go on where `state` was taken; it is empty at the begin."""
         self._count: int = state.get("count", 0)
         self._sums: dict[str, float] = dict(state.get("sums", {}))
         self._recent = deque[float](state.get("recent", ()), RECENT)
+        self._epochs = deque[float](state.get("epochs", ()), RECENT)
 
     @property
     def state(self) -> dict[str, Any]:
         """All that a resumed training needs, as plain data."""
-        return {"count": self._count, "sums": dict(self._sums), "recent": list(self._recent)}
+        return {
+            "count": self._count,
+            "sums": dict(self._sums),
+            "recent": list(self._recent),
+            "epochs": list(self._epochs),
+        }
 
     def add(self, losses: Mapping[str, float]) -> dict[str, float]:
         """Count a batch and return its numbers, to be recorded.
@@ -39,19 +45,32 @@ class TrainingRecord:
             values[f"{name}/batch"] = number = float(value)
             sums[name] = sums.get(name, 0.0) + number
         self._count += 1
-        recent = self._recent
-        recent.append(values["loss/batch"])
-        size = len(recent)
-        mean = values["loss/mean"] = sum(recent) / size
-        squares = sum([(loss - mean) * (loss - mean) for loss in recent])
-        values["loss/variance"] = squares / (size - 1) if size > 1 else 0.0
+        self._recent.append(values["loss/batch"])
+        values["loss/mean"], values["loss/variance"] = _spread(self._recent)
         return values
 
-    def take_means(self) -> dict[str, float]:
-        """Return the means over the epoch's batches by name, and begin a new epoch."""
-        means = {name: total / self._count for name, total in self._sums.items()}
+    def take_epoch(self) -> dict[str, float]:
+        """Return the numbers of the epoch, to be recorded, and begin a new one.
+
+        These are ``<name>/training`` for each entry, its mean over the batches, and mean and sample
+        variance of the loss over the last `RECENT` epochs, ``loss/training_mean`` and
+        ``loss/training_variance``. Empty where there was no batch.
+        """
+        if not self._count:
+            return {}
+        values = {f"{name}/training": total / self._count for name, total in self._sums.items()}
         self._count, self._sums = 0, {}
-        return means
+        self._epochs.append(values["loss/training"])
+        values["loss/training_mean"], values["loss/training_variance"] = _spread(self._epochs)
+        return values
+
+
+def _spread(recent: Collection[float]) -> tuple[float, float]:
+    """Return mean and sample variance, 0 for a single value."""
+    size = len(recent)
+    mean = sum(recent) / size
+    squares = sum([(value - mean) * (value - mean) for value in recent])
+    return mean, squares / (size - 1) if size > 1 else 0.0
 
 
 class BestEpoch:

@@ -76,14 +76,27 @@ def located(kind: str, reference: Any) -> str:
         return text
 
 
+def imported(kind: str, reference: str) -> Any:
+    """Return what ``"package.module:Class"`` or ``"script.py:Class"`` names.
+
+    Args:
+        kind: What it is, for errors.
+        reference: Where it is.
+
+    Raises:
+        ComponentNotFoundError: The module or script has nothing of that name.
+    """
+    place, _, name = reference.rpartition(":")
+    return _attribute(kind, _module(kind, place), name, place)
+
+
 def _find(kind: str, reference: Any) -> Any:
     if not isinstance(reference, str):
         if isinstance(reference, type):
             return reference
         raise ReferenceFormError(f"{reference!r} is neither a class nor the name of one.")
     if ":" in reference:
-        place, _, name = reference.rpartition(":")
-        return _attribute(kind, _module(kind, place), name, place)
+        return imported(kind, reference)
     plugin_name, _, name = reference.partition("/")
     if not plugin_name:
         raise ReferenceFormError(

@@ -67,8 +67,7 @@ class Sensor:
         where = f'{kind} "{self.name}": '
         if self.period is not None:
             numbers.positive(f"{where}period", self.period)
-        for option in ("delay", "jitter"):
-            numbers.not_negative(where + option, getattr(self, option))
+        numbers.options(numbers.not_negative, where, self, "delay", "jitter")
         if self.interpolation not in (0, 1):
             raise ConfigError(f"{where}interpolation is {self.interpolation!r}, not 0 or 1.")
         for option in ("noise", "bias", "bias_deviation", "random_walk"):

@@ -14,8 +14,8 @@ from physx_core.devices import check_unique, steps_of
 from physx_core.errors import ComponentNotFoundError, ConfigError, SimulationError
 from physx_core.interfaces.backend import Simulation, Vector
 from physx_core.sensors.description import Sensor
+from physx_core.sensors.groups import groups_of
 from physx_core.sensors.imperfections import Delays, Errors, Mask, Places
-from physx_core.sensors.truth import Truth, truth_of
 from physx_core.world import World
 
 
@@ -60,8 +60,12 @@ class Sensors:
     multiples of their periods. They keep no reference to the simulation and can be pickled. After
     `Simulation.set_state` call `reset`, and beside its `snapshot` and `restore` their own.
 
+    `view` and `block` are the measurements without copies, in memory that stays for life. Sensors
+    without noise, bias and delay cost the least.
+
     Attributes:
-        sensors: The sensors, in the order of the values.
+        sensors: The sensors, in the order of the values: those of one kind stand together, kinds
+            and those of one kind as they were given.
         dtype: Record of all values: a record for each sensor, by its name, and in it its
             quantities by theirs. All are float64, without gaps.
         size: Number of values of all sensors.
@@ -88,6 +92,8 @@ class Sensors:
                 joint's torque is not known, or `rng` is missing.
             FeatureNotSupportedError: The engine lacks what a sensor needs.
         """
+        kinds = list(dict.fromkeys(type(sensor) for sensor in sensors))
+        sensors = sorted(sensors, key=lambda sensor: kinds.index(type(sensor)))
         self.sensors = tuple(sensors)
         check_unique("sensor", [sensor.name for sensor in sensors])
         every = [
@@ -99,7 +105,7 @@ class Sensors:
         self._places = Places(sensors)
         self.size = self._places.components
         self.dtype = np.dtype([(each.name, _record(each)) for each in sensors])
-        self._truths = self._group(simulation, world)
+        self._groups = groups_of(sensors, every, simulation, world)
         periods = self._every * simulation.period
         self._delays = Delays(sensors, self._places, periods)
         self._errors = Errors(sensors, self._places, periods)
@@ -109,22 +115,24 @@ class Sensors:
                 "Sensors(..., rng=np.random.default_rng(seed))."
             )
         self._rng, self._frame = rng, -1
-        self._values = self._truth = np.full(self.size, np.nan)
+        self._exact = not (self._delays.acts or self._errors.acts)
+        self._truth = np.full(self.size, np.nan)
+        self._values = self._truth if self._exact else self._truth.copy()
+        self._arrange()
         self._errors.begin(rng)
 
-    def _group(
-        self, simulation: Simulation, world: World
-    ) -> list[tuple[Truth, NDArray[np.intp], NDArray[np.intp]]]:
-        """Return for each kind its truth, its components (sensors, width), and its sensors."""
-        kinds: dict[type[Sensor], list[int]] = {}
-        for place, sensor in enumerate(self.sensors):
-            kinds.setdefault(type(sensor), []).append(place)
-        found = []
-        for kind, members in kinds.items():
-            truth = truth_of(kind, [self.sensors[i] for i in members], simulation, world)
-            components = [np.flatnonzero(self._places.owners == i) for i in members]
-            found.append((truth, np.array(components), np.array(members)))
-        return found
+    def _arrange(self) -> None:
+        """Find the kinds' places in the vectors again; they are not pickled."""
+        self._blocks = [(group, group.block(self._truth)) for group in self._groups]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: all but views of it."""
+        return {name: value for name, value in vars(self).items() if name != "_blocks"}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        """Take over what was pickled."""
+        vars(self).update(state)
+        self._arrange()
 
     # Measuring ------------------------------------------------------------------------------
 
@@ -133,26 +141,32 @@ class Sensors:
         frame = simulation.frame
         if frame == self._frame:
             return
-        if self._frame < 0:
-            due: Mask = np.ones(len(self.sensors), np.bool_)
-        else:
-            due = frame % self._every == 0
-            if not due.any():
-                return
-        self._frame = frame
-        truth = self._truth.copy()
-        for kind, components, members in self._truths:
-            if due[members].any():
-                truth[components] = kind.measure(simulation)
-        seen = self._delays.delayed(truth, due, self._rng) if self._delays.acts else truth
+        first = self._frame < 0
+        if not first and frame % self._hook_every:
+            return
+        if not self._exact:
+            self._measure(simulation, frame, first)
+            return
+        for group, block in self._blocks:
+            if group.measure(simulation, block, frame, first):
+                self._frame = frame
+
+    def _measure(self, simulation: Simulation, frame: int, first: bool) -> None:
+        """Measure what is due, with errors."""
+        due: Mask = np.full(len(self.sensors), first) | (frame % self._every == 0)
+        if not due.any():
+            return
+        for group, block in self._blocks:
+            group.measure(simulation, block, frame, first)
+        self._frame, seen = frame, self._truth
+        if self._delays.acts:
+            seen = self._delays.delayed(seen, due, self._rng)
         if self._errors.acts:
             seen = self._errors.added(seen, due, self._rng)
         if due.all():
-            self._values, self._truth = seen, truth
-            return
-        mine = due[self._places.owners]
-        self._values = np.where(mine, seen, self._values)
-        self._truth = np.where(mine, truth, self._truth)
+            self._values[:] = seen
+        else:
+            np.copyto(self._values, seen, where=due[self._places.owners])
 
     __call__ = update
 
@@ -162,6 +176,27 @@ class Sensors:
         return self
 
     # Reading --------------------------------------------------------------------------------
+
+    @property
+    def view(self) -> Vector:
+        """What is measured, shape (size,): read-only, the same memory for life; NaN at first."""
+        return _read_only(self._values)
+
+    def block(self, kind: type[Sensor]) -> Vector:
+        """Return what sensors of one kind measure, shape (sensors, components).
+
+        It is a part of `view`: read-only, the same memory for life; NaN at first. Rows are in the
+        order of `sensors`.
+
+        Raises:
+            ComponentNotFoundError: There is no sensor of that kind.
+        """
+        for group in self._groups:
+            if group.kind is kind:
+                return _read_only(group.block(self._values))
+        known = [group.kind.__name__ for group in self._groups]
+        name = getattr(kind, "__name__", str(kind))
+        raise ComponentNotFoundError("kind of sensor", name, "The set", known)
 
     @property
     def values(self) -> Vector:
@@ -217,7 +252,7 @@ class Sensors:
         """
         if rng is not None:
             self._rng = rng
-        self._values = self._truth = np.full(self.size, np.nan)
+        self._values[:] = self._truth[:] = np.nan
         self._frame = -1
         self._delays.clear()
         self._errors.begin(self._rng)
@@ -247,12 +282,18 @@ class Sensors:
             fits = np.shape(given) == np.shape(own) if isinstance(own, np.ndarray) else True
             if not fits or (given is None) != (own is None):
                 raise SimulationError(f"The snapshot is not of these sensors: {name} differs.")
-        self._values, self._truth = state.values.copy(), state.truth.copy()
+        self._truth[:], self._values[:] = state.truth, state.values
         self._delays.past, self._delays.counts = state.past.copy(), state.counts.copy()
         self._errors.bias, self._errors.walk = state.bias.copy(), state.walk.copy()
         self._frame = state.frame
         if self._rng is not None and state.rng is not None:
             self._rng.bit_generator.state = copy.deepcopy(dict(state.rng))
+
+
+def _read_only(values: Vector) -> Vector:
+    found = values.view()
+    found.flags.writeable = False
+    return found
 
 
 def _record(sensor: Sensor) -> np.dtype[np.void]:

@@ -1,7 +1,7 @@
 """What sensors would measure if they were perfect: one class for each kind, for all of its kind.
 
-Each returns its sensors' components, shape (sensors, width), from nothing but the contract of
-`Simulation`, so that they are the same on every engine.
+Each writes its sensors' components from nothing but the contract of `Simulation`, so that they are
+the same on every engine.
 """
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from physx_core.devices import places_of
+from physx_core.devices import as_slice, places_of
 from physx_core.errors import ConfigError, FeatureNotSupportedError
-from physx_core.interfaces.backend import Layout, Simulation, Vector
-from physx_core.sensors.attitudes import cross, from_rotation_vectors, product, turned, turned_back
+from physx_core.interfaces.backend import Simulation, Vector
 from physx_core.sensors.description import (
     ContactSensor,
     EffortSensor,
@@ -24,16 +23,17 @@ from physx_core.sensors.description import (
     Sensor,
 )
 from physx_core.world import World
+from physx_core.world.rotations import cross, product, turned, turned_back
 
-_STRIDE = 6e-6
-"""Share of the motion of 1 s over which velocities are differentiated: third root of epsilon."""
+_AHEAD = (0.0, 0.0, 0.0, 1.0)
+"""Quaternion of no rotation."""
 
 
 class Truth(Protocol):
     """Measures all sensors of one kind without errors."""
 
-    def measure(self, simulation: Simulation) -> Vector:
-        """Return the components, shape (sensors, width)."""
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write the components to `out`, shape (sensors, width)."""
 
 
 class EncoderTruth:
@@ -41,16 +41,17 @@ class EncoderTruth:
 
     def __init__(self, sensors: Sequence[Encoder], simulation: Simulation) -> None:
         joints = [sensor.joint for sensor in sensors]
-        self._q = places_of("joint", joints, simulation.layout.position_index)
-        self._v = places_of("joint", joints, simulation.layout.velocity_index)
-        self._reduction = np.array([sensor.reduction for sensor in sensors])
+        self._q = as_slice(places_of("joint", joints, simulation.layout.position_index))
+        self._v = as_slice(places_of("joint", joints, simulation.layout.velocity_index))
+        reduction = np.array([sensor.reduction for sensor in sensors])[:, None]
+        self._reduction = None if (reduction == 1).all() else reduction
 
-    def measure(self, simulation: Simulation) -> Vector:
-        """Return position and velocity."""
-        found = np.empty((len(self._q), 2))
-        found[:, 0] = simulation.positions()[self._q] * self._reduction
-        found[:, 1] = simulation.velocities()[self._v] * self._reduction
-        return found
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write position and velocity."""
+        out[:, 0] = simulation.positions()[self._q]
+        out[:, 1] = simulation.velocities()[self._v]
+        if self._reduction is not None:
+            out *= self._reduction
 
 
 class ImuTruth:
@@ -58,86 +59,38 @@ class ImuTruth:
 
     def __init__(self, sensors: Sequence[Imu], simulation: Simulation, world: World) -> None:
         _needs("accelerations", simulation, "An Imu")
-        layout = simulation.layout
-        names = [sensor.body for sensor in sensors]
-        places = places_of("body", names, layout.names)
-        bases = {part.bodies.start: part for part in layout.parts.values() if part.floating}
-        self._on_base = np.array([place in bases for place in places.tolist()])
-        mine = [bases[place] for place in places[self._on_base].tolist()]
-        self._attitudes = np.array([part.positions.start for part in mine], np.intp)[:, None]
-        self._attitudes = self._attitudes + np.arange(3, 7)
-        self._twists = np.array([part.velocities.start for part in mine], np.intp)[:, None]
-        self._bodies = [name for name, base in zip(names, self._on_base, strict=True) if not base]
-        self._position = np.array([sensor.position for sensor in sensors])
-        self._rotation = np.array([sensor.rotation for sensor in sensors])
-        self._gravity = np.array(world.gravity)
+        self._bodies = [sensor.body for sensor in sensors]
+        places_of("body", self._bodies, simulation.layout.names)
+        self._arms = [_unless(sensor.position, (0.0, 0.0, 0.0)) for sensor in sensors]
+        self._rotations = [_unless(sensor.rotation, _AHEAD) for sensor in sensors]
+        self._gravity = tuple(float(part) for part in world.gravity)
 
-    def measure(self, simulation: Simulation) -> Vector:
-        """Return orientation, angular velocity and acceleration."""
-        q, v, a = simulation.positions(), simulation.velocities(), simulation.accelerations()
-        bodies = np.empty((len(self._position), 13))
-        if len(self._twists):
-            bodies[self._on_base] = self._of_bases(q, v, a)
-        if self._bodies:
-            bodies[~self._on_base] = self._of_others(simulation, q, v, a)
-        attitude, spin, linear, angular = np.split(bodies, (4, 7, 10), axis=1)
-        arm = turned(attitude, self._position)
-        linear = linear + cross(angular, arm) + cross(spin, cross(spin, arm))
-        attitude = product(attitude, self._rotation)
-        return np.concatenate(
-            [attitude, turned_back(attitude, spin), turned_back(attitude, linear - self._gravity)],
-            axis=1,
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write orientation, angular velocity and acceleration."""
+        motions = simulation.body_motions(self._bodies).tolist()
+        for row, motion in enumerate(motions):
+            out[row] = self._measured(motion, self._arms[row], self._rotations[row])
+
+    def _measured(
+        self, motion: list[float], arm: Sequence[float] | None, rotation: Sequence[float] | None
+    ) -> tuple[float, ...]:
+        """Return the components of one sensor from a row of `Simulation.body_motions`."""
+        attitude: Sequence[float] = motion[3:7]
+        p, q, r, x, y, z, a, b, c = motion[10:]
+        if arm is not None:
+            i, j, k = turned(attitude, *arm)
+            s, t, u = cross(p, q, r, i, j, k)
+            s, t, u = cross(p, q, r, s, t, u)
+            i, j, k = cross(a, b, c, i, j, k)
+            x, y, z = x + i + s, y + j + t, z + k + u
+        if rotation is not None:
+            attitude = product(attitude, rotation)
+        i, j, k = self._gravity
+        return (
+            *attitude,
+            *turned_back(attitude, p, q, r),
+            *turned_back(attitude, x - i, y - j, z - k),
         )
-
-    def _of_bases(self, q: Vector, v: Vector, a: Vector) -> Vector:
-        """Return how floating bases move, which their twists say: shape (bases, 13).
-
-        In each row quaternion, angular velocity, linear and angular acceleration.
-        """
-        attitude = q[self._attitudes]
-        along, about = self._twists + np.arange(3), self._twists + np.arange(3, 6)
-        spin = v[about]
-        linear = a[along] + cross(spin, v[along])
-        moves = [turned(attitude, each) for each in (spin, linear, a[about])]
-        return np.concatenate([attitude, *moves], axis=1)
-
-    def _of_others(self, simulation: Simulation, q: Vector, v: Vector, a: Vector) -> Vector:
-        """Return the same of other bodies, from the simulation's kinematics."""
-        attitude = simulation.body_poses(self._bodies, q)[:, 3:]
-        spin = simulation.body_velocities(self._bodies, q, v)[:, 3:]
-        change = self._accelerations(simulation, q, v, a)
-        return np.concatenate([attitude, spin, change], axis=1)
-
-    def _accelerations(self, simulation: Simulation, q: Vector, v: Vector, a: Vector) -> Vector:
-        """Return the changes of the bodies' velocities, shape (bodies, 6).
-
-        Velocities are linear in `v`, so their change is that of `a` in its place, plus the change
-        that the motion itself makes, by a central difference along it.
-        """
-        bodies, layout = self._bodies, simulation.layout
-        found = simulation.body_velocities(bodies, q, a)
-        fastest = float(np.abs(v).max(initial=0.0))
-        if fastest:
-            stride = _STRIDE / max(fastest, 1.0)
-            after = simulation.body_velocities(bodies, moved(layout, q, stride * v), v)
-            before = simulation.body_velocities(bodies, moved(layout, q, -stride * v), v)
-            found += (after - before) / (2 * stride)
-        return found
-
-
-def moved(layout: Layout, positions: Vector, motion: Vector) -> Vector:
-    """Return positions after a small motion, shape (nv,), that is velocities times a time."""
-    found = np.empty_like(positions)
-    for part in layout.parts.values():
-        q, v = positions[part.positions], motion[part.velocities]
-        if part.floating:
-            attitude = q[3:7]
-            turn = product(attitude, from_rotation_vectors(v[3:6]))
-            q = np.concatenate([q[:3] + turned(attitude, v[:3]), turn, q[7:] + v[6:]])
-            found[part.positions] = q
-        else:
-            found[part.positions] = q + v
-    return found
 
 
 class ContactTruth:
@@ -145,24 +98,24 @@ class ContactTruth:
 
     def __init__(self, sensors: Sequence[ContactSensor], simulation: Simulation) -> None:
         _needs("contacts", simulation, "A ContactSensor")
-        names = simulation.layout.names
-        self._bodies = places_of("body", [sensor.body for sensor in sensors], names)
-        self._count = len(names)
+        bodies = [sensor.body for sensor in sensors]
+        self._rows: dict[int, list[int]] = {}
+        for row, place in enumerate(places_of("body", bodies, simulation.layout.names).tolist()):
+            self._rows.setdefault(place, []).append(row)
 
-    def measure(self, simulation: Simulation) -> Vector:
-        """Return touching, normal force and force."""
-        contacts: Any = simulation.contacts()
-        whole = np.zeros((self._count, 5))
-        if len(contacts):
-            force = contacts["force"]
-            along = np.sum(force * contacts["normal"], axis=1)
-            rows = np.column_stack([np.ones(len(contacts)), along, force])
-            np.add.at(whole, contacts["body_a"], rows)
-            rows[:, 2:] *= -1
-            np.add.at(whole, contacts["body_b"], rows)
-            np.minimum(whole[:, 0], 1.0, out=whole[:, 0])
-        found: Vector = whole[self._bodies]
-        return found
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write touching, normal force and force."""
+        sums = [[0.0] * 5 for _ in out]
+        for first, second, _, (x, y, z), (a, b, c), _ in simulation.contacts().tolist():
+            for place, sign in ((first, 1.0), (second, -1.0)):
+                for row in self._rows.get(place, ()):
+                    mine = sums[row]
+                    mine[0] = 1.0
+                    mine[1] += x * a + y * b + z * c
+                    mine[2] += sign * x
+                    mine[3] += sign * y
+                    mine[4] += sign * z
+        out[:] = sums
 
 
 class ForceTorqueTruth:
@@ -171,12 +124,11 @@ class ForceTorqueTruth:
     def __init__(self, sensors: Sequence[ForceTorqueSensor], simulation: Simulation) -> None:
         _needs("joint_wrenches", simulation, "A ForceTorqueSensor")
         joints = [sensor.joint for sensor in sensors]
-        self._joints = places_of("joint", joints, simulation.layout.joints)
+        self._joints = as_slice(places_of("joint", joints, simulation.layout.joints))
 
-    def measure(self, simulation: Simulation) -> Vector:
-        """Return force and torque."""
-        wrenches: Vector = simulation.joint_wrenches()[self._joints]
-        return wrenches
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write force and torque."""
+        out[:] = simulation.joint_wrenches()[self._joints]
 
 
 class EffortTruth:
@@ -185,18 +137,18 @@ class EffortTruth:
     def __init__(self, sensors: Sequence[EffortSensor], simulation: Simulation) -> None:
         layout = simulation.layout
         joints = [sensor.joint for sensor in sensors]
-        self._joints = places_of("joint", joints, layout.joints)
-        for sensor, place in zip(sensors, self._joints, strict=True):
+        places = places_of("joint", joints, layout.joints)
+        for sensor, place in zip(sensors, places, strict=True):
             if layout.modes and layout.modes[place] != "force":
                 raise ConfigError(
                     f'EffortSensor "{sensor.name}": the joint "{sensor.joint}" has the mode '
                     f'"{layout.modes[place]}", so its torque is not known.'
                 )
+        self._joints = as_slice(places)
 
-    def measure(self, simulation: Simulation) -> Vector:
-        """Return the torque."""
-        torques: Vector = simulation.snapshot().commands[self._joints, None]
-        return torques
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write the torque."""
+        out[:, 0] = simulation.commands()[self._joints]
 
 
 def truth_of(
@@ -228,3 +180,9 @@ def _needs(feature: str, simulation: Simulation, what: str) -> None:
         raise FeatureNotSupportedError(
             simulation.engine, feature, simulation.features, f"{what} needs it."
         )
+
+
+def _unless(values: Sequence[float], nothing: Sequence[float]) -> tuple[float, ...] | None:
+    """Return values, None where they are nothing."""
+    found = tuple(float(value) for value in values)
+    return None if found == tuple(nothing) else found

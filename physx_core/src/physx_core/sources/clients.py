@@ -45,6 +45,7 @@ class ClientSource(Source):
         *,
         run_ahead: int | None = None,
         total: int | None = None,
+        accept_all: bool = False,
     ) -> None:
         """Keep what the clients are started with.
 
@@ -57,10 +58,11 @@ class ClientSource(Source):
                 rows depend on a network that is trained, or on predictions that are applied.
             total: How many rows will ever be asked for; no client makes rows beyond. None: nobody
                 knows.
+            accept_all: Whether samples that `check_sample` refuses count like the others.
         """
         self.instance_nb = config.num_clients
         self.fields = []
-        self._group = ClientGroup(config, services, seed)
+        self._group = ClientGroup(config, services, seed, accept_all=accept_all)
         self._refusals = 0
         if config.record_wrong_samples:
             self._refusals = config.max_wrong_samples_per_step + 1

@@ -17,13 +17,21 @@ from physx_core.sources.source import Source, check_stored
 class LocalSource(Source):
     """Steps the instances one after the other; no serialization, no copy but that into the row."""
 
-    def __init__(self, config: EnvironmentConfig, services: Services, seed: Sequence[int]) -> None:
+    def __init__(
+        self,
+        config: EnvironmentConfig,
+        services: Services,
+        seed: Sequence[int],
+        *,
+        accept_all: bool = False,
+    ) -> None:
         """Keep what the instances are made from.
 
         Args:
             config: Which environment, and how many instances.
             services: What the environments may ask of the run.
             seed: Seed of all instances.
+            accept_all: Whether samples that `check_sample` refuses count like the others.
         """
         self.instance_nb = config.num_clients
         self.fields = []
@@ -39,6 +47,7 @@ class LocalSource(Source):
                 simulations_per_step=config.simulations_per_step,
                 max_wrong_samples=config.max_wrong_samples_per_step,
                 record_wrong=config.record_wrong_samples,
+                accept_all=accept_all,
             )
             for number in range(1, self.instance_nb + 1)
         ]

@@ -65,6 +65,14 @@ class Kind(enum.IntEnum):
     """Client: rows that `check_sample` refused, as in ROWS, before the next accepted [how many]."""
     AGAIN = 21
     """Client: makes rows again that the server has from a client before it [how many so far]."""
+    REQUEST = 22
+    """Client of an environment that is served: what is to be done [number of the request]."""
+    ACTIONS = 23
+    """Client of an environment that is served: actions of its worlds [number of the request]."""
+    NOTES = 24
+    """Server: what goes with the next message and has no fixed layout [as there]."""
+    SEEN = 25
+    """Server: what became of a request, for clients that watch [how many there were so far]."""
 
 
 _KINDS = {int(kind): kind for kind in Kind}
@@ -153,9 +161,9 @@ class FrameReader:
         return waiting >= int(HEADER.unpack_from(self._bytes, self._start)[0])
 
     @property
-    def has_large(self) -> bool:
-        """Whether a part of a long frame has arrived, which may take its time."""
-        return self._large is not None
+    def arrived(self) -> int:
+        """How many bytes of a long frame that is on its way have arrived; 0 where none is."""
+        return 0 if self._large is None else self._large.received
 
     @property
     def may_have_more(self) -> bool:
@@ -234,29 +242,30 @@ class _LargeFrame:
 
     Attributes:
         frame: The frame.
-        missing: How many bytes of its payload have not arrived.
+        received: How many bytes of its payload have arrived.
+        missing: How many have not.
     """
 
     def __init__(self, kind: Kind, number: int, length: int) -> None:
         self.frame = Frame(kind, number, bytearray(min(length, _STEP)))
         self.missing = length
-        self._received = 0
+        self.received = 0
 
     def put(self, data: memoryview) -> None:
         """Add bytes that were received elsewhere."""
         self.frame.payload[: len(data)] = data
-        self._received += len(data)
+        self.received += len(data)
         self.missing -= len(data)
 
     def room(self) -> memoryview:
         """Return where the next bytes belong."""
         payload = self.frame.payload
-        if self._received == len(payload):
+        if self.received == len(payload):
             payload += bytes(min(self.missing, len(payload)))
-        return memoryview(payload)[self._received :]
+        return memoryview(payload)[self.received :]
 
     def filled(self, room: memoryview, count: int) -> None:
         """Note how many bytes were put into the room."""
         room.release()
-        self._received += count
+        self.received += count
         self.missing -= count

@@ -41,16 +41,25 @@ class ClientGroup:
         config: Which environment, how many clients, and how long they may be silent.
     """
 
-    def __init__(self, config: EnvironmentConfig, services: Services, seed: Sequence[int]) -> None:
+    def __init__(
+        self,
+        config: EnvironmentConfig,
+        services: Services,
+        seed: Sequence[int],
+        *,
+        accept_all: bool = False,
+    ) -> None:
         """Keep what the clients are started with.
 
         Args:
             config: Which environment, how many clients, and what starts them.
             services: What the environments may ask of the run.
             seed: Seed of all instances.
+            accept_all: Whether samples that `check_sample` refuses count like the others.
         """
         self.config = config
         self._seed = list(seed)
+        self._accepts_all = accept_all
         self._launcher = _make_launcher(config)
         self._handles: dict[int, ClientHandle] = {}
         self._launched: dict[int, float] = {}
@@ -168,12 +177,13 @@ class ClientGroup:
         return f"{socket.gethostname()}:{self.server.address.rpartition(':')[2]}"
 
     def _serve(self, timeout: float) -> None:
+        began = time.monotonic()
         self.server.pump(timeout)
         self._served = time.monotonic()
         lost = any(peer.is_lost and not peer.vacant for peer in self.server.peers.values())
         if lost or self._served - self._checked > _TICK:
             self._checked = self._served
-            self._check_ended(self._served)
+            self._check_ended(self._served, began)
 
     def _wait_a_moment(self) -> None:
         until = time.monotonic() + _GRACE
@@ -198,7 +208,7 @@ class ClientGroup:
             raise peer.failure
         return peer is not None and bool(peer.fields)
 
-    def _check_ended(self, now: float) -> None:
+    def _check_ended(self, now: float, listened_since: float) -> None:
         for number in self._numbers:
             handle, peer = self._handles.get(number), self._present(number)
             if peer is not None and peer.failure is not None:
@@ -211,9 +221,9 @@ class ClientGroup:
                 left = handle is None and not peer.offense
                 self._lose(number, ended(number, peer, handle), left=left)
             elif handle is not None and handle.exit_status() is not None:
-                # What it sent before its end may still be on its way.
+                # What it sent before its end may still be on its way, or wait to be read.
                 since = self._exits.setdefault(number, now)
-                if peer is None or now - since > 2 * _TICK:
+                if peer is None or (now - since > 2 * _TICK and peer.heard < listened_since):
                     self._lose(number, ended(number, peer, handle))
 
     # Clients that others take the place of --------------------------------------------------
@@ -309,6 +319,7 @@ class ClientGroup:
                 "simulations_per_step": config.simulations_per_step,
                 "max_wrong_samples": config.max_wrong_samples_per_step,
                 "record_wrong": config.record_wrong_samples,
+                "accept_all": self._accepts_all,
                 "draw": config.visualizer is not None,
                 "path": [str(Path(entry).resolve()) for entry in sys.path],
                 "directory": str(Path.cwd()),

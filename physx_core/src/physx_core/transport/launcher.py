@@ -14,6 +14,7 @@ from typing import IO
 
 from physx_core.errors import ClientError, ConfigError
 from physx_core.interfaces.launcher import ClientHandle, Launcher
+from physx_core.transport.guard import Guard
 from physx_core.transport.handshake import TOKEN_VARIABLE
 
 CLIENT_VARIABLE = "PHYSX_CLIENT"
@@ -34,7 +35,14 @@ class ClientProcess(ClientHandle):
         instance_id: Number of the instance that it runs, counted from 1.
     """
 
-    def __init__(self, instance_id: int, address: str, token: str, core: int | None = None) -> None:
+    def __init__(
+        self,
+        instance_id: int,
+        address: str,
+        token: str,
+        core: int | None = None,
+        guard: Guard | None = None,
+    ) -> None:
         """Keep what the process is started with.
 
         Args:
@@ -42,9 +50,10 @@ class ClientProcess(ClientHandle):
             address: The server's ``HOST:PORT``.
             token: Token of the run.
             core: The only processor core that it may use; None: all that this process may use.
+            guard: Ends it if this process is gone; None: one for it alone.
         """
         self.instance_id = instance_id
-        self._core = core
+        self._core, self._guard = core, guard or Guard()
         self._command = [
             *(sys.executable, "-P", "-m", "physx_core.transport"),
             *("--connect", address, "--instance", str(instance_id)),
@@ -73,6 +82,7 @@ class ClientProcess(ClientHandle):
             )
         except OSError as error:
             raise ClientError(self.instance_id, f"could not be started: {error}.") from error
+        self._guard.add(self._process.pid)
         if self._core is not None:
             with contextlib.suppress(ProcessLookupError):  # it has ended already
                 os.sched_setaffinity(self._process.pid, {self._core})
@@ -94,6 +104,7 @@ class ClientProcess(ClientHandle):
         status = process.poll()
         if status is not None:
             self.kill()  # what the environment left running
+            self._guard.remove(process.pid)
         return status
 
     def stderr(self) -> str:
@@ -141,6 +152,7 @@ class SubprocessLauncher(Launcher):
             ConfigError: This operating system cannot do so.
         """
         self._cores: list[int] = []
+        self._guard = Guard()
         if affinity:
             if not hasattr(os, "sched_setaffinity"):
                 raise ConfigError(
@@ -154,7 +166,7 @@ class SubprocessLauncher(Launcher):
         try:
             for number in instances:
                 core = self._cores[(number - 1) % len(self._cores)] if self._cores else None
-                process = ClientProcess(number, address, token, core)
+                process = ClientProcess(number, address, token, core, self._guard)
                 started.append(process)
                 process.start()
         except BaseException:

@@ -9,6 +9,7 @@ import signal
 import socket
 import threading
 from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 from physx_core.transport.descendants import kill_descendants
@@ -17,6 +18,7 @@ from physx_core.transport.frames import Frame, FrameReader, Kind
 from physx_core.transport.values import decode, pack_value
 
 _CLEANUP_TIME = 1.0
+_MOST_PARTS = 512  # a system call takes no more than 1024
 _HANGUP = getattr(select, "POLLRDHUP", 0)
 
 
@@ -59,6 +61,26 @@ class Link:
         """
         try:
             self._connection.sendall(message)
+        except OSError as error:
+            raise ServerGone from error
+
+    def send_parts(self, parts: Sequence[bytes | memoryview]) -> None:
+        """Send a message whose parts lie in several places.
+
+        Args:
+            parts: Bytes, in their order; they may change once this returns.
+
+        Raises:
+            RunEnded: The server is gone.
+        """
+        waiting = [memoryview(part) for part in parts if len(part)]
+        try:
+            while waiting:
+                sent = self._connection.sendmsg(waiting[:_MOST_PARTS])
+                while waiting and sent >= len(waiting[0]):
+                    sent -= len(waiting.pop(0))
+                if sent:
+                    waiting[0] = waiting[0][sent:]
         except OSError as error:
             raise ServerGone from error
 

@@ -13,6 +13,8 @@ from physx_core.transport.handshake import HANDSHAKE_LIMIT, ServerHandshake
 from physx_core.transport.journal import Journal
 from physx_core.transport.rows import RefusedRows, RowQueue
 
+_PIECE = 1 << 16
+
 
 class Peer:
     """What the server knows about one connection.
@@ -72,6 +74,7 @@ class Peer:
         self.vacant = self.has_told_fields = False
         self.requests = self.shown = 0
         self.journal: Journal | None = None
+        self._arrived = 0  # of a long frame, when the peer was last heard of
         self._outgoing = bytearray()
         self._next_order: int | None = None  # of the journal's, for this client; None: it had all
 
@@ -102,6 +105,15 @@ class Peer:
         self.row_fields, self.last_step = former.row_fields, former.last_step
         self.shown, self.journal = former.shown, former.journal
         self._next_order = None if self.journal is None else 0
+
+    def hear(self, *, whole: bool) -> None:
+        """Note that the peer is heard of, if it sent a whole frame, or a good piece of a long one.
+
+        A few bytes now and then are no sign of life.
+        """
+        arrived = 0 if whole else self.reader.arrived
+        if whole or arrived - self._arrived >= _PIECE:
+            self.heard, self._arrived = time.monotonic(), arrived
 
     def send(self, message: bytes) -> None:
         """Send as much as the connection takes now; `flush` sends the rest.

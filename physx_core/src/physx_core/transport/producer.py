@@ -16,7 +16,7 @@ from physx_core.transport.link import Link, RunEnded
 from physx_core.transport.rows import pack_rows, row_bytes
 from physx_core.transport.values import decode, encode
 
-_BLOCK_BYTES = 1 << 18
+_BLOCK_BYTES = 1 << 20
 _BLOCK_ROWS = 4096
 _BLOCK_TIME = 5e-3
 
@@ -93,7 +93,7 @@ class Producer:
                 self.failure = error
                 count = int(np.argmax(columns.arrays["step"][:count] == error.step))
             else:
-                self._link.send(pack_rows(block, count))
+                self._link.send_parts(pack_rows(block, count))
                 break
         self.made += count
         self._filled = 0
@@ -131,7 +131,7 @@ class Producer:
         self._skip_refused -= skipped
         for start in range(skipped, len(rows["step"]), columns.capacity):
             part = {name: values[start : start + columns.capacity] for name, values in rows.items()}
-            self._link.send(pack_rows(part, len(part["step"]), Kind.WRONG))
+            self._link.send_parts(pack_rows(part, len(part["step"]), Kind.WRONG))
 
     def _send_last_refused(self) -> None:
         """Send refused samples of an instance that has come to its end, if need be without rows."""

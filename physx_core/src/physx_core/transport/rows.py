@@ -17,8 +17,8 @@ def row_bytes(fields: Sequence[Field]) -> int:
     return sum(field.nbytes for field in fields)
 
 
-def pack_rows(block: Batch, count: int, kind: Kind = Kind.ROWS) -> bytes:
-    """Return the message that carries a block of rows.
+def pack_rows(block: Batch, count: int, kind: Kind = Kind.ROWS) -> list[bytes | memoryview]:
+    """Return the message that carries a block of rows, in parts: the rows are not copied.
 
     Args:
         block: Field name to contiguous array of shape (count, *field shape).
@@ -30,7 +30,7 @@ def pack_rows(block: Batch, count: int, kind: Kind = Kind.ROWS) -> bytes:
     """
     arrays = list(block.values())
     length = sum(array.nbytes for array in arrays)
-    return b"".join([header(kind, length, count), *(array.data for array in arrays)])
+    return [header(kind, length, count), *(array.reshape(-1).view("u1").data for array in arrays)]
 
 
 def unpack_rows(payload: bytearray, fields: Sequence[Field], count: int) -> Batch:

@@ -241,8 +241,8 @@ class Server:
             while not peer.gone:
                 turns += 1
                 frame = peer.reader.read(peer.connection)
-                if peer.handshake is None and (frame is not None or peer.reader.has_large):
-                    peer.heard = time.monotonic()
+                if peer.handshake is None:
+                    peer.hear(whole=frame is not None)
                 if frame is not None:
                     self._take(peer, frame)
                 if frame is None or not peer.reader.may_have_more:

@@ -29,7 +29,20 @@ def given_token(token_file: str | None) -> str | None:
         token, place = os.environ.get(TOKEN_VARIABLE), TOKEN_VARIABLE
     else:
         token, place = _read(token_file), token_file
-    if token is not None and len(token) < _SHORTEST:
+    return None if token is None else checked_token(token, place)
+
+
+def checked_token(token: str, place: str) -> str:
+    """Return a token that is long enough.
+
+    Args:
+        token: The token.
+        place: Where it is from, for messages.
+
+    Raises:
+        ConfigError: It is too short.
+    """
+    if len(token) < _SHORTEST:
         raise ConfigError(
             f"The token in {place} has {len(token)} characters: it must have at least {_SHORTEST}, "
             "so that nobody finds it by trying."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,7 @@ class Ground:
         Raises:
             ConfigError: A value cannot be.
         """
-        _check_material("Ground", self)
+        numbers.options(numbers.not_negative, "Ground.", self, "friction", "restitution")
         numbers.finite("Ground.height", self.height)
         normal = numbers.vector("Ground.normal", self.normal, 3)
         length = float(np.linalg.norm(normal))
@@ -73,11 +72,10 @@ class Stairs:
         Raises:
             ConfigError: A value cannot be.
         """
-        _check_material("Stairs", self)
+        numbers.options(numbers.not_negative, "Stairs.", self, "friction", "restitution")
         if not isinstance(self.steps, int) or self.steps < 1:
             raise ConfigError(f"Stairs.steps is {self.steps!r} but must be an integer from 1.")
-        for option in ("rise", "run", "width"):
-            numbers.positive(f"Stairs.{option}", getattr(self, option))
+        numbers.options(numbers.positive, "Stairs.", self, "rise", "run", "width")
         numbers.finite("Stairs.begin", self.begin)
         numbers.not_negative("Stairs.landing", self.landing)
 
@@ -119,7 +117,7 @@ class HeightField:
         Raises:
             ConfigError: A value cannot be.
         """
-        _check_material("HeightField", self)
+        numbers.options(numbers.not_negative, "HeightField.", self, "friction", "restitution")
         try:
             heights = np.array(self.heights, np.float64)
         except (TypeError, ValueError, OverflowError) as error:
@@ -148,8 +146,3 @@ class HeightField:
 
 
 Terrain = Ground | Stairs | HeightField
-
-
-def _check_material(kind: str, ground: Any) -> None:
-    for option in ("friction", "restitution"):
-        numbers.not_negative(f"{kind}.{option}", getattr(ground, option))

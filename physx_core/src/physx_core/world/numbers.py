@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from physx_core.errors import ConfigError
@@ -46,6 +46,22 @@ def not_negative(option: str, value: Any) -> float:
     if number < 0:
         raise ConfigError(f"{option} is {value!r} but cannot be negative.")
     return number
+
+
+def options(check: Callable[[str, Any], float], where: str, description: Any, *names: str) -> None:
+    """Check options of a description.
+
+    Args:
+        check: One of the checks above.
+        where: What stands before the options' names in an error.
+        description: What has them.
+        names: Their names.
+
+    Raises:
+        ConfigError: One does not pass.
+    """
+    for name in names:
+        check(where + name, getattr(description, name))
 
 
 def vector(option: str, values: Any, length: int) -> tuple[float, ...]:

@@ -44,13 +44,11 @@ class WorldObject:
         kind = type(self).__name__
         numbers.name(kind.lower(), self.name)
         where = f'{kind} "{self.name}": '
-        for option in ("mass", *self.lengths):
-            numbers.positive(where + option, getattr(self, option))
+        numbers.options(numbers.positive, where, self, "mass", *self.lengths)
         object.__setattr__(self, "position", numbers.vector(f"{where}position", self.position, 3))
         orientation = numbers.unit_quaternion(f"{where}orientation", self.orientation)
         object.__setattr__(self, "orientation", orientation)
-        numbers.not_negative(f"{where}friction", self.friction)
-        numbers.not_negative(f"{where}restitution", self.restitution)
+        numbers.options(numbers.not_negative, where, self, "friction", "restitution")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ import torch
 
 from physx_core import Field
 from physx_core.errors import ConfigError, FieldsMismatchError
-from physx_torch.choices import choose, classes_in, make
+from physx_torch.choices import make_activation
 from physx_torch.network import TorchNetwork
 
 
@@ -188,14 +188,9 @@ def _flags(own: str, given: bool | Sequence[bool], number: int) -> list[bool]:
 
 
 def _stack(sizes: Sequence[int], activation: Any, biases: Sequence[bool]) -> torch.nn.Sequential:
-    known = classes_in(torch.nn.modules.activation, torch.nn.Module)
-    chosen = choose("activation", activation, {**known, "Identity": torch.nn.Identity})
     modules: list[torch.nn.Module] = []
     for (inputs, outputs), bias in zip(pairwise(sizes), biases, strict=True):
         if modules:
-            slopes = {"num_parameters": inputs} if chosen is torch.nn.PReLU else {}
-            modules.append(make("activation", chosen, **slopes))
+            modules.append(make_activation("FC.activation", activation, inputs))
         modules.append(torch.nn.Linear(inputs, outputs, bias=bias))
-    if not all(isinstance(module, torch.nn.Module) for module in modules):
-        raise ConfigError(f"FC.activation is {activation!r} but must be a torch.nn.Module class.")
     return torch.nn.Sequential(*modules)

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 
 from physx_core import Field
 from physx_core.errors import ConfigError, FieldsMismatchError
+from physx_torch.choices import make_activation
 from physx_torch.network import TorchNetwork
 from physx_torch.networks.grid import Border, Layout, border, grid_size, layout, misfits
 
 Modules = list[torch.nn.Module]
+
+GROUPS = 8
+"""Greatest number of groups of channels that are normalized apart."""
+NORMALIZATIONS = ("none", "batch", "group")
 
 
 class UNet(TorchNetwork):
@@ -20,8 +26,8 @@ class UNet(TorchNetwork):
 
     On the way down, each step convolves, keeps the result, and halves the grid, with twice as many
     channels below; on the way up, each step doubles the grid, puts what was kept beside it, and
-    convolves. Convolutions have kernels of 3 points, and are followed by batch normalization and
-    ReLU.
+    convolves. Convolutions have kernels of 3 points, and are followed by a normalization and an
+    activation.
 
     A sample's field has the shape ``(*grid, channels)``, ``grid`` where there is one channel, or
     ``(points, channels)`` with the points of the grid in row-major order. Several `net_fields` are
@@ -50,6 +56,9 @@ class UNet(TorchNetwork):
         border_mode: str = "valid",
         skip_merge: bool = False,
         data_scale: float = 1.0,
+        normalization: str = "none",
+        activation: str | type[torch.nn.Module] = "ReLU",
+        positions: bool = False,
         input_size: Sequence[int] | None = None,
         **fields: Any,
     ) -> None:
@@ -69,6 +78,14 @@ class UNet(TorchNetwork):
             skip_merge: Whether what was kept on the way down is left out on the way up: an
                 encoder and decoder of convolutions.
             data_scale: What targets are multiplied by for the loss, and predictions divided by.
+            normalization: ``"none"``: the layers begin with weights that keep the size of what goes
+                through them (He et al., 2015). ``"batch"``: by the mean and deviation of the batch,
+                and of all batches for predictions: it learns quickly at first, but batches differ,
+                which limits how exact fields become, the more the smaller they are. ``"group"``: by
+                those of each sample alone, in up to 8 groups of channels.
+            activation: Class, or name in `torch.nn` such as ``"SiLU"``.
+            positions: Whether the network also reads where each point is, as one more channel for
+                each axis from -1 to 1: for bodies that are held at some place.
             input_size: Points of the grid along each axis; None: taken from the fields' shapes.
             fields: ``net_fields``, ``opt_fields`` and ``pred_fields`` as in `TorchNetwork`.
 
@@ -85,6 +102,12 @@ class UNet(TorchNetwork):
         for name, value in numbers.items():
             _check(name, value, _positive(value), "a positive integer")
         _check("nb_dims", nb_dims, nb_dims in (2, 3), "2 or 3")
+        _check(
+            "normalization",
+            normalization,
+            normalization in NORMALIZATIONS,
+            '"none", "batch" or "group"',
+        )
         _check("border_mode", border_mode, border_mode in ("valid", "same"), '"valid" or "same"')
         _check("data_scale", data_scale, data_scale > 0, "positive")
         _check("input_size", input_size, _is_size(input_size, nb_dims), f"{nb_dims} integers")
@@ -97,6 +120,8 @@ class UNet(TorchNetwork):
         self._dims, self._steps, self._same = nb_dims, nb_steps, border_mode == "same"
         self._sublayers = 2 if two_sublayers else 1
         self._merges = not skip_merge
+        self._normalization, self._activation = normalization, activation
+        self._positions = positions
         self._make_layers(nb_first_layer_channels)
 
     def _make_layers(self, first: int) -> None:
@@ -104,7 +129,7 @@ class UNet(TorchNetwork):
         upwards = torch.nn.ConvTranspose2d if dims == 2 else torch.nn.ConvTranspose3d
         last = torch.nn.Conv2d if dims == 2 else torch.nn.Conv3d
         widths = [first * 2**level for level in range(self._steps + 1)]
-        befores = [inputs, *widths]
+        befores = [inputs + (dims if self._positions else 0), *widths]
         self.down = torch.nn.ModuleList(
             self._level(before, width) for before, width in zip(befores, widths, strict=False)
         )
@@ -116,21 +141,42 @@ class UNet(TorchNetwork):
         merged = 2 if self._merges else 1
         self.join = torch.nn.ModuleList(self._level(merged * w, w) for w in below[1:])
         self.last = last(first, outputs, kernel_size=1)
+        if self._normalization == "none":
+            self._keep_size()
+
+    def _keep_size(self) -> None:
+        """Draw weights with which outputs vary as much as inputs, through all layers."""
+        for name, parameter in self.named_parameters():
+            if name.endswith("bias"):
+                torch.nn.init.zeros_(parameter)
+            elif name.startswith("up."):  # each value below makes one of each kernel's points
+                torch.nn.init.normal_(parameter, std=parameter.shape[0] ** -0.5)
+            elif parameter.dim() > 1:  # else it belongs to an activation
+                followed_by: Literal["linear", "relu"] = "linear" if name[:4] == "last" else "relu"
+                torch.nn.init.kaiming_normal_(parameter, nonlinearity=followed_by)
 
     def _level(self, before: int, channels: int) -> torch.nn.Sequential:
         """Return the convolutions of one level."""
         flat = self._dims == 2
         convolution = torch.nn.Conv2d if flat else torch.nn.Conv3d
-        normalization = torch.nn.BatchNorm2d if flat else torch.nn.BatchNorm3d
         modules: Modules = []
         for number in range(self._sublayers):
             inputs = before if number == 0 else channels
             modules += [
                 convolution(inputs, channels, kernel_size=3, padding=int(self._same)),
-                normalization(channels),
-                torch.nn.ReLU(),
+                *self._normalized(channels),
+                make_activation("UNet.activation", self._activation, channels),
             ]
         return torch.nn.Sequential(*modules)
+
+    def _normalized(self, channels: int) -> Modules:
+        """Return what normalizes the channels of a level."""
+        if self._normalization == "none":
+            return []
+        if self._normalization == "group":
+            return [torch.nn.GroupNorm(math.gcd(channels, GROUPS), channels)]
+        batch = torch.nn.BatchNorm2d if self._dims == 2 else torch.nn.BatchNorm3d
+        return [batch(channels)]
 
     def bind(self, fields: Mapping[str, Field]) -> None:
         """Learn the grid from the fields before the first batch.
@@ -177,6 +223,8 @@ class UNet(TorchNetwork):
         """
         x = inputs[0] if len(inputs) == 1 else torch.cat(inputs, dim=-1)
         x = x.to(self.last.weight.dtype).movedim(-1, 1)
+        if self._positions:
+            x = torch.cat([x, _places(x)], dim=1)
         kept: list[torch.Tensor] = []
         for level in self.down[:-1]:
             x = level(x)
@@ -199,6 +247,16 @@ def _middle(tensor: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
         if surplus:
             tensor = tensor.narrow(axis, surplus // 2, like.shape[axis])
     return tensor
+
+
+def _places(like: torch.Tensor) -> torch.Tensor:
+    """Return the place of each point, from -1 to 1 along each axis, (samples, axes, *axes)."""
+    axes = [
+        torch.linspace(-1, 1, points, dtype=like.dtype, device=like.device)
+        for points in like.shape[2:]
+    ]
+    places = torch.stack(torch.meshgrid(*axes, indexing="ij"))
+    return places.expand(like.shape[0], *places.shape)
 
 
 def _positive(value: Any) -> bool:

@@ -31,6 +31,7 @@ class Block(SharedArrays, ABC):
         update_ratio: Period in periods of the environment below; -1: a step of the environment.
         every: Period in physics steps; 0 before the first reset.
         period: The same in s.
+        connected_to: Which of the simulator's builds it is connected to; -1: none yet.
         memory: Names of the attributes that `snapshot` keeps.
     """
 
@@ -54,6 +55,18 @@ class Block(SharedArrays, ABC):
             )
         self.name, self.env, self.update_ratio = name, env, int(update_ratio)
         self.every, self.period = 0, 0.0
+        self.connected_to = -1
+
+    def refresh_connection(self) -> None:
+        """Call `connect`, unless the simulator is as it was the last time.
+
+        Layers do so when they are made and at every reset; a constructor may, so that spaces are
+        known before there is a layer.
+        """
+        builds = self.env.simulator.builds
+        if builds != self.connected_to:
+            self.connect()
+            self.connected_to = builds
 
     @abstractmethod
     def connect(self) -> None:

@@ -58,7 +58,7 @@ class BodyObserver(ObserverBlock):
         super().__init__(name, env, update_ratio=update_ratio)
         self._wanted = None if bodies is None else tuple(bodies)
         self.compute_rpy = compute_rpy
-        self.connect()
+        self.refresh_connection()
 
     def connect(self) -> None:
         """Find IMUs and encoders."""

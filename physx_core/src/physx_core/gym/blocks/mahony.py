@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -19,81 +20,103 @@ from physx_core.sensors.attitudes import cross, from_rotation_vectors, product, 
 _WEIGHTLESS = 1e-3
 """Acceleration, in m/s², below which it says nothing about where up is."""
 
-_SMALL = 0.01
-"""Square of an angle, in rad², below which three terms of a series are exact to 1e-9."""
+_SMALL = 0.0025
+"""Square of an angle, in rad², below which three terms of the tangent's series give it to 1e-9."""
 
 _UP = np.array([0.0, 0.0, 1.0])
 
 
-def advanced(
-    state: Sequence[float], measured: Sequence[float], kp: float, ki: float, dt: float, g: float
-) -> tuple[float, ...]:
+class Gains(NamedTuple):
+    """Numbers of the filter, worked out once.
+
+    Attributes:
+        turn: Half the turn in a period for an acceleration across from up, in rad.
+        bias: Change of the bias in a period, likewise, in rad/s.
+        half: Half the period, in s.
+        gravity: Square of gravity, in m²/s⁴.
+    """
+
+    turn: float
+    bias: float
+    half: float
+    gravity: float
+
+    @classmethod
+    def of(cls, kp: float, ki: float, dt: float, g: float) -> Self:
+        """Return the numbers of a filter.
+
+        Args:
+            kp: How fast the attitude follows the acceleration, in rad/s.
+            ki: How fast the bias follows it, in rad/s².
+            dt: The period, in s.
+            g: Gravity, in m/s².
+        """
+        return cls(0.5 * dt * kp, dt * ki, 0.5 * dt, g * g)
+
+
+def advanced(state: Sequence[float], measured: Sequence[float], gains: Gains) -> tuple[float, ...]:
     """Return the state of one filter a period later, in plain numbers.
 
     Args:
         state: Quaternion, rates less their bias, bias, and rates measured last, in rad/s: 13
             numbers.
         measured: Rates in rad/s and accelerations in m/s², 6 numbers.
-        kp: How fast the attitude follows the acceleration, in rad/s.
-        ki: How fast the bias follows it, in rad/s².
-        dt: The period, in s.
-        g: Gravity, in m/s².
+        gains: Numbers of the filter.
     """
     x, y, z, w, _, _, _, bx, by, bz, px, py, pz = state
     gx, gy, gz, ax, ay, az = measured
-    ox, oy, oz = 0.5 * (px + gx) - bx, 0.5 * (py + gy) - by, 0.5 * (pz + gz) - bz
-    square, gravity = ax * ax + ay * ay + az * az, g * g
+    turn, learn, half, gravity = gains
+    middle = 0.5 * half  # rates are the mean of now and last time
+    ox = middle * (px + gx) - half * bx
+    oy = middle * (py + gy) - half * by
+    oz = middle * (pz + gz) - half * bz
+    square = ax * ax + ay * ay + az * az
     weight = gravity - 2 * abs(square - gravity)
     if weight > 0.0:
         weight /= gravity * math.sqrt(square)
         ux, uy, uz = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
         ex, ey, ez = ay * uz - az * uy, az * ux - ax * uz, ax * uy - ay * ux
-        gain = kp * weight
+        gain = turn * weight
         ox, oy, oz = ox + gain * ex, oy + gain * ey, oz + gain * ez
-        gain = ki * dt * weight
+        gain = learn * weight
         bx, by, bz = bx - gain * ex, by - gain * ey, bz - gain * ez
-    half = 0.5 * dt
-    ox, oy, oz = ox * half, oy * half, oz * half
+    # The turn by twice o, as (tan(|o|) o / |o|, 1): its length does not matter.
     square = ox * ox + oy * oy + oz * oz
     if square < _SMALL:
-        c, s = 1 - square * (0.5 - square / 24), 1 - square * (1 / 6 - square / 120)
+        ratio = 1 + square * (1 / 3 + square * (2 / 15))
     else:
         angle = math.sqrt(square)
-        c, s = math.cos(angle), math.sin(angle) / angle
-    ox, oy, oz = ox * s, oy * s, oz * s
-    qx = x * c + w * ox + y * oz - z * oy
-    qy = y * c + w * oy + z * ox - x * oz
-    qz = z * c + w * oz + x * oy - y * ox
-    qw = w * c - x * ox - y * oy - z * oz
+        ratio = math.tan(angle) / angle
+    ox, oy, oz = ox * ratio, oy * ratio, oz * ratio
+    qx = x + w * ox + y * oz - z * oy
+    qy = y + w * oy + z * ox - x * oz
+    qz = z + w * oz + x * oy - y * ox
+    qw = w - x * ox - y * oy - z * oz
     scale = 1.0 / math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
-    attitude = (qx * scale, qy * scale, qz * scale, qw * scale)
-    return (*attitude, gx - bx, gy - by, gz - bz, bx, by, bz, gx, gy, gz)
+    qx, qy, qz, qw = qx * scale, qy * scale, qz * scale, qw * scale
+    return qx, qy, qz, qw, gx - bx, gy - by, gz - bz, bx, by, bz, gx, gy, gz
 
 
-def advanced_rows(
-    states: Vector, measured: Vector, kp: float, ki: float, dt: float, g: float
-) -> Vector:
+def advanced_rows(states: Vector, measured: Vector, gains: Gains) -> Vector:
     """Return the states of many filters a period later, as `advanced`.
 
     Args:
         states: Shape (n, 13).
         measured: Shape (n, 6).
-        kp: See `advanced`.
-        ki: See `advanced`.
-        dt: See `advanced`.
-        g: See `advanced`.
+        gains: See `advanced`.
     """
     attitudes, biases, last = states[:, :4], states[:, 7:10], states[:, 10:]
     rates, accelerations = measured[:, :3], measured[:, 3:]
-    squares, gravity = np.einsum("ij,ij->i", accelerations, accelerations), g * g
+    gravity, half = gains.gravity, gains.half
+    squares = np.einsum("ij,ij->i", accelerations, accelerations)
     weights = np.maximum(gravity - 2 * np.abs(squares - gravity), 0.0)
     weights /= np.where(weights > 0, gravity * np.sqrt(squares), 1.0)
     up = turned_back(attitudes, np.broadcast_to(_UP, rates.shape))
     errors = cross(accelerations, up) * weights[:, None]
-    turns = from_rotation_vectors(dt * (0.5 * (last + rates) - biases + kp * errors))
-    attitudes = product(attitudes, turns)
+    halves = half * (0.5 * (last + rates) - biases) + gains.turn * errors
+    attitudes = product(attitudes, from_rotation_vectors(2 * halves))
     attitudes /= np.sqrt(np.einsum("ij,ij->i", attitudes, attitudes))[:, None]
-    biases = biases - ki * dt * errors
+    biases = biases - gains.bias * errors
     return np.concatenate([attitudes, rates - biases, biases, rates], axis=1)
 
 

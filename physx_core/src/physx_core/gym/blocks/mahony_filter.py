@@ -13,6 +13,7 @@ from gymnasium import spaces
 from physx_core.errors import ConfigError
 from physx_core.gym.blocks.block import ObserverBlock
 from physx_core.gym.blocks.mahony import (
+    Gains,
     advanced,
     advanced_rows,
     roll_pitch_yaw,
@@ -88,7 +89,7 @@ class MahonyFilter(ObserverBlock):
         self.ki = numbers.not_negative(f"{where}ki", ki)
         self.exact_init, self.ignore_twist = exact_init, ignore_twist
         self.compute_rpy = compute_rpy
-        self.connect()
+        self.refresh_connection()
 
     def connect(self) -> None:
         """Find the IMUs."""
@@ -100,9 +101,9 @@ class MahonyFilter(ObserverBlock):
             )
         count = len(self.sensors)
         self._measured: Vector = simulator.sensed["Imu"]
-        self._moving = self._measured[4:] if count > 1 else self._measured[4:].reshape(-1)
+        self._moving = self._measured[4:] if count > 1 else self._measured[4:, 0]
         self.estimates = np.zeros((16 if self.compute_rpy else 13, count))
-        self._filtered = self.estimates[:13] if count > 1 else self.estimates.reshape(-1)[:13]
+        self._filtered = self.estimates[:13] if count > 1 else self.estimates[:13, 0]
         self._biases, self._is_first = self.estimates[7:10], True
         places = {"orientation": slice(0, 4), "angular_velocity": slice(4, 7)}
         if self.compute_rpy:
@@ -121,7 +122,7 @@ class MahonyFilter(ObserverBlock):
         """Take up the period."""
         super().setup()
         gravity = math.hypot(*self.env.simulator.world.gravity)
-        self._gains = (self.kp, self.ki, self.period, gravity)
+        self._gains = Gains.of(self.kp, self.ki, self.period, gravity)
 
     def begin(self) -> None:
         """Begin with the attitudes that the IMUs say, without bias."""
@@ -164,10 +165,10 @@ class MahonyFilter(ObserverBlock):
             return
         if state.ndim == 1:
             measured = self._moving.tolist()
-            found = advanced(state.tolist(), measured, *self._gains)
+            found = advanced(state.tolist(), measured, self._gains)
             _STATE.pack_into(state, 0, *found)
         else:
-            state.T[:] = advanced_rows(state.T, self._moving.T, *self._gains)
+            state.T[:] = advanced_rows(state.T, self._moving.T, self._gains)
         if self.ignore_twist or self.compute_rpy:
             self._complete()
 

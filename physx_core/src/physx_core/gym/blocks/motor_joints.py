@@ -57,6 +57,16 @@ class JointEncoders(SharedArrays):
             np.take(self._measured, self._places, 1, self.values, "clip")
             np.multiply(self.values, self._scales, self.values)
 
+    def buffer(self) -> Vector:
+        """Return a new array like the values, in the same order in memory.
+
+        To calculate with arrays of different orders takes three times as long.
+        """
+        shape = self.values.shape
+        if self.values.flags.c_contiguous:
+            return np.zeros(shape)
+        return np.zeros(shape[::-1]).T
+
 
 class MotorJoints(SharedArrays):
     """The joints that an environment's motors drive, in the motors' order; all of shape (motors,).

@@ -65,7 +65,7 @@ class MotorSafetyLimit(ControllerBlock):
         self.kp, self.kd = kp, kd
         self.soft_position_margin = soft_position_margin
         self.soft_velocity_max = soft_velocity_max
-        self.connect()
+        self.refresh_connection()
 
     def connect(self) -> None:
         """Take up the limits of the environment's motors."""
@@ -84,9 +84,11 @@ class MotorSafetyLimit(ControllerBlock):
         # With a shaft that turns the other way, the joint's upper limit is the shaft's lower one.
         limits = np.sort(np.array([self.soft_lower, self.soft_upper]) * signs, axis=0)
         self._encoders = self.joints.encoders
-        self._gains = np.array([kp * kd, kd]) * signs
-        self._scaled, self._room = np.zeros((2, count)), np.zeros((2, count))
+        self._scaled, gains = self._encoders.buffer(), self._encoders.buffer()
+        gains[:] = np.array([kp * kd, kd]) * signs
+        self._room = np.zeros((2, count))
         self._parts = (*self._scaled, *(kp * kd * limits), *self._room)
+        self._measured = (self._encoders.values, gains, self._scaled)
         self._most = np.array([kd * fastest] * 2)
         self._least = -self._most
         self._bounded = bool(np.isfinite(self._most).any())
@@ -96,7 +98,7 @@ class MotorSafetyLimit(ControllerBlock):
         if self._encoders.is_copy:
             self._encoders.refresh()
         positions, velocities, lower, upper, backward, forward = self._parts
-        multiply(self._encoders.values, self._gains, self._scaled)
+        multiply(*self._measured)
         if self._bounded:
             subtract(lower, positions, backward)
             subtract(upper, positions, forward)

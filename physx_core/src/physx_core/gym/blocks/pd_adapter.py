@@ -62,7 +62,7 @@ class PDAdapter(ControllerBlock):
         if order not in (0, 1):
             raise ConfigError(f'PDAdapter "{name}": order is {order!r} but must be 0 or 1.')
         self.order, self.is_instantaneous, self.deadband = order, is_instantaneous, deadband
-        self.connect()
+        self.refresh_connection()
 
     def connect(self) -> None:
         """Take up the bounds of the controller's targets."""

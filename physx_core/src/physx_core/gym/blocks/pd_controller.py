@@ -76,7 +76,7 @@ class PDController(ControllerBlock):
         self.joint_position_margin = joint_position_margin
         self.joint_velocity_limit = joint_velocity_limit
         self.joint_acceleration_limit = joint_acceleration_limit
-        self.connect()
+        self.refresh_connection()
 
     def connect(self) -> None:
         """Take up the limits of the environment's motors."""
@@ -103,12 +103,12 @@ class PDController(ControllerBlock):
         self.targets = Targets(self.lower, self.upper, self.max_velocity, self.max_acceleration)
         self.target_state = self.targets.state
         gains = kp / self.joints.reduction
-        self._encoders, errors = self.joints.encoders, np.zeros((2, len(gains)))
-        self._parts = (
-            *(errors, errors[0], errors[1], np.array([gains, gains * kd])),
-            *(self.targets.pair, self._encoders.values),
-            *(-self.joints.max_torque, self.joints.max_torque),
-        )
+        self._encoders, self._errors = self.joints.encoders, np.zeros((2, len(gains)))
+        self._gains = np.array([gains, gains * kd])
+        self._least, self._most = -self.joints.max_torque, self.joints.max_torque
+        # Row by row, as what is measured may have another order in memory.
+        targets = (self.targets.positions, self.targets.velocities)
+        self._rows = (*targets, *self._encoders.values, *self._errors)
 
     def setup(self) -> None:
         """Take up the periods."""
@@ -143,14 +143,15 @@ class PDController(ControllerBlock):
     def compute_command(self, action: Vector, command: Vector) -> None:
         """Move the targets on, and write the torques, shape (motors,), in N m or N."""
         self.targets.step(action)
-        errors, position_errors, velocity_errors, gains, pair, measured, least, most = self._parts
         if self._encoders.is_copy:
             self._encoders.refresh()
-        subtract(pair, measured, errors)
-        multiply(errors, gains, errors)
-        add(position_errors, velocity_errors, command)
-        minimum(command, most, out=command)
-        maximum(command, least, out=command)
+        positions, velocities, seen, seen_velocities, errors, velocity_errors = self._rows
+        subtract(positions, seen, errors)
+        subtract(velocities, seen_velocities, velocity_errors)
+        multiply(self._errors, self._gains, self._errors)
+        add(errors, velocity_errors, command)
+        minimum(command, self._most, out=command)
+        maximum(command, self._least, out=command)
 
 
 def check_torques(where: str, env: PipelineEnv, count: int) -> None:

@@ -43,7 +43,7 @@ class QuantityObserver(ObserverBlock):
         if not isinstance(quantity, Quantity):
             raise ConfigError(f'QuantityObserver "{name}": {quantity!r} is no Quantity.')
         self.quantity = quantity
-        self.connect()
+        self.refresh_connection()
 
     def connect(self) -> None:
         """Make a buffer of the form that the quantity has now."""

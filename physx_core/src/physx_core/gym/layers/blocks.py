@@ -8,29 +8,34 @@ from typing import Any
 from gymnasium import spaces
 
 from physx_core.errors import ConfigError
-from physx_core.gym.blocks.block import Block
+from physx_core.gym.blocks.block import ControllerBlock, ObserverBlock
 from physx_core.gym.layer import Layer, PipelineEnv
 from physx_core.interfaces.backend import Vector
 
 
 class Rhythm:
-    """When a block runs, at hand in one place: attributes of a layer take time to be looked up.
+    """When a block runs, and what to call: at hand in one place, as a layer's attributes are slow.
 
     Attributes:
-        block: The block.
-        acts: The next environment below that computes commands.
-        observes: The next environment below that observes.
+        run: Runs the block.
+        act: Computes commands in the next environment below that does.
+        observe: Observes in the next environment below that does.
+        target: Action of that environment.
         stepper: Where the episode is.
         every: Period of the block, in physics steps.
         last: Physics step of the episode at which the block ran last; -1: not yet.
     """
 
-    __slots__ = ("acts", "block", "every", "last", "observes", "stepper")
+    __slots__ = ("act", "every", "last", "observe", "run", "stepper", "target")
 
-    def __init__(self, env: PipelineEnv, block: Any) -> None:
-        self.block, self.stepper = block, env.stepper_state
-        self.acts = _next_with("compute_command", env)
-        self.observes = _next_with("refresh_observation", env)
+    def __init__(self, env: PipelineEnv, block: ObserverBlock | ControllerBlock) -> None:
+        acts = _next_with("compute_command", env)
+        self.act, self.target = acts.compute_command, acts.action
+        self.observe = _next_with("refresh_observation", env).refresh_observation
+        self.run: Any = (
+            block.refresh_observation if isinstance(block, ObserverBlock) else block.compute_command
+        )
+        self.stepper = env.stepper_state
         self.every, self.last = max(block.every, 1), -1
 
 
@@ -49,9 +54,9 @@ class BlockLayer(Layer):
         block: The block.
     """
 
-    block: Block
+    block: ObserverBlock | ControllerBlock
 
-    def __init__(self, env: PipelineEnv, block: Block) -> None:
+    def __init__(self, env: PipelineEnv, block: ObserverBlock | ControllerBlock) -> None:
         """Put a block on the environment that it was made for.
 
         Raises:
@@ -69,17 +74,14 @@ class BlockLayer(Layer):
                     "its own."
                 )
         self.block = block
-        self._connected = env.simulator.builds
-        self._made: tuple[Any, ...] = ()
+        self._basis: tuple[Any, ...] = ()
+        self._build = -1
         self._rhythm = Rhythm(env, block)
         super().__init__(env)
 
     def _initialize_action_space(self) -> None:
         """Let the block take up what changed in the simulator."""
-        builds = self.env.simulator.builds
-        if builds != self._connected:
-            self.block.connect()
-            self._connected = builds
+        self.block.refresh_connection()
         self._initialize_actions()
 
     def _initialize_actions(self) -> None:
@@ -88,10 +90,11 @@ class BlockLayer(Layer):
 
     def _initialize_observation_space(self) -> None:
         """Add the block's parts to the observation below, unless that is as it was."""
-        basis = (self.env.observation_space, self.env.observation, self.action, self._connected)
-        if len(self._made) == 4 and all(a is b for a, b in zip(self._made, basis, strict=True)):
+        build = self.block.connected_to
+        basis = (self.env.observation_space, self.env.observation, self.action)
+        if build == self._build and all(a is b for a, b in zip(self._basis, basis, strict=True)):
             return
-        self._made = basis
+        self._basis, self._build = basis, build
         super()._initialize_observation_space()
         self._add_parts()
         state, space = self.block.get_state(), self.block.state_space
@@ -104,11 +107,11 @@ class BlockLayer(Layer):
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
         """Let the layers below observe."""
-        self._rhythm.observes.refresh_observation(measurement)
+        self._rhythm.observe(measurement)
 
     def compute_command(self, action: Any, command: Vector) -> None:
         """Let the layers below compute the command of this layer's action."""
-        self._rhythm.acts.compute_command(action, command)
+        self._rhythm.act(action, command)
 
     def _initialize_buffers(self) -> None:
         super()._initialize_buffers()

@@ -43,7 +43,7 @@ class ControlledEnv(BlockLayer):
 
     def _initialize_actions(self) -> None:
         controller = self.controller
-        if self._made and self.action_space is controller.action_space:
+        if self._build >= 0 and self.action_space is controller.action_space:
             return
         self.action_space = controller.action_space
         self.action = neutral(self.action_space)
@@ -56,9 +56,8 @@ class ControlledEnv(BlockLayer):
     def compute_command(self, action: Any, command: Vector) -> None:
         """Let the block, if it is due, act on the layer below, and that on the motors."""
         rhythm = self._rhythm
-        below, frame = rhythm.acts, rhythm.stepper.iter
-        target = below.action
+        target, frame = rhythm.target, rhythm.stepper.iter
         if frame != rhythm.last and frame % rhythm.every == 0:
             rhythm.last = frame
-            rhythm.block.compute_command(action, target)
-        below.compute_command(target, command)
+            rhythm.run(action, target)
+        rhythm.act(target, command)

@@ -44,8 +44,8 @@ class ObservedEnv(BlockLayer):
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
         """Let the layers below observe, then the block, if it is due."""
         rhythm = self._rhythm
-        rhythm.observes.refresh_observation(measurement)
+        rhythm.observe(measurement)
         frame = rhythm.stepper.iter
         if frame != rhythm.last and frame % rhythm.every == 0:
             rhythm.last = frame
-            rhythm.block.refresh_observation(measurement)
+            rhythm.run(measurement)

@@ -1,0 +1,111 @@
+"""Dynamics: what is computed for any state of a world, whatever its present one is.
+
+The convention of all states is that of `physx_core.interfaces.layout`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+
+from physx_core.errors import FeatureNotSupportedError
+from physx_core.interfaces.layout import Layout, Vector
+
+
+class Dynamics(ABC):
+    """The dynamics of a world; a part of `Simulation`.
+
+    Attributes:
+        engine: Name of the engine.
+        layout: Names and places in the state.
+        features: What it can do: names of `physx_core.interfaces.features.FEATURES`.
+    """
+
+    engine: str = ""
+    layout: Layout
+    features: frozenset[str]
+
+    @abstractmethod
+    def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
+        """Return the accelerations, shape (nv,), that torques (nv,) cause in a state.
+
+        Damping, springs and Coulomb friction of the joints act; contacts and limits do not. All
+        joints are driven by torques here, whatever their mode. Accelerations are derivatives of
+        the velocities, so a base's are in its own frame.
+        """
+
+    @abstractmethod
+    def inverse_dynamics(
+        self, positions: Vector, velocities: Vector, accelerations: Vector
+    ) -> Vector:
+        """Return the torques, shape (nv,), that cause accelerations (nv,) in a state."""
+
+    def mass_matrix(self, positions: Vector) -> Vector:
+        """Return the mass matrix, shape (nv, nv)."""
+        raise self._lacks("mass_matrix")
+
+    def jacobian(
+        self, body: str, positions: Vector, point: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> Vector:
+        """Return the Jacobian, shape (6, nv), of a point of a link or object.
+
+        Times the velocities it gives the point's linear velocity, then the body's angular velocity,
+        both along the world's axes.
+
+        Args:
+            body: Name of the link or object.
+            positions: Shape (nq,).
+            point: In the body's frame, in m.
+        """
+        raise self._lacks("jacobian")
+
+    def forward_dynamics_derivatives(
+        self, positions: Vector, velocities: Vector, torques: Vector
+    ) -> tuple[Vector, Vector, Vector]:
+        """Return the derivatives of `forward_dynamics` by positions, velocities and torques.
+
+        Returns:
+            Three arrays of shape (nv, nv), rows are accelerations. Those by the positions are by a
+            small motion along each velocity, so a base has six columns, not seven. Coulomb friction
+            counts as constant.
+        """
+        raise self._lacks("derivatives")
+
+    def forward_dynamics_batch(
+        self, positions: Vector, velocities: Vector, torques: Vector
+    ) -> Vector:
+        """Return `forward_dynamics` of many states, shape (n, nv); each row is a state.
+
+        Args:
+            positions: Shape (n, nq).
+            velocities: Shape (n, nv).
+            torques: Shape (n, nv).
+        """
+        states = zip(positions, velocities, torques, strict=True)
+        found = [self.forward_dynamics(*state) for state in states]
+        return np.array(found, np.float64).reshape(-1, self.layout.nv)
+
+    def forward_dynamics_derivatives_batch(
+        self, positions: Vector, velocities: Vector, torques: Vector
+    ) -> tuple[Vector, Vector]:
+        """Return accelerations of many states, and their derivatives.
+
+        Args:
+            positions: Shape (n, nq); each row is a state.
+            velocities: Shape (n, nv).
+            torques: Shape (n, nv).
+
+        Returns:
+            Accelerations, shape (n, nv), and the derivatives of `forward_dynamics_derivatives` by
+            positions, velocities and torques, shape (3, n, nv, nv).
+        """
+        states = zip(positions, velocities, torques, strict=True)
+        found = [self.forward_dynamics_derivatives(*state) for state in states]
+        shape = (len(found), 3, self.layout.nv, self.layout.nv)
+        derivatives = np.array(found, np.float64).reshape(shape).swapaxes(0, 1)
+        return self.forward_dynamics_batch(positions, velocities, torques), derivatives
+
+    def _lacks(self, feature: str) -> FeatureNotSupportedError:
+        return FeatureNotSupportedError(self.engine or type(self).__name__, feature, self.features)

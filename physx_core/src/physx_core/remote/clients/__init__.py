@@ -1,0 +1,1 @@
+"""Clients: environments that run in another process, driven from here."""

@@ -1,0 +1,30 @@
+"""Plain data: what of a value JSON can hold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+_KINDS = "biuf"
+_DEEPEST = 32
+
+
+def plain(value: Any, depth: int = 0) -> Any:
+    """Return a value as data for JSON.
+
+    Arrays become lists. What JSON has nothing for is left out of dictionaries, and is None anywhere
+    else. Numbers that are not finite stay as they are.
+    """
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist() if value.dtype.kind in _KINDS else None
+    if depth >= _DEEPEST:
+        return None
+    if isinstance(value, dict):
+        items = ((str(key), item, plain(item, depth + 1)) for key, item in value.items())
+        return {key: data for key, item, data in items if data is not None or item is None}
+    if isinstance(value, (list, tuple)):
+        return [plain(item, depth + 1) for item in value]
+    return None

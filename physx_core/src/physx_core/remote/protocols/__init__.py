@@ -1,0 +1,1 @@
+"""The wire protocols that physx brings, one module each."""

@@ -1,0 +1,93 @@
+"""`serve`, `connect` and `connect_vector`: a protocol by name brought to life."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from physx_core.errors import UsageError
+from physx_core.plugins import resolve
+from physx_core.remote.protocol import Protocol, Service, find_protocol, parse_address
+from physx_core.remote.worlds import GYMNASIUM, open_worlds
+
+if TYPE_CHECKING:
+    import gymnasium
+    from gymnasium.vector import VectorEnv
+
+    from physx_core.remote.environment import RLEnvironment
+
+
+def serve(
+    environment: Any,
+    protocol: str | type[Protocol] = "physx",
+    *,
+    address: str = "127.0.0.1",
+    port: int = 0,
+    num_worlds: int = 1,
+    env_kwargs: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Service:
+    """Return a service of an environment; call its `run`, or `poll` again and again.
+
+    Args:
+        environment: An `RLEnvironment`, its class or reference; or what
+            `physx_core.remote.open_worlds` takes.
+        protocol: Name of the protocol, ``"package.module:Class"``, or the class.
+        address: Where to listen, or what to connect to.
+        port: Likewise; 0: any free port, or the protocol's own.
+        num_worlds: How many worlds to serve on one connection.
+        env_kwargs: Keyword arguments of each environment.
+        options: The protocol's own options.
+
+    Raises:
+        PhysxError: There is no such environment or protocol, or it cannot listen there.
+    """
+    kind = find_protocol(protocol)(**options)
+    scene = _scene(environment, env_kwargs or {})
+    if scene is None:
+        worlds = open_worlds(environment, num_worlds, env_kwargs)
+        try:
+            return kind.service(worlds, address=address, port=port)
+        except BaseException:
+            worlds.close()
+            raise
+    if num_worlds != 1:
+        raise UsageError(f"An RLEnvironment is one world, and num_worlds is {num_worlds}.")
+    return kind.service(scene, address=address, port=port)
+
+
+def connect(
+    address: str, protocol: str | type[Protocol] = "physx", **options: Any
+) -> gymnasium.Env[Any, Any]:
+    """Return a service's environment, driven from here.
+
+    Args:
+        address: ``"host:port"``.
+        protocol: See `serve`.
+        options: The options of the protocol's client.
+
+    Raises:
+        PhysxError: Nothing answers there, or not what was expected.
+    """
+    return find_protocol(protocol).connect(*parse_address(address), **options)
+
+
+def connect_vector(
+    address: str, protocol: str | type[Protocol] = "physx", **options: Any
+) -> VectorEnv[Any, Any, Any]:
+    """Return a service's worlds, driven from here together; see `connect`."""
+    return find_protocol(protocol).connect_vector(*parse_address(address), **options)
+
+
+def _scene(environment: Any, arguments: Mapping[str, Any]) -> RLEnvironment | None:
+    """Return the `RLEnvironment` that is meant, or None for what is of another kind."""
+    from physx_core.remote.environment import RLEnvironment
+
+    if isinstance(environment, str) and not environment.startswith(GYMNASIUM):
+        if ":" not in environment:
+            return None
+        environment = resolve("environment", environment)
+    if inspect.isclass(environment) and issubclass(environment, RLEnvironment):
+        return environment(**arguments)
+    return environment if isinstance(environment, RLEnvironment) else None

@@ -1,0 +1,61 @@
+"""Guard: ends processes on this machine once this process is gone, whatever became of it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import threading
+
+# Each line names all process groups that there are; the last one counts when no more can come.
+_SCRIPT = (
+    "while read -r line; do groups=$line; done; "
+    'for group in $groups; do kill -s KILL -- "-$group"; done'
+)
+
+
+class Guard:
+    """Knows the process groups of the clients; a shell ends those that this process leaves behind.
+
+    A client whose server is gone leaves on its own, unless it is stopped, or an engine keeps it
+    from running any Python. The shell waits at the end of a pipe that only this process can write
+    to, and which closes when this process ends, be it with SIGKILL. There is a shell as long as
+    there are groups.
+    """
+
+    def __init__(self) -> None:
+        """Begin with no groups, and no shell."""
+        self._groups: set[int] = set()
+        self._shell: subprocess.Popen[bytes] | None = None
+        self._lock = threading.Lock()
+
+    def add(self, group: int) -> None:
+        """Watch over a process group."""
+        with self._lock:
+            self._groups.add(group)
+            if self._shell is None:
+                with contextlib.suppress(OSError):  # no shell: clients still leave on their own
+                    self._shell = subprocess.Popen(
+                        ["/bin/sh", "-c", _SCRIPT],
+                        stdin=subprocess.PIPE,
+                        stdout=subprocess.DEVNULL,
+                        stderr=subprocess.DEVNULL,
+                        bufsize=0,
+                        start_new_session=True,
+                    )
+            self._tell()
+
+    def remove(self, group: int) -> None:
+        """Forget a process group, all of which has ended."""
+        with self._lock:
+            self._groups.discard(group)
+            self._tell()
+            if not self._groups and self._shell is not None:
+                shell, self._shell = self._shell, None
+                shell.communicate()
+
+    def _tell(self) -> None:
+        if self._shell is not None and self._shell.stdin is not None:
+            line = " ".join(map(str, sorted(self._groups))) + "\n"
+            with contextlib.suppress(OSError):  # somebody ended the shell
+                os.write(self._shell.stdin.fileno(), line.encode())

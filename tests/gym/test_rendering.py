@@ -1,0 +1,285 @@
+"""Pictures, recordings and films of environments; pictures need a Vulkan driver."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import psutil
+import pytest
+import rerun as rr
+from PIL import Image
+
+from physx_core import plugins
+from physx_core.errors import (
+    ConfigError,
+    LogError,
+    PluginNotFoundError,
+    UnknownOptionError,
+    VisualizerError,
+)
+from physx_core.gym import RobotEnv, Simulator, replay
+from physx_core.gym.drawing import WorldDrawing
+from physx_core.gym.film import write_film
+from physx_core.scene import Factory
+from physx_core.world import (
+    Box,
+    Capsule,
+    Cylinder,
+    Ground,
+    HeightField,
+    Mesh,
+    Robot,
+    Sphere,
+    Stairs,
+    World,
+)
+
+SIZE = (160, 120)
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    """Pictures of an environment that moves; skips where there is nothing to draw with."""
+    before = children()
+    env = RobotEnv("cartpole", 0.02, render_mode="rgb_array")
+    env.viewer_kwargs["picture_size"] = SIZE
+    env.reset(seed=0)
+    try:
+        found = [env.render(), env.render()]
+    except VisualizerError as error:
+        if "Vulkan" not in str(error) or os.environ.get("CI") == "true":
+            raise
+        pytest.skip(str(error))
+    for _ in range(10):
+        env.step(env.action_space.high)
+    found.append(env.render())
+    env.reset(seed=0)
+    found.append(env.render())
+    env.close()
+    assert children() == before
+    return found
+
+
+def children():
+    return {child.pid for child in psutil.Process().children(recursive=True)}
+
+
+def recorded(steps=20, robot="cartpole", **options):
+    env = RobotEnv(robot, 0.02, **options)
+    env.eval()
+    env.reset(seed=0)
+    for _ in range(steps):
+        env.step(env.action_space.sample())
+    return env
+
+
+def transforms(path, instance=1):
+    """Return how many poses each step of a recording has."""
+    counts: dict[int, int] = {}
+    for chunk in rr.chunk.RrdReader(path).stream().filter(content=f"env_{instance}/tf"):
+        for step in chunk.to_record_batch().column("step").to_pylist():
+            counts[step] = counts.get(step, 0) + 1
+    return counts
+
+
+# Pictures -----------------------------------------------------------------------------------
+
+
+def test_pictures_show_the_present_state(pictures):
+    first, again, moved, back = pictures
+    assert all(each.shape == (120, 160, 3) and each.dtype == np.uint8 for each in pictures)
+    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 30
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(first, back)
+    assert (first != moved).any(axis=2).mean() > 0.003
+
+
+def test_a_film(pictures, tmp_path):
+    env = recorded(10)
+    path = tmp_path / "a.gif"
+    assert env.replay(record_video_path=path, frame_rate=10, picture_size=SIZE) == path
+    with Image.open(path) as film:
+        assert film.size == SIZE
+        assert film.n_frames == 3
+        assert film.info["duration"] == 100
+
+
+def test_without_the_viewer_the_remedy_is_named():
+    env = RobotEnv("cartpole", 0.02, render_mode="rgb_array")
+    env.viewer_kwargs["visualizer"] = "rerunn"
+    env.reset(seed=0)
+    with pytest.raises(PluginNotFoundError, match="pip install"):
+        env.render()
+
+
+def test_without_a_display_there_is_no_window():
+    env = recorded(2, render_mode=None)
+    with pytest.raises(VisualizerError, match="there is no display"):
+        env.replay()
+    env.render_mode = "human"
+    with pytest.raises(VisualizerError, match="there is no display"):
+        env.render()
+
+
+def test_unknown_options_are_refused():
+    with pytest.raises(UnknownOptionError, match="render_mode"):
+        RobotEnv("cartpole", 0.02, render_mode="movie")
+    env = RobotEnv("cartpole", 0.02, render_mode="rgb_array")
+    env.viewer_kwargs["size"] = SIZE
+    env.reset(seed=0)
+    with pytest.raises((UnknownOptionError, TypeError), match="size"):
+        env.render()
+
+
+# Replays ------------------------------------------------------------------------------------
+
+
+def test_a_replay_is_a_recording_in_real_time(tmp_path):
+    env = recorded(25)
+    assert env.replay(path=tmp_path / "a.rrd") == tmp_path / "a.rrd"
+    frames = transforms(tmp_path / "a.rrd")
+    assert sorted(frames) == list(range(16))  # 0.5 s at 30 a second
+    assert set(frames.values()) == {3}
+
+
+def test_several_logs_side_by_side(tmp_path):
+    first, second = recorded(5), recorded(10, "ant", fixed_base=False)
+    log = second.reset()[1]["log_path"]
+    second.step(second.action_space.sample())
+    second.stop()
+    replay(first.log_data, compare=[log, second.log_data], path=tmp_path / "a.rrd", frame_rate=100)
+    assert sorted(transforms(tmp_path / "a.rrd", 1)) == list(range(11))
+    assert sorted(transforms(tmp_path / "a.rrd", 2)) == list(range(11))
+    assert sorted(transforms(tmp_path / "a.rrd", 3)) == list(range(11))
+
+
+def test_replays_that_make_no_sense(tmp_path):
+    env = RobotEnv("cartpole", 0.02)
+    env.reset(seed=0)
+    with pytest.raises(LogError, match="Nothing was recorded"):
+        env.replay(path=tmp_path / "a.rrd")
+    env = recorded(2)
+    with pytest.raises(ConfigError, match="frame_rate"):
+        env.replay(path=tmp_path / "a.rrd", frame_rate=0)
+    data = env.log_data
+    data["constants"]["world"] = World([Robot("acrobot"), Robot("cartpole", name="b")])
+    with pytest.raises(LogError, match="2 positions, but its world has 4"):
+        replay(data, path=tmp_path / "a.rrd")
+
+
+# What is drawn ------------------------------------------------------------------------------
+
+CUBE = """v 0 0 0
+v 1 0 0
+v 0 1 0
+v 0 0 1
+f 1 3 2
+f 1 2 4
+f 2 3 4
+f 1 4 3
+"""
+
+
+def drawn(world, turn=None):
+    """Return what was set last of each object of a scene, by name."""
+    engine = plugins.resolve("backend", "dart")
+    simulation, factory = engine.build(world), Factory()
+    drawing = WorldDrawing(factory, world, engine, simulation.layout, "world")
+    drawing.add(simulation.body_poses())
+    if turn is not None:
+        turn(simulation)
+        drawing.move(simulation.body_poses())
+    found = {}
+    for event in factory.take_events():
+        found.setdefault(event.name, {}).update(event.values)
+    drawing.close()
+    simulation.close()
+    return found
+
+
+def test_objects_of_all_kinds_are_drawn_where_they_are(tmp_path):
+    (tmp_path / "a.obj").write_text(CUBE)
+    pose = {"position": (1.0, 2.0, 3.0), "orientation": (0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5))}
+    world = World(
+        [Robot("cartpole", name="robot")],
+        objects=[
+            Box(name="box", size=(0.2, 0.4, 0.6), **pose),
+            Sphere(name="ball", radius=0.1, static=True, **pose),
+            Capsule(name="pill", radius=0.1, length=0.3, **pose),
+            Cylinder(name="can", radius=0.1, length=1.0, **pose),
+            Mesh(name="mesh", path=tmp_path / "a.obj", **pose),
+        ],
+        contacts="none",
+    )
+
+    def move(simulation):
+        q = simulation.positions()
+        for part in simulation.layout.parts.values():
+            if part.name != "robot":
+                q[part.positions.start] += 10.0
+        simulation.set_state(q, simulation.velocities())
+
+    found = drawn(world, move)
+    np.testing.assert_allclose(found["box"]["position"], (11, 2, 3))
+    np.testing.assert_allclose(found["box"]["half_sizes"], (0.1, 0.2, 0.3))
+    np.testing.assert_allclose(found["box"]["orientation"], pose["orientation"], atol=1e-6)
+    np.testing.assert_allclose(found["ball"]["position"], (1, 2, 3))
+    np.testing.assert_allclose(found["pill"]["position"], (11, 2, 3))
+    np.testing.assert_allclose(found["mesh"]["poses"], [(11, 2, 3, *pose["orientation"])], atol=1e-6)
+    corners = found["can"]["positions"]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    np.testing.assert_allclose(low, (10.5, 1.9, 2.9), atol=1e-6)  # it lies along x
+    np.testing.assert_allclose(high, (11.5, 2.1, 3.1), atol=1e-6)
+    assert found["robot"]["bodies"] == ["rail", "cart", "pole"]
+    assert found["robot"]["urdf"].endswith("cartpole.urdf")
+
+
+@pytest.mark.parametrize(
+    ("ground", "names"),
+    [
+        (Ground(height=1.0, normal=(0.0, 0.0, -1.0)), {"ground"}),
+        (Stairs(steps=2), {"ground", "stairs/0", "stairs/1"}),
+        (HeightField(np.arange(12.0).reshape(3, 4), spacing=(1.0, 1.0)), {"ground"}),
+        (None, set()),
+    ],
+)
+def test_grounds_are_drawn(ground, names):
+    found = drawn(World([Robot("ant", fixed_base=False)], ground=ground))
+    assert found.keys() - {"robot", "view"} == names
+    assert found["view"]["follow"] == "robot"
+    if isinstance(ground, HeightField):
+        points, cells = found["ground"]["positions"], found["ground"]["cells"]
+        assert points.shape == (12, 3)
+        assert len(cells) == 2 * 2 * 3
+        a, b, c = (points[cells[:, corner]] for corner in range(3))
+        assert (np.cross(b - a, c - a)[:, 2] > 0).all()
+    elif isinstance(ground, Ground):
+        assert found["ground"]["position"][2] == pytest.approx(-1.0, abs=0.02)
+
+
+def test_a_camera_stays_where_the_base_is_fixed():
+    assert "follow" not in drawn(World([Robot("cartpole")]))["view"]
+
+
+def test_films_of_other_formats_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"\.gif, \.webp, \.png, not a\.mp4"):
+        write_film([np.zeros((4, 4, 3), np.uint8)], tmp_path / "a.mp4", 30)
+
+
+def test_a_simulator_with_other_options_is_drawn_anew(pictures):
+    env = RobotEnv(Simulator(World([Robot("cartpole")])), 0.02, render_mode="rgb_array")
+    env.viewer_kwargs["picture_size"] = SIZE
+    env.reset(seed=0)
+    first = env.render()
+    env.stop()
+    env.simulator.set_options({"world": {"gravity": (0.0, 0.0, -1.0)}})
+    env.reset(seed=0)
+    np.testing.assert_array_equal(env.render(), first)
+    env.close()
