@@ -75,7 +75,9 @@ def test_keys_become_actions_until_the_end(env):
     assert actions == [0.0, 1.0, 1.0, -1.0, 0.0]
     assert env.calls[0][2] is None
     assert env.calls[1][2] == 0.0
-    assert [float(call[1]["t"]) for call in env.calls] == pytest.approx([0, 0.002, 0.004, 0.006, 0.008])
+    assert [float(call[1]["t"]) for call in env.calls] == pytest.approx(
+        [0, 0.002, 0.004, 0.006, 0.008]
+    )
     assert env.calls[0][3] == {"speed": 3}
     assert not env.is_simulation_running
 

@@ -40,7 +40,9 @@ def log():
     variables = {"time": np.arange(50) * 0.01}
     variables |= {f"v.{number}": values[:, number] for number in range(3)}
     variables["n"] = rng.integers(-(2**63), 2**63 - 1, 50)
-    return Log({"seed": 3, "options": {"a": [1, None]}, "units": {"time": "s", "v.1": "m/s²"}}, variables)
+    return Log(
+        {"seed": 3, "options": {"a": [1, None]}, "units": {"time": "s", "v.1": "m/s²"}}, variables
+    )
 
 
 def run(env, steps, seed=0):
@@ -414,7 +416,8 @@ def test_command_line(tmp_path, capsys):
     assert "motor.torque.slider" in told
     assert "state.q" not in told
     plot, recording = tmp_path / "a.png", tmp_path / "a.rrd"
-    assert main(["log", path, path, "--plot", str(plot), "--replay", str(recording)]) == 0
+    words = ["log", path, path, "--columns", "motor", "--plot", str(plot)]
+    assert main([*words, "--replay", str(recording)]) == 0
     assert plot.read_bytes()[:4] == b"\x89PNG"
     assert recording.read_bytes()[:3] == b"RRF"
     assert main(["log", str(tmp_path / "none.h5")]) == 1

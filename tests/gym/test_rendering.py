@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from typing import ClassVar
 
 import numpy as np
 import psutil
@@ -21,6 +22,7 @@ from physx_core.errors import (
 from physx_core.gym import RobotEnv, Simulator, replay
 from physx_core.gym.drawing import WorldDrawing
 from physx_core.gym.film import write_film
+from physx_core.interfaces.visualizer import Visualizer
 from physx_core.scene import Factory
 from physx_core.world import (
     Box,
@@ -232,7 +234,9 @@ def test_objects_of_all_kinds_are_drawn_where_they_are(tmp_path):
     np.testing.assert_allclose(found["box"]["orientation"], pose["orientation"], atol=1e-6)
     np.testing.assert_allclose(found["ball"]["position"], (1, 2, 3))
     np.testing.assert_allclose(found["pill"]["position"], (11, 2, 3))
-    np.testing.assert_allclose(found["mesh"]["poses"], [(11, 2, 3, *pose["orientation"])], atol=1e-6)
+    np.testing.assert_allclose(
+        found["mesh"]["poses"], [(11, 2, 3, *pose["orientation"])], atol=1e-6
+    )
     corners = found["can"]["positions"]
     low, high = corners.min(axis=0), corners.max(axis=0)
     np.testing.assert_allclose(low, (10.5, 1.9, 2.9), atol=1e-6)  # it lies along x
@@ -273,13 +277,55 @@ def test_films_of_other_formats_are_refused(tmp_path):
         write_film([np.zeros((4, 4, 3), np.uint8)], tmp_path / "a.mp4", 30)
 
 
-def test_a_simulator_with_other_options_is_drawn_anew(pictures):
-    env = RobotEnv(Simulator(World([Robot("cartpole")])), 0.02, render_mode="rgb_array")
-    env.viewer_kwargs["picture_size"] = SIZE
+class Fake(Visualizer):
+    """A visualizer that keeps what it is told."""
+
+    opened: ClassVar[list[Fake]] = []
+
+    def __init__(self, **options):
+        self.options, self.steps, self.is_open = options, [], True
+        self.opened.append(self)
+
+    def events(self, instance_id, step, events):
+        self.steps.append((instance_id, step, [event.action for event in events]))
+
+    def close(self):
+        self.is_open = False
+
+
+def test_a_viewer_for_humans_follows_each_step():
+    Fake.opened.clear()
+    env = RobotEnv(Simulator(World([Robot("cartpole")])), 0.02, render_mode="human")
+    env.viewer_kwargs |= {"visualizer": Fake, "port": 5}
     env.reset(seed=0)
-    first = env.render()
+    assert env.render() is None
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    (viewer,) = Fake.opened
+    assert viewer.options == {"mode": "spawn", "save": False, "port": 5}
+    assert [step for _, step, _ in viewer.steps] == list(range(5))
+    assert viewer.steps[0][2] == ["add", "add", "update"]  # the view and the robot
+    assert viewer.steps[4][2] == ["update"]
+    env.close()
+    assert not viewer.is_open
+
+
+def test_a_simulator_with_other_options_is_drawn_anew():
+    Fake.opened.clear()
+    env = RobotEnv(Simulator(World([Robot("cartpole")])), 0.02, render_mode="human")
+    env.viewer_kwargs["visualizer"] = Fake
+    env.reset(seed=0)
+    env.reset(seed=0)
+    assert len(Fake.opened) == 1
     env.stop()
     env.simulator.set_options({"world": {"gravity": (0.0, 0.0, -1.0)}})
     env.reset(seed=0)
-    np.testing.assert_array_equal(env.render(), first)
-    env.close()
+    assert [viewer.is_open for viewer in Fake.opened] == [False, True]
+
+
+def test_a_viewer_without_pictures_is_refused():
+    env = RobotEnv("cartpole", 0.02, render_mode="rgb_array")
+    env.viewer_kwargs["visualizer"] = Fake
+    env.reset(seed=0)
+    with pytest.raises(VisualizerError, match="Fake makes no pictures"):
+        env.render()

@@ -52,7 +52,11 @@ def columns_after(telemetry):
         (np.zeros((2, 2)), ["a", "b", "c", "d"], ["v.a", "v.b", "v.c", "v.d"]),
         (np.zeros(1), "a", ["v.a"]),
         (np.zeros(()), "a", ["v.a"]),
-        ({"k": np.zeros(1), "l": (np.zeros(2),)}, {"k": "a", "l": [["b", "c"]]}, ["v.a", "v.b", "v.c"]),
+        (
+            {"k": np.zeros(1), "l": (np.zeros(2),)},
+            {"k": "a", "l": [["b", "c"]]},
+            ["v.a", "v.b", "v.c"],
+        ),
     ],
 )
 def test_names_are_those_given(value, fieldnames, wanted):

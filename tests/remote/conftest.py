@@ -11,10 +11,11 @@ import threading
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import numpy as np
 import pytest
 
 from physx_core import Field
-from physx_core.remote import Messages, RLAgent, RLEnvironment, RLEnvWorld, serve
+from physx_core.remote import Messages, RLAgent, RLEnvironment, RLEnvWorld, connect, serve
 from physx_core.remote.messages import ERROR, extension, fill
 
 PATIENCE = 30.0
@@ -232,3 +233,34 @@ def original_client():
 def message():
     """Return a request as it goes over the wire."""
     return framed
+
+
+@pytest.fixture
+def drive(in_thread):
+    """Serve an environment in a thread and return a client of it."""
+    clients = []
+
+    def drive(environment, protocol_options=None, **options):
+        service = in_thread(environment, **(protocol_options or {}))
+        host, port = service.address
+        clients.append(connect(f"{host}:{port}", "godot-gym", **options))
+        return clients[-1]
+
+    yield drive
+    for client in clients:
+        client.close()
+
+
+@pytest.fixture
+def same():
+    return _same
+
+
+def _same(first, second):
+    """Return whether two values are the same in structure, type and every bit."""
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(_same(first[k], second[k]) for k in first)
+    if isinstance(first, tuple):
+        return len(first) == len(second) and all(map(_same, first, second))
+    first, second = np.asarray(first), np.asarray(second)
+    return first.dtype == second.dtype and np.array_equal(first, second)

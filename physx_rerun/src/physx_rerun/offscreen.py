@@ -15,6 +15,7 @@ from physx_core.fields import Array
 from physx_rerun.headless import Camera, start
 
 _MARGIN = (16, 80)  # pixels of the window around a view, and some more: its frame, its title
+_NOTES = 10  # pictures after which the viewer's notes of its start are gone
 _PATIENCE = 60.0  # s that a picture may take
 
 
@@ -71,6 +72,8 @@ class OffscreenViewer:
             scene = camera.scene()
             if scene is None:
                 raise VisualizerError("There is nothing to take a picture of: nothing was drawn.")
+            for _ in range(_NOTES if is_first else 0):
+                camera.glance(scene)
             drawn = camera.shoot(scene) if is_first else camera.glance(scene)
         except OSError as error:
             self._viewer.check(wait=2.0)

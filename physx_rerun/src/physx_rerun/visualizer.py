@@ -227,6 +227,7 @@ class RerunVisualizer(Visualizer):
                 self._recording.close()
             if self._offscreen is not None:
                 self._offscreen.close()
+                self._offscreen = None
         if self._recording is None:
             return
         self._recording = self._offscreen = None

@@ -24,6 +24,7 @@ VERBS = {
     "import": "make a dataset of an npz or HDF5 file",
     "predict": "put a session's network into a running environment",
     "client": "run an environment for a run that waits for clients, on this machine or another",
+    "serve": "let another process drive an environment: Godot clients, trainers, physx",
     "log": "show what was recorded of an episode: table, plot, replay",
     "replay": "send stored samples through their environment, to look at them in a viewer",
 }

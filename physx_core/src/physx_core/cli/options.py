@@ -56,7 +56,7 @@ def pipeline_from(
         raise UnknownOptionError(f"The table [{make.kind}]", unknown, known)
     form = dataclasses.make_dataclass(verb, options, kw_only=True)
     form.__doc__ = textwrap.dedent(make.__doc__ or "").split("\n\n")[0]
-    with _registry():
+    with argument_registry():
         chosen: Any = tyro.cli(form, args=rest, prog=f"physx {verb}")
     values = {_python_name(make, name): getattr(chosen, name) for name in (o[0] for o in options)}
     return make(**values)
@@ -165,7 +165,8 @@ def _docstrings(cls: type[Any]) -> dict[str, str]:
     return docs
 
 
-def _registry() -> Registry:
+def argument_registry() -> Registry:
+    """Return what reads ``NAME=VALUE ...`` and references; a context within which it does."""
     registry = ConstructorRegistry()
 
     @registry.primitive_rule

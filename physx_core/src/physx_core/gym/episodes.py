@@ -224,7 +224,7 @@ class Episodes(PipelineEnv):
             simulator.start(positions, velocities)
             info = self._begin(top)
         except BaseException:
-            simulator.stop()
+            self.stop()
             raise
         self._ready = True
         if self.render_mode == "human":

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Awaitable, Generator, Iterator
-from types import TracebackType
 from typing import Any, Self, TypeAlias
 
 import gymnasium
@@ -16,7 +15,7 @@ from physx_core.interfaces.backend import Simulation
 from physx_core.remote.agent import RLAgent
 from physx_core.remote.communication import Communication
 from physx_core.remote.messages import DESCRIPTION, Messages, encoded_extension
-from physx_core.remote.requests import as_frames, as_object, as_speed
+from physx_core.remote.requests import as_frames, as_object, as_seed, as_speed
 from physx_core.remote.spaces import describe_space
 from physx_core.remote.timer import PhysicsFramesTimer
 from physx_core.remote.world import RLEnvWorld
@@ -120,9 +119,8 @@ class RLEnvironment:
     @property
     def frame_time(self) -> float:
         """Simulated time of one physics frame, in s."""
-        if self.simulation is None:
-            return FRAME_TIME
-        return self.frame_steps * self.simulation.period
+        simulation = self.simulation
+        return FRAME_TIME if simulation is None else self.frame_steps * simulation.period
 
     # Running --------------------------------------------------------------------------------
 
@@ -132,8 +130,7 @@ class RLEnvironment:
             self._enter_tree()
             self._ready()
             self._is_ready = True
-            if self.messages is not None and not isinstance(self.messages, Messages):
-                self.messages = Messages(self.messages)
+            self.messages = None if self.messages is None else Messages(self.messages)
 
     def run(self) -> None:
         """Serve at the address that `_ready` began to listen at, until Ctrl-C or `close`.
@@ -164,12 +161,7 @@ class RLEnvironment:
         self.open()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Close the environment."""
         self.close()
 
@@ -310,11 +302,8 @@ class RLEnvironment:
 
     def _seed(self, value: Any) -> None:
         """Take the value of a request to reset, and its seed if it has one."""
-        seed = value.get(self.SEED_KEY) if isinstance(value, dict) else None
-        if seed is not None:
-            if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-                raise RequestError(f"A seed is a whole number of at least 0, not {seed!r}.")
-            self.rng = np.random.default_rng(seed)
+        if isinstance(value, dict) and value.get(self.SEED_KEY) is not None:
+            self.rng = np.random.default_rng(as_seed(value[self.SEED_KEY]))
         self.reset_request = value
 
     # Stepping -------------------------------------------------------------------------------
@@ -338,10 +327,7 @@ class RLEnvironment:
                 elif isinstance(awaited, (int, float)):
                     yield awaited
                 else:
-                    raise UsageError(
-                        f"_step() waits for {awaited!r}: it may wait for a PhysicsFramesTimer, or "
-                        "for a number of seconds."
-                    )
+                    raise UsageError(f"_step() waits for {awaited!r}: no timer, no number of s.")
         finally:
             self.paused = True
             if isinstance(waits, Generator):
@@ -408,5 +394,5 @@ class RLEnvironment:
         """Return what clients may want to know, as JSON."""
         spaces = {"observation": self.observation_space, "action": self.action_space}
         told = {name: describe_space(space) for name, space in spaces.items() if space is not None}
-        messages = self.messages.to_dict() if self.messages is not None else {}
+        messages = {} if self.messages is None else self.messages.to_dict()
         return json.dumps({"version": 1, "messages": messages, "spaces": told})

@@ -60,6 +60,17 @@ def as_frames(value: Any) -> int:
     return int(value)
 
 
+def as_seed(value: Any) -> int:
+    """Return a seed.
+
+    Raises:
+        RequestError: It is no whole number of at least 0.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise RequestError(f"A seed is a whole number of at least 0, not {value!r:.60}.")
+    return value
+
+
 def as_speed(value: Any) -> float | None:
     """Return how much faster than the clock time passes; None for as fast as it can.
 

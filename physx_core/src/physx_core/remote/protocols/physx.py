@@ -87,7 +87,11 @@ class Physx(Protocol):
                 'serve it with the protocol "godot-gym".'
             )
         service = PhysxService(worlds, self.token, **self._options)
-        service.listen(address, port)
+        try:
+            service.listen(address, port)
+        except BaseException:
+            service.close()
+            raise
         return service
 
     @classmethod

@@ -6,7 +6,8 @@ import itertools
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
 
@@ -78,15 +79,13 @@ class Requests:
 
     def _stepped(self, worlds: Sequence[int], actions: Sequence[Any]) -> Iterator[float]:
         step, put, begin = self._worlds.step, self.board.put, time.monotonic()
-        world = 0
-        try:
+        with _Place("step") as place:
             for world, action in zip(worlds, actions, strict=True):
+                place.world = world
                 put(world, step(world, action))
                 if time.monotonic() - begin > _SLICE:
                     yield 0.0
                     begin = time.monotonic()
-        except Exception as error:
-            raise _named(error, world, "step") from error
 
     def resets(self, request: Mapping[str, Any]) -> Outcome:
         """Prepare a new episode of some worlds.
@@ -115,16 +114,15 @@ class Requests:
     def _begun(
         self, worlds: Sequence[int], seeds: Sequence[int | None], options: dict[str, Any] | None
     ) -> Iterator[float]:
-        begin, world = time.monotonic(), 0
-        try:
+        begin = time.monotonic()
+        with _Place("reset") as place:
             for world, seed in zip(worlds, seeds, strict=True):
+                place.world = world
                 observation, info = self._worlds.reset(world, seed, options)
                 self.board.put(world, (observation, 0.0, False, False, info))
                 if time.monotonic() - begin > _SLICE:
                     yield 0.0
                     begin = time.monotonic()
-        except Exception as error:
-            raise _named(error, world, "reset") from error
 
     # Snapshots --------------------------------------------------------------------------------
 
@@ -141,10 +139,8 @@ class Requests:
                 "forgotten, or the client that took them leaves."
             )
         state, rows = self._snapshots[number]
-        try:
+        with _Place("restore", world):
             self._worlds.restore(world, state)
-        except Exception as error:
-            raise _named(error, world, "restore") from error
         self.board.paste(world, rows)
         return world
 
@@ -164,10 +160,8 @@ class Requests:
             return self._snapshots.pop(request.get("snapshot", 0), None) is not None
         if what == "render":
             world = self._world(request)
-            try:
+            with _Place("render", world):
                 return self._worlds.environments[world].render()
-            except Exception as error:
-                raise _named(error, world, "render") from error
         raise RequestError(
             f'There is no request "{what}". There are: reset, last, snapshot, restore, forget and '
             "render."
@@ -181,10 +175,8 @@ class Requests:
             )
         if not self.board.known[world]:
             raise RequestError(f"World {world} has not begun yet: reset it first.")
-        try:
+        with _Place("snapshot", world):
             state = self._worlds.snapshot(world)
-        except Exception as error:
-            raise _named(error, world, "snapshot") from error
         number = next(self._numbers)
         self._snapshots[number] = (state, self.board.copy(world))
         return number
@@ -219,9 +211,27 @@ def reported(error: Exception, place: str = "") -> RequestError:
     return told
 
 
-def _named(error: Exception, world: int, what: str) -> PhysxError:
-    """Return an error that says in which world it was."""
-    if isinstance(error, PhysxError):
-        error.add_note(f"This was world {world} of the service, in {what}().")
-        return error
-    return reported(error, f"World {world} failed in {what}(): ")
+class _Place:
+    """A context in which errors say in which world they were.
+
+    Attributes:
+        world: Number of the world at work.
+    """
+
+    def __init__(self, what: str, world: int = 0) -> None:
+        self.world = world
+        self._what = what
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if isinstance(error, PhysxError):
+            error.add_note(f"This was world {self.world} of the service, in {self._what}().")
+        elif isinstance(error, Exception):
+            raise reported(error, f"World {self.world} failed in {self._what}(): ") from error

@@ -15,6 +15,7 @@ from physx_core.remote.framing import Reader
 from physx_core.remote.protocols.physx_requests import Outcome, Requests, reported
 from physx_core.remote.protocols.physx_wire import (
     ACT,
+    COUNT,
     IS_RESET,
     OBSERVE,
     SERVICE,
@@ -71,9 +72,9 @@ class PhysxService(SocketService):
         self._seen = 0
         self._is_watching = False
 
-    def close(self) -> None:
-        """End all connections and close the worlds; see `Service.close`."""
-        super().close()
+    def _release(self) -> None:
+        """Close the worlds too, once no request is being carried out."""
+        super()._release()
         self._worlds.close()
 
     def _introduced(self) -> dict[str, Any]:
@@ -281,7 +282,12 @@ class PhysxService(SocketService):
         rows = board.rows(worlds.tolist())
         infos = [board.infos[world] for world in worlds]
         notes = encoded_infos(infos) if any(infos) else b""
-        shown = {WORLDS: worlds.astype(np.int64), IS_RESET: np.bool_(False), **rows}
+        shown = {
+            WORLDS: worlds.astype(np.int64),
+            IS_RESET: np.bool_(False),
+            COUNT: np.int64(self._seen),
+            **rows,
+        }
         return b"".join(_message(kind, number, notes, shown))
 
 

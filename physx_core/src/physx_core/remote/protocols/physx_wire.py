@@ -25,7 +25,7 @@ SERVICE = "physx environments"
 ACT, OBSERVE = 1, 2
 """What a client wants to be, in the place of an instance's number in the handshake."""
 
-WORLDS, IS_RESET = "worlds", "is_reset"
+WORLDS, IS_RESET, COUNT = "worlds", "is_reset", "count"
 REWARD, TERMINATED, TRUNCATED = "reward", "terminated", "truncated"
 """Names of arrays beside those of observations and actions."""
 
@@ -138,9 +138,10 @@ class Leaves:
         """Return the value of each world."""
         if self._is_single:
             array = arrays[self.names[0]]
-            return array if self._shapes[0] else list(array)
-        columns = [arrays[name] for name in self.names]
-        return [join(self.space, iter([c[row] for c in columns])) for row in range(count)]
+            if isinstance(self._leaves[0], spaces.Discrete):
+                return list(array)
+            return array if self._shapes[0] else [array[row, ...] for row in range(count)]
+        return [self.row(arrays, row) for row in range(count)]
 
     def batch(self, arrays: Mapping[str, Array]) -> Any:
         """Return the worlds' values as one value of Gymnasium's batched space."""
@@ -151,15 +152,8 @@ class Leaves:
     def row(self, arrays: Mapping[str, Array], row: int) -> Any:
         """Return one world's value: parts of the arrays."""
         if self._is_single:
-            return arrays[self.names[0]][row, ...] if self._shapes[0] else self._scalar(
-                0, arrays[self.names[0]][row]
-            )
-        parts = enumerate(self.names)
-        values = [
-            arrays[name][row, ...] if self._shapes[i] else self._scalar(i, arrays[name][row])
-            for i, name in parts
-        ]
-        return join(self.space, iter(values))
+            return self._item(0, arrays, row)
+        return join(self.space, (self._item(i, arrays, row) for i in range(len(self.names))))
 
     def stacked(self, value: Any, *, one: bool = False) -> dict[str, Array]:
         """Return arrays of a batch of values, or of one value.
@@ -190,9 +184,9 @@ class Leaves:
                 )
         return arrays
 
-    def _scalar(self, place: int, value: Any) -> Any:
-        is_number = isinstance(self._leaves[place], spaces.Discrete)
-        return value if is_number else np.asarray(value)
+    def _item(self, place: int, arrays: Mapping[str, Array], row: int) -> Any:
+        array = arrays[self.names[place]]
+        return array[row] if isinstance(self._leaves[place], spaces.Discrete) else array[row, ...]
 
 
 def _put(array: Array, row: int, value: Any) -> None:

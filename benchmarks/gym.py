@@ -1,0 +1,384 @@
+"""Environments: what a step costs beside the physics, and how they compare with gym_jiminy's.
+
+    python benchmarks/gym.py
+    python benchmarks/gym.py --jiminy /path/to/an/environment/with/gym_jiminy/bin/python
+
+The bare loop is what a user of the engine would write: torques set, `step(n)`, positions and velocities
+read into arrays that are there; under the same torques from the same state, so the physics is the
+same. Its costs and those of `step` are the least of several runs for each step of an episode: what
+the machine's other work adds is not counted. The unit is one step of Gymnasium's own CartPole-v1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from measure import claim, finish, rates
+
+import physx_core.gym  # noqa: F401 - registers the environments
+from physx_core.gym import build_pipeline, load_pipeline
+from physx_core.gym.environments.quadruped import STAND
+
+clock = time.perf_counter
+HERE = Path(__file__).parent
+PIPELINE = HERE.parent / "examples" / "quadruped" / "pipeline.toml"
+ACTIONS = 256
+ROUNDS, REPEATS = 5, 12
+
+
+def registered(name: str, **options: Any) -> Any:
+    """Return an environment of physx without Gymnasium's wrappers."""
+    return gymnasium.make(f"physx/{name}-v0", disable_env_checker=True, **options).unwrapped
+
+
+def three_blocks() -> Any:
+    """Return a quadruped with three blocks that run once a step: PD, Mahony filter, safety limit."""
+    kwargs = {"urdf": "a1/a1", "fixed_base": False, "period": 2.5e-3}
+    simulator = {"cls": "physx_core.gym:Simulator.build", "kwargs": kwargs}
+    pd = {"kp": 80.0, "kd": 0.02, "joint_velocity_limit": 12.0, "joint_acceleration_limit": 400.0}
+    layers = [
+        {"block": {"cls": "MotorSafetyLimit", "kwargs": {"kp": 20.0, "kd": 2.0}}},
+        {"block": {"cls": "PDController", "kwargs": pd}},
+        {"block": {"cls": "MahonyFilter"}},
+    ]
+    options = {"simulator": simulator, "step_dt": 0.02}
+    return build_pipeline({"cls": "RobotEnv", "kwargs": options}, layers)()
+
+
+# What a step costs beside the physics -----------------------------------------------------------
+
+
+class Overhead:
+    """Times steps of an environment, and the bare loop that does the same to the engine."""
+
+    def __init__(self, env: Any, steps: int, action: Any) -> None:
+        """Note what the motors do in an episode of some steps under an action."""
+        self._env, self._base, self._steps, self._action = env, env.unwrapped, steps, action
+        env.reset(seed=0)
+        simulator = self._base.simulator
+        self._ticks: list[tuple[np.ndarray, int]] = []
+        self.per_step = 0
+        apply, step = simulator.apply_command, simulator.step
+        command: list[np.ndarray] = []
+
+        def noting_command() -> None:
+            apply()
+            command[:] = [simulator.simulation.commands()]
+
+        def noting_step(n: int) -> None:
+            self._ticks.append((command[0], n))
+            step(n)
+
+        simulator.apply_command, simulator.step = noting_command, noting_step
+        for _ in range(steps):
+            env.step(action)
+        del simulator.apply_command, simulator.step
+        self.per_step = len(self._ticks) // steps
+
+    def whole(self) -> np.ndarray:
+        """Return times of the environment's steps, in s."""
+        env, action, times = self._env, self._action, np.empty(self._steps)
+        env.reset(seed=0)
+        for number in range(self._steps):
+            begin = clock()
+            env.step(action)
+            times[number] = clock() - begin
+        self._end = self._base.robot_state.q.copy()
+        return times
+
+    def bare(self) -> np.ndarray:
+        """Return times of the bare loop's steps, in s."""
+        self._env.reset(seed=0)
+        simulation, times = self._base.simulator.simulation, np.empty(self._steps)
+        q, v = simulation.positions(), simulation.velocities()
+        for number in range(self._steps):
+            ticks = self._ticks[number * self.per_step : (number + 1) * self.per_step]
+            begin = clock()
+            for torques, n in ticks:
+                simulation.set_torques(torques)
+                simulation.step(n)
+                simulation.positions(q)
+                simulation.velocities(v)
+            times[number] = clock() - begin
+        if not np.array_equal(q[self._base.robot.positions], self._end):
+            raise RuntimeError("The bare loop does not do what the environment does.")
+        return times
+
+
+def cartpole_times() -> float:
+    """Return the time of a step of Gymnasium's CartPole-v1, in s."""
+    env, least = gymnasium.make("CartPole-v1").unwrapped, np.full(8, np.inf)
+    for seed in range(100):
+        env.reset(seed=seed)
+        for number in range(8):
+            begin = clock()
+            env.step(number % 2)
+            least[number] = min(least[number], clock() - begin)
+    return float(least.mean())
+
+
+def overheads() -> list[bool]:
+    """Compare steps of environments with the bare loop."""
+    stand = np.tile(list(STAND.values()), 4)
+    rest = np.zeros(12)
+    cases = {
+        "cartpole": (Overhead(registered("Cartpole"), 30, 1), 2.0),
+        "ant": (Overhead(registered("Ant"), 8, np.zeros(8, np.float32)), 3.0),
+        "quadruped, PD + Mahony + safety": (Overhead(three_blocks(), 8, rest), 7.0),
+        "the same and target adapter, 4 times a step": (
+            Overhead(load_pipeline(PIPELINE)(), 6, stand),
+            None,
+        ),
+    }
+    found: dict[str, list[tuple[float, float, float]]] = {name: [] for name in cases}
+    for _ in range(ROUNDS):
+        for name, (case, _) in cases.items():
+            pairs = [(case.whole(), case.bare()) for _ in range(REPEATS)]
+            whole, bare = (np.min(times, axis=0) for times in zip(*pairs, strict=True))
+            unit = cartpole_times()
+            found[name].append((float(np.median(whole - bare)) / unit, bare.mean(), unit))
+    met = []
+    print("A step beside the bare loop of the same robot, in steps of Gymnasium's CartPole-v1")
+    for name, (case, target) in cases.items():
+        units, bare, unit = (statistics.median(each) for each in zip(*found[name], strict=True))
+        print(
+            f"  {name}: bare loop {1e6 * bare:.0f} us, in {case.per_step} parts; a unit is "
+            f"{1e6 * unit:.1f} us; beside it {1e6 * units * unit:.1f} us"
+        )
+        if target is None:
+            print(f"  {name}: {units:.4g}\n")
+        else:
+            met.append(claim(name, units, at_most=target))
+    return met
+
+
+# Against gym_jiminy -------------------------------------------------------------------------------
+
+
+class Zoo:
+    """gym_jiminy's environments in a process of another interpreter."""
+
+    def __init__(self, python: str) -> None:
+        command = [python, "-P", str(HERE / "jiminy_zoo.py")]
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+
+    def measure(self, name: str, seconds: float) -> dict[str, float]:
+        """Return steps per second of an environment, and its periods."""
+        stdin, stdout = self._process.stdin, self._process.stdout
+        if stdin is None or stdout is None:
+            raise RuntimeError("gym_jiminy's process has no pipes")
+        print(name, seconds, file=stdin, flush=True)
+        answer = stdout.readline()
+        if not answer:
+            raise RuntimeError(f"gym_jiminy's process ended; is {self._process.args} right?")
+        found: dict[str, float] = json.loads(answer)
+        return found
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.communicate()
+
+
+def steps_per_second(env: Any, seconds: float) -> float:
+    """Return steps per second of time in `step` under random actions; resets are not counted."""
+    spent, steps = 0.0, 0
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(ACTIONS)]
+    while spent < seconds:
+        action = actions[steps % ACTIONS]
+        begin = clock()
+        _, _, terminated, truncated, _ = env.step(action)
+        spent += clock() - begin
+        steps += 1
+        if terminated or truncated:
+            env.reset()
+    return steps / spent
+
+
+def against_jiminy(python: str) -> list[bool]:
+    """Compare steps per second with gym_jiminy, at physx's own physics period and at its."""
+    zoo, met = Zoo(python), []
+    for name, target in (("Cartpole", 1.5), ("Acrobot", 5.0), ("Ant", 1.0)):
+        theirs = zoo.measure(name.lower(), 0.1)
+        envs = [registered(name), registered(name)]
+        envs[1].simulator.set_options({"world": {"period": theirs["period"]}})
+        if envs[0].step_dt != theirs["step_dt"]:
+            raise RuntimeError(f"{name}: step_dt is {envs[0].step_dt}, not {theirs['step_dt']}")
+        measured: list[list[float]] = []
+        for _ in range(2 * ROUNDS + 1):
+            ours = [steps_per_second(env, 0.25) for env in envs]
+            measured.append([*ours, zoo.measure(name.lower(), 0.25)["rate"]])
+        own, same, other = (statistics.median(each) for each in zip(*measured, strict=True))
+        ratios = [statistics.median(row[k] / row[2] for row in measured) for k in (0, 1)]
+        print(f"{name}, steps of {envs[0].step_dt:g} s: steps/s, and ratio to gym_jiminy")
+        print(f"  gym_jiminy, integrating every {1e3 * theirs['period']:g} ms: {other:,.0f}")
+        for env, rate, ratio in zip(envs, (own, same), ratios, strict=True):
+            print(f"  physx, every {1e3 * env.simulator.period:g} ms: {rate:,.0f}")
+            met.append(claim("ratio", ratio, at_least=target))
+    zoo.close()
+    return met
+
+
+# Telemetry, start-up, memory, processes -----------------------------------------------------------
+
+
+def telemetry() -> list[bool]:
+    """Compare steps in evaluation, where all is recorded, with those in training."""
+    met = []
+    cases = {
+        "cartpole": (registered("Cartpole"), 1, 30),
+        "ant": (registered("Ant"), np.zeros(8, np.float32), 20),
+        "quadruped with three blocks": (three_blocks(), np.zeros(12), 20),
+    }
+    for name, (env, action, steps) in cases.items():
+        found = []
+        for _ in range(ROUNDS):
+            least = {True: np.full(steps, np.inf), False: np.full(steps, np.inf)}
+            for _ in range(REPEATS):
+                for training, times in least.items():
+                    env.stop()
+                    env.unwrapped.train(training)
+                    env.reset(seed=0)
+                    for number in range(steps):
+                        begin = clock()
+                        env.step(action)
+                        times[number] = min(times[number], clock() - begin)
+            found.append(least[False].sum() / least[True].sum())
+        env.stop()
+        env.unwrapped.train()
+        met.append(claim(f"evaluation against training, {name}", statistics.median(found), at_most=1.2))
+        env.close()
+    return met
+
+
+_IMPORTS = "import gymnasium, dartpy"
+_FIRST_RESET = """
+import gymnasium, physx_core.gym
+gymnasium.make("physx/Cartpole-v0").reset(seed=0)
+"""
+
+
+def start_up() -> bool:
+    """Compare import and first reset with the import of what they stand on."""
+
+    def run(program: str) -> Callable[[], int]:
+        def process() -> int:
+            subprocess.run([sys.executable, "-c", program], check=True)
+            return 1
+
+        return process
+
+    measured = rates({"imports": run(_IMPORTS), "reset": run(_FIRST_RESET)}, 2 * ROUNDS + 1)
+    times = {name: 1e3 / statistics.median(values) for name, values in measured.items()}
+    pairs = zip(measured["imports"], measured["reset"], strict=True)
+    print(
+        f"Processes: import of gymnasium and dartpy {times['imports']:.0f} ms; import of "
+        f"physx_core.gym and first reset of cartpole {times['reset']:.0f} ms"
+    )
+    return claim("times as long", statistics.median(a / b for a, b in pairs), at_most=1.5)
+
+
+_MEMORY = """
+import gc, os, sys
+import gymnasium
+import physx_core.gym
+
+def made():
+    if sys.argv[1].endswith(".toml"):
+        return physx_core.gym.load_pipeline(sys.argv[1])()
+    return gymnasium.make(sys.argv[1])
+
+def resident():
+    gc.collect()
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+kept = []
+for number in range(50):
+    env = made()
+    env.reset(seed=number)
+    for _ in range(5):
+        env.step(env.action_space.sample())
+    kept.append(env)
+    if number == 9:
+        before = resident()
+print((resident() - before) / 40)
+"""
+
+
+def memory() -> list[bool]:
+    """Measure what each further environment takes."""
+    met = []
+    for name, path, most in (
+        ("cartpole", "physx/Cartpole-v0", 2.0),
+        ("quadruped with blocks", str(PIPELINE), 5.0),
+    ):
+        command = [sys.executable, "-c", _MEMORY, path]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        met.append(claim(f"MiB for each further {name}", float(done.stdout), at_most=most))
+    return met
+
+
+def vector(name: str, envs: int, **options: Any) -> Callable[[], Iterator[int]]:
+    """Return steps of a vector environment."""
+
+    def steps() -> Iterator[int]:
+        env = gymnasium.make_vec(name, num_envs=envs, **options)
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        actions = [env.action_space.sample() for _ in range(32)]
+        env.step(actions[0])
+        yield 0
+        begin, count = clock(), 0
+        while clock() - begin < 0.8:
+            env.step(actions[count % 32])
+            count += 1
+        yield count * envs
+        env.close()
+
+    return steps
+
+
+def processes() -> bool:
+    """Compare two processes of environments with one."""
+    candidates = {
+        f"{count} processes": vector("physx/Ant-v0", 8, processes=count) for count in (1, 2)
+    }
+    measured = rates(candidates, ROUNDS)
+    ratio = statistics.median(
+        two / one for one, two in zip(*(measured[name] for name in candidates), strict=True)
+    )
+    print("8 ants in a vector environment, steps/s:", end=" ")
+    print({name: round(statistics.median(values)) for name, values in measured.items()})
+    return claim("2 processes against 1", ratio, at_least=1.7)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="exit with 1 if a target is missed")
+    parser.add_argument("--jiminy", metavar="PYTHON", help="interpreter that has gym_jiminy")
+    chosen = parser.parse_args()
+    gc.disable()
+    met = overheads()
+    if chosen.jiminy:
+        met += against_jiminy(chosen.jiminy)
+    met += [*telemetry(), start_up(), *memory(), processes()]
+    finish(met)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""Steps gym_jiminy's environments, for `benchmarks/gym.py`, which starts it with another interpreter.
+
+A line on standard input is an environment's name and a time in s; the answer is a line of JSON: steps per
+second of time in `step`, and the periods of control and integration that were used.
+
+    pip install -r benchmarks/requirements-jiminy.txt      # in an environment of its own
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+import warnings
+from typing import Any
+
+import gymnasium
+
+ACTIONS = 256
+
+
+def made(name: str) -> tuple[Any, list[Any]]:
+    """Return an environment, ready to run, and actions for it."""
+    env = gymnasium.make(f"gym_jiminy.envs:{name}", disable_env_checker=True).unwrapped
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    return env, [env.action_space.sample() for _ in range(ACTIONS)]
+
+
+def steps_per_second(env: Any, actions: list[Any], seconds: float) -> float:
+    """Return steps per second of time in `step`; resets are not counted."""
+    clock, spent, steps = time.perf_counter, 0.0, 0
+    env.reset()
+    while spent < seconds:
+        action = actions[steps % ACTIONS]
+        begin = clock()
+        _, _, terminated, truncated, _ = env.step(action)
+        spent += clock() - begin
+        steps += 1
+        if terminated or truncated:
+            env.reset()
+    return steps / spent
+
+
+def integrations(env: Any, actions: list[Any]) -> float:
+    """Return the mean time between two steps of the integrator, in s."""
+    env.reset()
+    env.step(actions[0])
+    before = env.stepper_state.iter
+    for action in actions[:5]:
+        env.step(action)
+    return 5 * env.step_dt / (env.stepper_state.iter - before)
+
+
+def main() -> None:
+    """Answer until standard input ends."""
+    warnings.filterwarnings("ignore")
+    known: dict[str, tuple[Any, list[Any]]] = {}
+    for line in sys.stdin:
+        name, seconds = line.split()
+        if name not in known:
+            known[name] = made(name)
+            steps_per_second(*known[name], 0.1)
+        env, actions = known[name]
+        found = {
+            "rate": steps_per_second(env, actions, float(seconds)),
+            "step_dt": env.step_dt,
+            "period": integrations(env, actions),
+        }
+        print(json.dumps(found), flush=True)
+
+
+if __name__ == "__main__":
+    main()
