@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -143,11 +144,11 @@ def test_a_layer_on_top_is_played(env):
 
 
 def test_without_a_terminal_or_keys(monkeypatch, terminal):
-    with open(os.devnull) as nothing:
+    with Path(os.devnull).open() as nothing:
         monkeypatch.setattr(sys, "stdin", nothing)
         with pytest.raises(UsageError, match="needs a terminal"):
             RobotEnv("cartpole", 0.02).play_interactive()
-    with open(terminal, closefd=False), os.fdopen(os.dup(terminal)) as stdin:
+    with os.fdopen(os.dup(terminal)) as stdin:
         monkeypatch.setattr(sys, "stdin", stdin)
         with pytest.raises(UsageError, match="RobotEnv cannot be played: override _key_to_action"):
             RobotEnv("cartpole", 0.02).play_interactive(start_paused=False)

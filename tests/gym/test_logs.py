@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -131,7 +131,7 @@ def test_an_episode_without_steps_leaves_no_file():
     env.eval()
     path = run(env, 0)["log_path"]
     env.reset()
-    assert not os.path.exists(path)
+    assert not Path(path).exists()
 
 
 def test_the_world_comes_back(tmp_path):
@@ -168,12 +168,12 @@ def test_logs_go_with_their_environment():
     env.eval()
     path = run(env, 1)["log_path"]
     env.stop()
-    assert os.path.exists(path)
+    assert Path(path).exists()
     env.close()
-    assert not os.path.exists(os.path.dirname(path))
+    assert not Path(path).parent.exists()
     again = run(env, 1)["log_path"]
     env.stop()
-    assert os.path.exists(again)
+    assert Path(again).exists()
     env.close()
 
 

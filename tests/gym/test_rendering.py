@@ -304,7 +304,7 @@ def test_a_viewer_for_humans_follows_each_step():
     (viewer,) = Fake.opened
     assert viewer.options == {"mode": "spawn", "save": False, "port": 5}
     assert [step for _, step, _ in viewer.steps] == list(range(5))
-    assert viewer.steps[0][2] == ["add", "add", "update"]  # the view and the robot
+    assert viewer.steps[0][2] == ["add", "add"]  # the view and the robot
     assert viewer.steps[4][2] == ["update"]
     env.close()
     assert not viewer.is_open

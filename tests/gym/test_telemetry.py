@@ -230,7 +230,7 @@ def test_pickled_variables_are_still_those_of_their_owner():
     whole = np.zeros(4)
     telemetry.register("v", {"part": whole[1:3]})
     recorded(telemetry, 0.0)
-    copy, owner = pickle.loads(pickle.dumps((telemetry, whole)))
+    copy, owner = pickle.loads(pickle.dumps((telemetry, whole)))  # noqa: S301
     owner[1:3] = 4.0, 5.0
     found = recorded(copy, 0.0)
     assert (found["v.part.0"][0], found["v.part.1"][0]) == (4.0, 5.0)

@@ -126,9 +126,12 @@ def test_an_answer_that_does_not_come_in_time():
     ],
 )
 def test_an_answer_that_is_too_long_or_nonsense(answer, said):
-    with Stub(answer) as stub, GodotGymClient(MESSAGES, stub.address) as client:
-        with pytest.raises(RemoteProtocolError, match=said):
-            client.request({})
+    with (
+        Stub(answer) as stub,
+        GodotGymClient(MESSAGES, stub.address) as client,
+        pytest.raises(RemoteProtocolError, match=said),
+    ):
+        client.request({})
 
 
 @pytest.mark.parametrize("cut", range(1, 22))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,6 +42,22 @@ def copied(tree: Any) -> Any:
     if kind in (tuple, list):
         return kind([copied(each) for each in tree])
     return tree.copy() if isinstance(tree, np.ndarray) else tree
+
+
+def copier(space: spaces.Space[Any]) -> Callable[[Any], Any]:
+    """Return what copies buffers as elements of a space: a choice as a number, not as an array."""
+    choices = any(isinstance(each, spaces.Discrete) for _, each in leaves(space))
+    return partial(_element, space) if choices else copied
+
+
+def _element(space: spaces.Space[Any], tree: Any) -> Any:
+    if isinstance(space, spaces.Dict):
+        return {key: _element(each, tree[key]) for key, each in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(_element(*pair) for pair in zip(space.spaces, tree, strict=True))
+    if isinstance(space, spaces.Discrete) and isinstance(tree, np.ndarray):
+        return tree[()]
+    return copied(tree)
 
 
 def fill(tree: Any, values: Any) -> Any:

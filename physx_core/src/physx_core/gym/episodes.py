@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import weakref
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy as np
 
-from physx_core.errors import EpisodeError, SimulationError, UnknownOptionError
+from physx_core.errors import ConfigError, EpisodeError, SimulationError, UnknownOptionError
 from physx_core.gym.actions import Actions
-from physx_core.gym.buffers import ObservationChecks, copied, fill, neutral
+from physx_core.gym.buffers import ObservationChecks, copied, copier, fill, neutral
+from physx_core.gym.inheritance import construct_next
 from physx_core.gym.periods import Periods
 from physx_core.gym.pipeline_env import Info, PipelineEnv, Step
 from physx_core.gym.recording import Recording
@@ -65,9 +67,11 @@ class Episodes(PipelineEnv):
         """
         if not isinstance(simulator, Simulator):
             simulator, kwargs = simulator_of(simulator, kwargs), {}
-        _construct_next(self, kwargs)
+        construct_next(Episodes, self, kwargs)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise UnknownOptionError("render_mode", [render_mode], self.metadata["render_modes"])
+            raise UnknownOptionError(
+                "render_mode", [str(render_mode)], self.metadata["render_modes"]
+            )
         self.simulator, self.render_mode, self.debug = simulator, render_mode, bool(debug)
         self.step_dt = numbers.positive("step_dt", step_dt)
         option = "simulation_duration_max"
@@ -196,6 +200,8 @@ class Episodes(PipelineEnv):
         self, top: PipelineEnv, seed: int | None, options: dict[str, Any] | None
     ) -> tuple[Any, Info]:
         """Begin an episode with a layer as the top; see `reset`."""
+        if options is not None and not isinstance(options, Mapping):
+            raise ConfigError(f"The options of reset are {options!r} but must be a mapping.")
         self.stop()
         simulator = self.simulator
         self._update_pipeline(top)
@@ -229,7 +235,7 @@ class Episodes(PipelineEnv):
         self._ready = True
         if self.render_mode == "human":
             self.render()
-        return copied(top.observation), info
+        return self._copied(top.observation), info
 
     def _begin(self, top: PipelineEnv) -> Info:
         """Bring everything to the first state."""
@@ -260,6 +266,7 @@ class Episodes(PipelineEnv):
         self._actions = Actions(top.action_space, top.action)
         alone = top is self
         self._checks = self._own_checks if alone else ObservationChecks(top.observation_space)
+        self._copied = copier(top.observation_space)
 
     def run_step(self, top: PipelineEnv, action: Any) -> Step:
         """Simulate a step under an action of the top; see `step`."""
@@ -288,7 +295,7 @@ class Episodes(PipelineEnv):
             self._ready, self._why = False, f"The episode {word}: call reset()."
         if self.render_mode == "human":
             self.render()
-        return copied(top.observation), reward, bool(terminated), bool(truncated), info
+        return self._copied(top.observation), reward, bool(terminated), bool(truncated), info
 
     def _run(self, top: PipelineEnv) -> None:
         """Control and simulate for a step, up to its last observation."""
@@ -384,16 +391,3 @@ class Episodes(PipelineEnv):
         """Take up a pickled or copied environment."""
         super().__setstate__(state)
         self._derived = self._renderer = None
-
-
-def _construct_next(env: Any, options: dict[str, Any]) -> None:
-    """Call the constructor of the class after `Episodes` in an environment's order of classes."""
-    order = type(env).__mro__
-    after = order[order.index(Episodes) + 1 :]
-    takes = [each for each in after if "__init__" in vars(each) and each is not object]
-    if options and not takes:
-        raise UnknownOptionError(type(env).__name__, options, _OPTIONS)
-    super(Episodes, env).__init__(**options)
-
-
-_OPTIONS = ("simulator", "step_dt", "simulation_duration_max", "debug", "render_mode")

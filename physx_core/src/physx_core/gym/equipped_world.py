@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -82,8 +82,8 @@ class EquippedWorld(SharedArrays):
             raise ComponentNotFoundError("robot", str(robot), "The world", names)
         self.world, self.backend = world, backend
         self._robot_name = names[0] if robot is None else robot
-        self._given_motors = None if motors is None else tuple(motors)
-        self._given_sensors = None if sensors is None else tuple(sensors)
+        self._given_motors = _all_of("motors", Motor, motors)
+        self._given_sensors = _all_of("sensors", Sensor, sensors)
         self._motors: tuple[Motor, ...] = self._given_motors or ()
         self._sensors: tuple[Sensor, ...] = self._given_sensors or ()
         self.control_period = positive_or_none("control_period", control_period)
@@ -249,6 +249,25 @@ class EquippedWorld(SharedArrays):
         whole[engine.part.positions] = q
         q[:3] += rise(engine.simulation, self.world.ground, engine.part.name, whole)
         return q
+
+
+def _all_of(option: str, kind: type[Any], given: Any) -> tuple[Any, ...] | None:
+    """Return a list of motors or sensors as a tuple; None stays None.
+
+    Raises:
+        ConfigError: It is something else.
+    """
+    if given is None:
+        return None
+    name = kind.__name__
+    wanted = f"{option} must be a list of {name}s, as in [{name}(...)]"
+    if isinstance(given, (str, Mapping)) or not isinstance(given, Iterable):
+        raise ConfigError(f"{wanted}, not {given!r}.")
+    found = tuple(given)
+    for each in found:
+        if not isinstance(each, kind):
+            raise ConfigError(f"{wanted}; {each!r} is none.")
+    return found
 
 
 def positive_or_none(option: str, value: float | None) -> float | None:

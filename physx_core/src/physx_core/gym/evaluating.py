@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from physx_core.errors import ConfigError
 from physx_core.gym.rendering import has_display
 from physx_core.world import numbers
 
@@ -45,8 +47,9 @@ def evaluate(
         Rewards of all steps, and information: one more, as the first is that of the reset.
 
     Raises:
-        ConfigError: The horizon is not positive.
+        ConfigError: The horizon is not positive, or the policy does not take what it is asked with.
     """
+    _check(policy_fn)
     steps = math.inf
     if horizon is not None:
         steps = math.ceil(numbers.positive("horizon", horizon) / env.step_dt - 1e-9)
@@ -69,6 +72,23 @@ def evaluate(
     if enable_replay or (enable_replay is None and has_display()):
         _replay(env, kwargs)
     return rewards, infos
+
+
+def _check(policy_fn: Any) -> None:
+    """Check that a policy can be asked.
+
+    Raises:
+        ConfigError: It cannot.
+    """
+    try:
+        inspect.signature(policy_fn).bind(*[None] * 6)
+    except (TypeError, ValueError) as error:
+        if callable(policy_fn) and isinstance(error, ValueError):
+            return  # made in C: it says itself what it does not take
+        raise ConfigError(
+            "The policy is called with observation, previous action, reward, terminated, truncated "
+            f"and information, and returns an action; {policy_fn!r} cannot be: {error}."
+        ) from error
 
 
 def _run(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from physx_core.devices import steps_of
 from physx_core.errors import ConfigError
+from physx_core.world import numbers
 
 if TYPE_CHECKING:
     from physx_core.gym.simulator import Simulator
@@ -53,6 +54,7 @@ class Periods:
                 )
         self.control_dt, self.observe_dt = self.control * period, self.observe * period
         self.moment = math.gcd(self.whole, self.control, self.observe)
+        duration = numbers.positive("simulation_duration_max", duration)
         self.last = math.ceil(duration / period * (1 - 1e-12))
         self.longest = math.ceil(self.last / self.whole) * self.whole * period
 

@@ -24,6 +24,7 @@ class Recording:
     def __init__(self) -> None:
         self._telemetry: Telemetry | None = None
         self._folder: LogFolder | None = None
+        self._action: tuple[Any, Any] | None = None  # of another type, and what is recorded of it
 
     @property
     def telemetry(self) -> Telemetry:
@@ -47,15 +48,25 @@ class Recording:
         from physx_core.gym.standard_columns import constants_of, register_simulator
 
         register_simulator(self.telemetry, env.simulator)
-        action, motors = top.action, env.simulator.motors
-        if isinstance(action, np.ndarray) and action.dtype == np.float64:
-            joints = [motor.joint for motor in motors]
-            names = joints if action.shape == (len(joints),) else None
-            self.telemetry.register("action", action, names)
+        self._register_action(env, top.action)
         path = self._path(env)
         info["log_path"] = str(path)
         self.telemetry.begin(path, constants_of(env))
         return True
+
+    def _register_action(self, env: Episodes, action: Any) -> None:
+        """Record the action, if it is one array of numbers."""
+        self.telemetry.unregister("action")
+        self._action = None
+        if not isinstance(action, np.ndarray) or action.dtype.kind not in "fiub":
+            return
+        kept = action.dtype in (np.float64, np.int64)
+        recorded = action if kept else np.array(action, np.float64)
+        self._action = None if kept else (action, recorded)
+        joints = [motor.joint for motor in env.simulator.motors]
+        self.telemetry.register(
+            "action", recorded, joints if action.shape == (len(joints),) else None
+        )
 
     def _path(self, env: Episodes) -> Path:
         given = env.reset_options.get("log_path")
@@ -70,6 +81,8 @@ class Recording:
     def row(self, env: Episodes) -> None:
         """Record what is now."""
         env.robot_state.refresh()
+        if self._action is not None:
+            np.copyto(self._action[1], self._action[0])
         self.telemetry.record(env.stepper_state.t)
 
     def data(self, env: Episodes) -> dict[str, Any]:

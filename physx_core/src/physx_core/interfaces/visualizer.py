@@ -74,5 +74,5 @@ class Visualizer(Observer):
     """An observer that draws what the environments' factories emit."""
 
     def capture(self) -> Array | None:
-        """Return a picture of what it shows, shape (height, width, 3), uint8; None: it makes none."""
+        """Return a picture, shape (height, width, 3), uint8; None: it makes no pictures."""
         return None

@@ -1,0 +1,166 @@
+"""Environments in another process against raw sockets, and many worlds against single requests.
+
+Whatever is compared runs in turn, in one run. Starting processes does not count.
+
+    python benchmarks/remote.py
+    python benchmarks/remote.py --check     # ends with status 1 where a target is missed
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+import socket
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measure import claim, finish, rates, report
+from remote_servers import FRAME_STEPS, messages
+
+from physx_core.remote import GodotGymClient, PhysxClient, PhysxEnv, PhysxVectorEnv
+
+ROUNDS = 15
+REQUESTS = 400
+WORLDS = 16
+STEPS = 40
+SERVERS = Path(__file__).with_name("remote_servers.py")
+ACTION = [0.1]
+WANTED = {"agent": ["positions", "velocities"], "world": ["done"]}
+
+
+@contextlib.contextmanager
+def process(*words: str) -> Iterator[str]:
+    """Run a server in another process; yield the first line that it prints."""
+    server = subprocess.Popen(
+        [sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    try:
+        yield server.stdout.readline() if server.stdout is not None else ""
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def served(*words: str) -> contextlib.AbstractContextManager[str]:
+    """Run ``physx serve`` in another process; yield the line that says where it listens."""
+    return process("-m", "physx_core.cli", "serve", *words, "--port", "0")
+
+
+def place_of(line: str) -> tuple[str, int]:
+    """Return host and port at the end of a line."""
+    host, _, port = line.split()[-1].rpartition(":")
+    return host, int(port)
+
+
+def raw_round_trips(port: int, request: bytes, answer: int) -> Callable[[], int]:
+    """Return what sends and receives the same bytes as `godot_gym`, and does nothing with them."""
+    connection = socket.create_connection(("127.0.0.1", port))
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def ask() -> int:
+        for _ in range(REQUESTS):
+            connection.sendall(request)
+            received = 0
+            while received < answer:
+                received += len(connection.recv(1 << 16))
+        return REQUESTS
+
+    return ask
+
+
+def godot_gym() -> bool:
+    """Compare steps over godot-gym with raw round trips and the same physics in between."""
+    request = json.dumps({"action": ACTION, "observation": WANTED}).encode()
+    with contextlib.ExitStack() as stack:
+        line = stack.enter_context(served(f"{SERVERS}:Small", "--protocol", "godot-gym"))
+        client = stack.enter_context(GodotGymClient(messages(), place_of(line)))
+        client.set_repeat_action(1)
+        client.reset(WANTED)
+        told = client.step(ACTION, WANTED)
+        example = messages().Message(
+            agent_data={name: told["agent"][name].tolist() for name in WANTED["agent"]},
+            world_data={"done": False},
+        )
+        example.world_data.SetInParent()
+        sizes = 4 + len(request), 4 + len(example.SerializeToString())
+        ports = {
+            name: int(stack.enter_context(process(str(SERVERS), *map(str, sizes), steps)))
+            for name, steps in (("raw", "0"), ("raw and physics", str(FRAME_STEPS)))
+        }
+
+        def steps() -> int:
+            for _ in range(REQUESTS):
+                client.step(ACTION, WANTED)
+            return REQUESTS
+
+        candidates = {
+            name: raw_round_trips(port, bytes(sizes[0]), sizes[1]) for name, port in ports.items()
+        }
+        measured = rates({**candidates, "godot-gym": steps}, ROUNDS)
+    print(f"godot-gym over DART, repeat_action=1: {sizes[0]} bytes there, {sizes[1]} back")
+    for name, each in measured.items():
+        print(f"  {name:28} {statistics.median(each):12,.0f} requests/s")
+    pairs = zip(measured["raw and physics"], measured["godot-gym"], strict=True)
+    ratio = statistics.median(raw / mine for raw, mine in pairs)
+    return claim("godot-gym takes as many times as long as raw and physics", ratio, at_most=1.9)
+
+
+def worlds_together(environment: str, target: float) -> bool:
+    """Compare one request for all worlds with single requests, on one connection."""
+    with served(environment, "--num-worlds", str(WORLDS)) as line:
+        with PhysxClient(place_of(line)) as client:
+            together = PhysxVectorEnv(client)
+            single = [PhysxEnv(client, world) for world in range(WORLDS)]
+            actions = np.ones(WORLDS, np.int64)
+
+            def one_request() -> Iterator[int]:
+                together.reset(seed=0)
+                yield 0
+                for step in range(STEPS):
+                    actions[:] = step % 2
+                    together.step(actions)
+                yield STEPS * WORLDS
+
+            def single_requests() -> Iterator[int]:
+                together.reset(seed=0)
+                yield 0
+                over = [False] * WORLDS
+                for step in range(STEPS):
+                    for world, env in enumerate(single):
+                        over[world] = _one_step(env, over[world], step % 2)
+                yield STEPS * WORLDS
+
+            candidates: dict[str, Any] = {
+                "16 single requests": single_requests,
+                "16 worlds in one request": one_request,
+            }
+            measured = rates(candidates, ROUNDS)
+    return report(
+        f"{environment}, {WORLDS} worlds on one connection of the protocol physx",
+        "steps", measured, "16 single requests", target, "16 worlds in one request",
+    )  # fmt: skip
+
+
+def _one_step(env: PhysxEnv, over: bool, action: int) -> bool:
+    if over:
+        env.reset()
+        return False
+    _, _, terminated, truncated, _ = env.step(action)
+    return terminated or truncated
+
+
+def main() -> None:
+    """Measure everything."""
+    os.environ["PHYSX_TOKEN"] = secrets.token_hex(32)
+    finish([godot_gym(), worlds_together("gym/CartPole-v1", 5.0)])
+
+
+if __name__ == "__main__":
+    main()
