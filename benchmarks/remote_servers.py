@@ -9,39 +9,39 @@ from typing import Any
 from physx_core import Field, Simulation, plugins
 from physx_core.remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
 from physx_core.remote.messages import fill
-from physx_core.world import Robot, World
+from physx_core.world import Ground, Sphere, World, Wrench
 
-PERIOD = 1 / 240
-FRAME_STEPS = 4
+PERIOD = 1 / 120
+FRAME_STEPS = 2
 VALUES = 16
 
 
 def build() -> Simulation:
-    """Return a cartpole on DART."""
-    world = World([Robot("cartpole", collisions="none")], period=PERIOD)
+    """Return a ball on the ground, on DART."""
+    ball = Sphere(name="ball", radius=0.1, position=(0.0, 0.0, 0.1))
+    world = World(objects=[ball], ground=Ground(), period=PERIOD)
     simulation: Simulation = plugins.resolve("backend", "dart").build(world)
     return simulation
 
 
-class Pole(RLAgent):
-    """A cart that is pushed; it tells positions and velocities, and some numbers more."""
+class Ball(RLAgent):
+    """A ball that is pushed; it tells its position and velocity, and some numbers more."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
-        self.rest = [0.0] * (VALUES - 2)
+        self.number = simulation.apply_wrench(Wrench("ball"))
+        self.rest = [0.0] * VALUES
 
     def set_action(self, action: Any) -> None:
-        """Push the cart."""
-        self.simulation.set_torques([action[0], 0.0])  # type: ignore[arg-type]
+        """Push the ball."""
+        self.simulation.remove_wrench(self.number)
+        self.number = self.simulation.apply_wrench(Wrench("ball", force=action))
 
     def get_data(self, request: Any, storage: Any) -> None:
         """Tell what there is, 16 + 16 numbers."""
-        positions, velocities = self.simulation.positions(), self.simulation.velocities()
-        fill(
-            storage,
-            positions=[*positions.tolist(), *self.rest],
-            velocities=[*velocities.tolist(), *self.rest],
-        )
+        positions = self.simulation.positions().tolist() + self.rest
+        velocities = self.simulation.velocities().tolist() + self.rest
+        fill(storage, positions=positions[:VALUES], velocities=velocities[:VALUES])
 
 
 class Room(RLEnvWorld):
@@ -57,13 +57,13 @@ class Small(RLEnvironment):
 
     def _ready(self) -> None:
         self.simulation = build()
-        self.agent, self.world = Pole(self.simulation), Room()
+        self.begin = self.simulation.snapshot()
+        self.agent, self.world = Ball(self.simulation), Room()
         self.messages = messages()
 
     def _reset(self) -> None:
         if self.simulation is not None:
-            zeros = [0.0, 0.0]
-            self.simulation.set_state(zeros, zeros)  # type: ignore[arg-type]
+            self.simulation.set_state(self.begin.positions, self.begin.velocities)
 
 
 def messages() -> Messages:
@@ -76,7 +76,7 @@ def main() -> None:
     """Answer each request of so many bytes with so many bytes, after one frame of physics."""
     request, answer, steps = (int(word) for word in sys.argv[1:])
     simulation, reply = build(), bytes(answer)
-    simulation.set_torques([0.1, 0.0])  # type: ignore[arg-type]
+    simulation.apply_wrench(Wrench("ball", force=(0.1, 0.0, 0.0)))
     with socket.create_server(("127.0.0.1", 0)) as listener:
         print(listener.getsockname()[1], flush=True)
         connection, _ = listener.accept()

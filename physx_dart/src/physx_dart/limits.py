@@ -25,7 +25,13 @@ class JointConstraints:
     its bounds; a motor brings it to its velocity likewise. A motor without bounds does so whatever
     the limits are.
 
+    Each of these is a row: a velocity that is aimed at, and bounds of the impulse. The lower limits
+    of all joints come first, then the upper ones, then friction and motors where there are any.
+
     Attributes:
+        joints: Joint of each row, shape (rows,).
+        least: Smallest impulse of each row, in N m s or N s, shape (rows,).
+        most: Largest impulse of each row.
         targets: Velocities that the motors aim at, shape (n,), in rad/s or m/s.
         acts: Whether anything but limits acts.
         limits: Whether any joint has limits.
@@ -34,28 +40,37 @@ class JointConstraints:
     def __init__(self, joints: Sequence[Joint], period: float) -> None:
         """Keep the bounds of all joints, and the period in s."""
         modes = np.array([joint.settings.mode for joint in joints], dtype=object)
-        self._lower = np.array([joint.lower for joint in joints])
-        self._upper = np.array([joint.upper for joint in joints])
-        self._fastest = np.array([joint.max_velocity for joint in joints])
-        self._friction = period * np.array([joint.friction for joint in joints])
-        self._motors = modes != "force"
+        lower = np.array([joint.lower for joint in joints])
+        upper = np.array([joint.upper for joint in joints])
+        fastest = np.array([joint.max_velocity for joint in joints])
+        friction = period * np.array([joint.friction for joint in joints])
+        strength = period * np.array([joint.max_torque for joint in joints])
         free = modes == "velocity"
-        self._lower[free], self._upper[free], self._fastest[free] = -np.inf, np.inf, np.inf
-        self._friction[free] = 0.0
-        strength = np.array([joint.max_torque for joint in joints])
-        self._strength = np.where(free, np.inf, period * strength)
-        self._rubs = bool(self._friction.any())
+        lower[free], upper[free], fastest[free] = -np.inf, np.inf, np.inf
+        friction[free], strength[free] = 0.0, np.inf
+        self._rubs, self._motors = np.flatnonzero(friction), np.flatnonzero(modes != "force")
+        self._arrange(friction[self._rubs], strength[self._motors], len(joints))
+        signs = np.array([[1.0], [-1.0]])
+        self._signs, self._pace = signs, signs / period
+        self._limits = self._pace * [lower, upper]
+        self._slowest = -fastest
         self._period = period
         self.targets = np.zeros(len(joints))
-        self.acts = self._rubs or bool(self._motors.any())
-        limits = np.concatenate([self._lower, self._upper, self._fastest])
-        self.limits = bool(np.isfinite(limits).any())
+        self.acts = bool(len(self._rubs) or len(self._motors))
+        self.limits = bool(np.isfinite([lower, upper, fastest]).any())
         self._ranges = [
-            (place, float(lower), float(upper))
-            for place, (lower, upper) in enumerate(zip(self._lower, self._upper, strict=True))
-            if lower > -math.inf or upper < math.inf
+            (place, float(low), float(high))
+            for place, (low, high) in enumerate(zip(lower, upper, strict=True))
+            if low > -math.inf or high < math.inf
         ]
-        self._slowest_limit = float(self._fastest.min(initial=np.inf))
+        self._slowest_limit = float(fastest.min(initial=np.inf))
+
+    def _arrange(self, friction: Vector, strength: Vector, n: int) -> None:
+        """Set what is known of the rows beforehand."""
+        nothing, places = np.zeros(n), np.arange(n)
+        self.joints = np.concatenate([places, places, self._rubs, self._motors])
+        self.least = np.concatenate([nothing, nothing - np.inf, -friction, -strength])
+        self.most = np.concatenate([nothing + np.inf, nothing, friction, strength])
 
     def safe(self, positions: Vector, velocities: Vector) -> tuple[int, float]:
         """Return for how many steps no limit can act while the speed stays below a bound.
@@ -78,51 +93,39 @@ class JointConstraints:
             return 0, 0.0
         return int(min(slack / (bound * self._period), 2**30)), bound * bound
 
-    def impulses(
-        self, positions: Vector, velocities: Vector
-    ) -> tuple[NDArray[np.intp], Vector, Vector, Vector] | None:
-        """Return what has to change, or None where the free motion is allowed.
+    def bounds(self, positions: Vector) -> Vector:
+        """Return how fast joints have to move at least, up for lower and down for upper limits.
 
         Args:
             positions: Before the step, shape (n,).
-            velocities: After the step if nothing stopped the joints, shape (n,).
 
         Returns:
-            Four vectors of one length: which degrees of freedom (one may be there twice), by how
-            much their velocities shall change, and the smallest and the largest impulse on them.
+            Shape (2, n), in rad/s or m/s: mostly negative, as joints need not move.
         """
-        if not self.acts and self._allows(positions, velocities):
-            return None
-        below, above = positions < self._lower, positions > self._upper
-        to_lower = (self._lower - positions) / self._period
-        to_upper = (self._upper - positions) / self._period
-        outside = below | above
-        slowest = np.where(below, to_lower, np.maximum(-self._fastest, to_lower))
-        slowest = np.minimum(slowest, _FASTEST_RETURN)
-        fastest = np.where(above, to_upper, np.minimum(self._fastest, to_upper))
-        fastest = np.maximum(fastest, -_FASTEST_RETURN)
-        low = below | ((velocities < slowest) & ~outside)
-        high = above | ((velocities > fastest) & ~outside & ~low)
-        rubs, motors = (self._friction > 0) & (velocities != 0), self._motors
-        index = np.concatenate([np.flatnonzero(rows) for rows in (low, high, rubs, motors)])
-        if not len(index):
-            return None
-        nothing, friction = np.zeros(len(velocities)), self._friction
-        strength = self._strength[motors]
-        aims = [slowest[low], fastest[high], nothing[rubs], self.targets[motors]]
-        target = np.concatenate(aims)
-        least = np.concatenate([nothing[low], nothing[high] - np.inf, -friction[rubs], -strength])
-        most = np.concatenate([nothing[low] + np.inf, nothing[high], friction[rubs], strength])
-        return index, target - velocities[index], least, most
+        needed = self._limits - self._pace * positions
+        bounds = np.maximum(needed, self._slowest)
+        if (needed > 0).any():
+            bounds = np.where((needed > 0).any(axis=0), needed, bounds)
+        return np.minimum(bounds, _FASTEST_RETURN)
 
-    def _allows(self, positions: Vector, velocities: Vector) -> bool:
-        """Return whether no limit acts on a free motion."""
-        after = positions + self._period * velocities
-        return bool(
-            (after >= self._lower).all()
-            and (after <= self._upper).all()
-            and (np.abs(velocities) <= self._fastest).all()
-        )
+    def acting(self, bounds: Vector, velocities: Vector, reach: float) -> NDArray[np.bool_]:
+        """Return which rows act, shape (rows,).
+
+        Args:
+            bounds: As `bounds` returned them.
+            velocities: After the step, shape (n,).
+            reach: How close to its bound a velocity is when a limit counts as acting.
+        """
+        acts = np.ones(len(self.joints), np.bool_)
+        np.less(self._signs * velocities, bounds + reach, out=acts[: bounds.size].reshape(2, -1))
+        return acts
+
+    def aims(self, bounds: Vector) -> Vector:
+        """Return the velocity that each row aims at, shape (rows,)."""
+        limits = (self._signs * bounds).ravel()
+        if not self.acts:
+            return limits
+        return np.concatenate([limits, np.zeros(len(self._rubs)), self.targets[self._motors]])
 
 
 def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vector:
