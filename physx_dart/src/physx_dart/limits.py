@@ -142,19 +142,21 @@ def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vect
         least: Smallest impulses, shape (n,), may be -inf.
         most: Largest impulses, likewise.
     """
-    matrix = response + np.diag(_REGULARIZATION * np.diag(response))
-    side = np.zeros(len(change), dtype=np.int8)  # -1: at its least, 1: at its most, 0: between
+    matrix = response.copy()
+    matrix.flat[:: len(change) + 1] *= 1 + _REGULARIZATION
+    # -1: at its least, 1: at its most, 0: between; at first as if no row knew of the others.
+    alone = change / matrix.diagonal()
+    side = (alone > most).astype(np.int8) - (alone < least)
     best, blocks = len(change) + 1, 3
     impulses = np.zeros(len(change))
     for _ in range(50 * (len(change) + 1)):
         free = side == 0
         impulses = np.where(side < 0, least, np.where(side > 0, most, 0.0))
         if free.any():
-            rest = change[free] - matrix[np.ix_(free, ~free)] @ impulses[~free]
-            impulses[free] = np.linalg.solve(matrix[np.ix_(free, free)], rest)
-        missing = matrix @ impulses - change
+            rest = (change - matrix @ impulses)[free]
+            impulses[free] = np.linalg.solve(matrix[free][:, free], rest)
         under, over = free & (impulses < least), free & (impulses > most)
-        freed = ((side < 0) & (missing < 0)) | ((side > 0) & (missing > 0))
+        freed = side * (matrix @ impulses - change) > 0
         wrong = np.flatnonzero(under | over | freed)
         if not len(wrong):
             break

@@ -29,6 +29,10 @@ from physx_dart.rotations import base_accelerations, matrix_from_quaternion
 
 _UNSEEN = 10
 """Steps after which it is seen whether a limit might have acted."""
+_REACH = 1.0
+"""Speed in rad/s or m/s within which a limit takes part where something touches."""
+_MISSED = 1e-9
+"""Speed beyond its bound at which a joint counts as having left its limits."""
 
 
 class PinocchioRobot(RobotEngine):
@@ -84,6 +88,9 @@ class PinocchioRobot(RobotEngine):
         self._smooth = bool(resists.damping.any() or resists.stiffness.any())
         self._touching: Touching | None = None
         self._impulses = np.zeros(0)
+        # Of an inverse matrix of inertia, Pinocchio computes the upper half.
+        self._upper = np.triu(np.ones((self.nv, self.nv)), 1) + 0.5 * np.eye(self.nv)
+        self._unit = np.eye(self.nv)
 
     # Stepping -------------------------------------------------------------------------------
 
@@ -164,28 +171,63 @@ class PinocchioRobot(RobotEngine):
         self._positions = pinocchio.integrate(model, q, dt * after)
 
     def _constrained(self, q: Vector, before: Vector, v: Vector) -> Vector:
-        """Return velocities (nv,) after the impulses of contacts, limits, servos and friction."""
-        base, dt = self.base, self._period
-        self._touching = None
+        """Return velocities (nv,) after the impulses of contacts, limits, servos and friction.
+
+        What acts on one joint may drive another to its limits. So limits that are close take part
+        from the beginning, and those that are left nevertheless join in.
+        """
+        base, joints = self.base, self._joints
+        touching = None
         if self._contacts:
-            self._touching = self._contacts.find(self._free_data, q, v, dt)
-        found = self._joints.impulses(q[self.nq - self.nv + base :], v[base:])
-        touching = self._touching
-        if found is None and touching is None:
+            touching = self._contacts.find(self._free_data, q, v, self._period)
+        self._touching = touching
+        bounds = joints.bounds(q[self.nq - self.nv + base :])
+        acts = joints.acting(bounds, v[base:], _REACH if touching else 0.0)
+        if touching is None and not acts.any():
             return v
-        inverse = pinocchio.computeMinverse(self._model, self._data, q)
-        inverse = np.triu(inverse) + np.triu(inverse, 1).T
-        nothing = np.zeros(0)
-        index, change, least, most = found or (np.zeros(0, np.intp), nothing, nothing, nothing)
-        index = index + base
-        if touching is None:
-            impulses = solve(inverse[np.ix_(index, index)], change, least, most)
-            return v + inverse[:, index] @ impulses
-        rows = np.concatenate([touching.jacobian, np.eye(self.nv)[index]])
-        wanted = np.concatenate([-touching.bias(before, dt), change + v[index]])
-        spread = inverse @ rows.T
+        upper = pinocchio.computeMinverse(self._model, self._data, q) * self._upper
+        inverse, aims = upper + upper.T, joints.aims(bounds)
+        while True:
+            rows = np.flatnonzero(acts)
+            if touching is None:
+                after = self._limited(inverse, v, rows, aims)
+            else:
+                after = self._touched(inverse, before, v, touching, rows, aims)
+            missed = joints.acting(bounds, after[base:], -_MISSED) & ~acts
+            if not missed.any():
+                return after
+            acts |= missed
+
+    def _limited(self, inverse: Vector, v: Vector, rows: Vector, aims: Vector) -> Vector:
+        """Return velocities after the impulses of rows of the joints alone."""
+        joints = self._joints
+        index = joints.joints[rows] + self.base
+        spread = inverse[:, index]
+        change = aims[rows] - v[index]
+        return v + spread @ solve(spread[index], change, joints.least[rows], joints.most[rows])
+
+    def _touched(
+        self,
+        inverse: Vector,
+        before: Vector,
+        v: Vector,
+        touching: Touching,
+        rows: Vector,
+        aims: Vector,
+    ) -> Vector:
+        """Return velocities after the impulses of contacts and of rows of the joints."""
+        joints = self._joints
+        jacobian, wanted = touching.jacobian, -touching.bias(before, self._period)
+        if len(rows):
+            jacobian = np.concatenate([jacobian, self._unit[joints.joints[rows] + self.base]])
+            wanted = np.concatenate([wanted, aims[rows]])
+        spread = inverse @ jacobian.T
         impulses = self._solver.solve(
-            rows @ spread, rows @ v - wanted, touching.friction, least, most
+            jacobian @ spread,
+            jacobian @ v - wanted,
+            touching.friction,
+            joints.least[rows],
+            joints.most[rows],
         )
         self._impulses = impulses[: 3 * len(touching.gaps)]
         return v + spread @ impulses
