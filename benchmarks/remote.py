@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from measure import claim, finish, rates, report
-from remote_servers import FRAME_STEPS, messages
+from remote_servers import ACTION, FRAME_STEPS, messages
 
 from physx_core.remote import GodotGymClient, PhysxClient, PhysxEnv, PhysxVectorEnv
 
@@ -31,7 +31,6 @@ REQUESTS = 400
 WORLDS = 16
 STEPS = 40
 SERVERS = Path(__file__).with_name("remote_servers.py")
-ACTION = [0.1, 0.0, 0.0]
 WANTED = {"agent": ["positions", "velocities"], "world": ["done"]}
 
 

@@ -6,42 +6,50 @@ import socket
 import sys
 from typing import Any
 
+import numpy as np
+
 from physx_core import Field, Simulation, plugins
 from physx_core.remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
 from physx_core.remote.messages import fill
-from physx_core.world import Ground, Sphere, World, Wrench
+from physx_core.world import Ground, JointSettings, Robot, World
 
-PERIOD = 1 / 120
-FRAME_STEPS = 2
+PERIOD = 1 / 180
+FRAME_STEPS = 3
+WHEELS = ("left_wheel_joint", "right_wheel_joint")
 VALUES = 16
+ACTION = [2.0, 3.0]
 
 
 def build() -> Simulation:
-    """Return a ball on the ground, on DART."""
-    ball = Sphere(name="ball", radius=0.1, position=(0.0, 0.0, 0.1))
-    world = World(objects=[ball], ground=Ground(), period=PERIOD)
+    """Return the robot of examples/apple_seeker on the ground, on DART."""
+    joints = dict.fromkeys(WHEELS, JointSettings(mode="servo"))
+    robot = Robot("wheeled_base", fixed_base=False, position=(0.0, 0.0, 0.15), joints=joints)
+    world = World([robot], ground=Ground(), period=PERIOD)
     simulation: Simulation = plugins.resolve("backend", "dart").build(world)
     return simulation
 
 
-class Ball(RLAgent):
-    """A ball that is pushed; it tells its position and velocity, and some numbers more."""
+class Wheels(RLAgent):
+    """A robot on wheels; it tells its position and velocity, and some numbers more."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
-        self.number = simulation.apply_wrench(Wrench("ball"))
-        self.rest = [0.0] * VALUES
+        joints = simulation.layout.joints
+        self.wheels = [joints.index(wheel) for wheel in WHEELS]
+        self.commands = np.zeros(len(joints))
+        self.positions, self.velocities = np.zeros(VALUES), np.zeros(VALUES)
 
     def set_action(self, action: Any) -> None:
-        """Push the ball."""
-        self.simulation.remove_wrench(self.number)
-        self.number = self.simulation.apply_wrench(Wrench("ball", force=action))
+        """Turn the wheels."""
+        self.commands[self.wheels] = action
+        self.simulation.set_commands(self.commands)
 
     def get_data(self, request: Any, storage: Any) -> None:
         """Tell what there is, 16 + 16 numbers."""
-        positions = self.simulation.positions().tolist() + self.rest
-        velocities = self.simulation.velocities().tolist() + self.rest
-        fill(storage, positions=positions[:VALUES], velocities=velocities[:VALUES])
+        layout = self.simulation.layout
+        self.simulation.positions(self.positions[: layout.nq])
+        self.simulation.velocities(self.velocities[: layout.nv])
+        fill(storage, positions=self.positions, velocities=self.velocities)
 
 
 class Room(RLEnvWorld):
@@ -58,7 +66,7 @@ class Small(RLEnvironment):
     def _ready(self) -> None:
         self.simulation = build()
         self.begin = self.simulation.snapshot()
-        self.agent, self.world = Ball(self.simulation), Room()
+        self.agent, self.world = Wheels(self.simulation), Room()
         self.messages = messages()
 
     def _reset(self) -> None:
@@ -76,7 +84,7 @@ def main() -> None:
     """Answer each request of so many bytes with so many bytes, after one frame of physics."""
     request, answer, steps = (int(word) for word in sys.argv[1:])
     simulation, reply = build(), bytes(answer)
-    simulation.apply_wrench(Wrench("ball", force=(0.1, 0.0, 0.0)))
+    Wheels(simulation).set_action(ACTION)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         print(listener.getsockname()[1], flush=True)
         connection, _ = listener.accept()

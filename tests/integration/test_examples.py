@@ -158,3 +158,14 @@ def test_operators_are_learned_by_networks_of_other_libraries(problem, library, 
     text = run(root / "examples/operators/run.py", "--small", problem).stdout
     sizes = [int(size) for size in re.findall(rf"^(?:{network}|FC) +(\d+)", text, re.M)]
     assert len(sizes) == 2 and sizes[1] == pytest.approx(sizes[0], rel=0.02)
+
+
+def test_equations_of_motion_help_a_network(root, run):
+    text = run(root / "examples/physics_informed/run.py", "--small").stdout
+    assert number(text, r"make the error ([\d.]+) times smaller") > 5
+
+
+def test_a_policy_is_trained(root, run):
+    pytest.importorskip("stable_baselines3", reason="needs stable-baselines3")
+    words = ("--steps", "1024", "--threshold", "50")
+    assert "solved" in run(root / "examples/train_ppo.py", *words).stdout

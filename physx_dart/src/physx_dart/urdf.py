@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
-from xml.sax.saxutils import quoteattr
 
 from physx_core.errors import ModelError, listed, nearest
 from physx_core.world import JointSettings, Robot
@@ -269,7 +268,11 @@ def _engine_text(tree: _Tree) -> str:
 
 
 def _quoted(name: str) -> str:
-    return quoteattr(name) if _SPECIAL.search(name) else f'"{name}"'
+    if not _SPECIAL.search(name):
+        return f'"{name}"'
+    from xml.sax.saxutils import quoteattr  # it loads much that is seldom needed
+
+    return quoteattr(name)
 
 
 def _inertial(name: str, link: Element) -> str:

@@ -1,0 +1,289 @@
+"""Members of the environment, each by what its documentation says and by its place in the order."""
+
+import copy
+import gc
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from physx_core.errors import EpisodeError
+from physx_core.gym import Layer, RobotEnv
+from physx_core.gym.quantities import BodyPositions
+from physx_core.motors import Motor
+from physx_core.sensors import Encoder
+
+MEMBERS = (
+    "simulator", "render_mode", "stepper_state", "is_simulation_running", "robot", "robot_state",
+    "derived", "log_fieldnames", "np_random", "np_random_seed", "num_steps", "quantities",
+    "observation", "action", "measurements", "register_variable", "set_wrapper_attr",
+    "get_wrapper_attr", "has_wrapper_attr", "viewer_kwargs", "step_dt", "control_dt", "observe_dt",
+    "simulation_duration_max", "debug", "unwrapped", "training", "train", "eval", "reset", "close",
+    "step", "stop", "render", "plot", "replay", "evaluate", "play_interactive", "log_data",
+    "metadata", "spec", "action_space", "observation_space", "refresh_observation",
+    "compute_command", "compute_reward", "has_terminated",
+)  # fmt: skip
+HOOKS = (
+    "_setup", "_neutral", "_sample_state", "_initialize_action_space",
+    "_initialize_observation_space", "_initialize_seed", "_initialize_buffers", "_refresh_buffers",
+    "_key_to_action", "_update_pipeline",
+)  # fmt: skip
+
+
+def cart(kind=RobotEnv, **options):
+    return kind("cartpole", 0.02, **{"motors": [Motor(joint="slider")], "period": 5e-3, **options})
+
+
+def test_all_members_are_there():
+    env = cart()
+    layer = Layer(env)
+    env.reset(seed=0)
+    layer.reset(seed=0)
+    for name in MEMBERS:
+        assert env.has_wrapper_attr(name), name
+        assert layer.has_wrapper_attr(name), name
+    assert all(hasattr(env, name) for name in HOOKS)
+    assert env.metadata["render_modes"] == ["human", "rgb_array"]
+    assert env.spec is None
+    assert gymnasium.make("physx/Cartpole-v0").unwrapped.spec.id == "physx/Cartpole-v0"
+
+
+# Construction and seeds -------------------------------------------------------------------------
+
+
+def test_construction_makes_the_action_space_first_and_runs_nothing():
+    calls = []
+
+    class Noting(RobotEnv):
+        def _initialize_action_space(self):
+            calls.append(("action", self.step_dt, self.control_dt))
+            super()._initialize_action_space()
+
+        def _initialize_observation_space(self):
+            calls.append(("observation", self.action_space.shape))
+            super()._initialize_observation_space()
+
+        def _setup(self):
+            calls.append("setup")
+
+    env = cart(Noting)
+    assert calls == [("action", 0.02, 0.02), ("observation", (1,))]
+    assert env.num_steps == -1
+    assert not env.is_simulation_running
+
+
+def test_a_seed_reaches_states_sensors_and_spaces():
+    env = cart(sensors=[Encoder(name="a", joint="hinge", noise=0.1)])
+
+    def drawn():
+        number = env.np_random.random()
+        sampled = env.action_space.sample()[0], env.observation_space.sample()["t"][()]
+        return number, *sampled, float(env.reset()[0]["measurements"]["Encoder"][0, 0])
+
+    env._initialize_seed(5)
+    first = drawn()
+    assert env.np_random_seed == 5
+    env._initialize_seed()
+    assert env.np_random_seed != 5
+    other = drawn()
+    assert all(one != two for one, two in zip(first, other, strict=True))
+    env._initialize_seed(5)
+    assert drawn() == first
+
+
+def test_the_pipeline_changes_at_the_base():
+    env = cart()
+    layer = Layer(env)
+    assert env.derived is layer
+    env._update_pipeline(None)
+    assert env.derived is env is layer.derived
+    env._update_pipeline(layer)
+    layer.reset()
+    env._update_pipeline(None)
+    for each in (env, layer):
+        with pytest.raises(EpisodeError, match="pipeline has changed: call reset"):
+            each.step([0.0])
+
+
+# The order within an episode --------------------------------------------------------------------
+
+
+def test_steps_are_counted_before_the_last_observation():
+    seen = []
+
+    def noting(name):
+        def call(self, *arguments):
+            seen.append((name, int(self.num_steps), round(self.stepper_state.t, 9)))
+            return getattr(RobotEnv, name)(self, *arguments)
+
+        return call
+
+    names = ("compute_command", "refresh_observation", "has_terminated", "compute_reward")
+    env = cart(type("Noting", (RobotEnv,), {name: noting(name) for name in names}))
+    env.reset()
+    assert seen == [("refresh_observation", 0, 0.0), ("has_terminated", 0, 0.0)]
+    seen.clear()
+    env.step([0.0])
+    assert seen == [("compute_command", 0, 0.0), *((name, 1, 0.02) for name in names[1:])]
+
+
+def test_the_first_state_is_sampled_from_the_neutral_one():
+    class Noting(RobotEnv):
+        calls = ()
+
+        def _neutral(self):
+            self.calls += (("neutral", bool(self.is_simulation_running)),)
+            return np.array([0.1, 0.2])
+
+        def _sample_state(self):
+            self.calls += ("sample",)
+            return super()._sample_state()
+
+    env = cart(Noting)
+    observation, _ = env.reset()
+    assert env.calls == ("sample", ("neutral", False))
+    assert observation["states"]["agent"]["q"].tolist() == [0.1, 0.2]
+
+
+def test_quantities_are_those_of_the_step():
+    class Watching(RobotEnv):
+        def note(self):
+            return float(self.quantities.get_value(BodyPositions(("cart",)))[0, 0])
+
+        def refresh_observation(self, measurement):
+            super().refresh_observation(measurement)
+            self.observed = self.note()
+
+        def has_terminated(self, info):
+            info["ended"] = self.note()
+            return False, False
+
+        def compute_reward(self, terminated, info):
+            return self.note()
+
+    env = cart(Watching, control_period=5e-3)
+    env.reset()
+    for _ in range(3):
+        _, reward, *_, info = env.step([30.0])
+        assert reward == info["ended"] == env.observed == pytest.approx(env.robot_state.q[0])
+
+
+@pytest.mark.parametrize(
+    "hook", ["_setup", "_sample_state", "_initialize_buffers", "_refresh_buffers"]
+)
+def test_an_error_in_a_hook_leaves_an_environment_that_can_be_reset(hook):
+    class Failing(RobotEnv):
+        fails = True
+
+    def fail(self):
+        if self.fails:
+            raise RuntimeError("now")
+        return getattr(RobotEnv, hook)(self)
+
+    setattr(Failing, hook, fail)
+    env = cart(Failing)
+    with pytest.raises(RuntimeError, match="now"):
+        env.reset(seed=0)
+    assert not env.is_simulation_running
+    with pytest.raises(EpisodeError, match="reset"):
+        env.step([0.0])
+    env.fails = False
+    env.reset(seed=0)
+    env.step([0.0])
+
+
+# Logs -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", ["evaluation", "debug"])
+def test_logs_are_written_by_stop_and_by_the_next_reset(way):
+    env = cart(debug=way == "debug")
+    env.train(way == "debug")
+    _, info = env.reset()
+    env.step([0.0])
+    assert not Path(info["log_path"]).exists()
+    _, second = env.reset()
+    assert Path(info["log_path"]).exists()
+    assert second["log_path"] != info["log_path"]
+    env.step([0.0])
+    env.stop()
+    assert Path(second["log_path"]).exists()
+    env.close()
+
+
+def test_nothing_is_registered_while_an_episode_runs():
+    env = cart()
+    env.reset()
+    env.register_variable("late", np.zeros(1))  # nothing is recorded, so from the next reset on
+    env.stop()
+    env.eval()
+    env.reset()
+    with pytest.raises(EpisodeError, match="before reset"):
+        env.register_variable("later", np.zeros(1))
+    env.step([0.0])
+    assert "late.0" in env.log_data["variables"]
+
+
+def test_log_data_is_of_the_running_episode_or_of_the_last():
+    env = cart()
+    assert env.log_data == {}
+    env.eval()
+    env.reset(seed=0)
+    for steps in range(1, 4):
+        env.step([1.0])
+        assert env.log_data["variables"]["time"][-1] == pytest.approx(0.02 * steps)
+    before = env.log_data["variables"]["state.q.robot.slider"]
+    env.stop()
+    np.testing.assert_array_equal(env.log_data["variables"]["state.q.robot.slider"], before)
+
+
+@pytest.mark.parametrize(
+    ("space", "names"),
+    [
+        (spaces.Box(-1, 1, (1,)), ["action.slider"]),
+        (spaces.Box(-1, 1, (2,)), ["action.0", "action.1"]),
+        (spaces.Discrete(3), ["action"]),
+        (spaces.MultiDiscrete([2, 3]), ["action.0", "action.1"]),
+        (spaces.Dict({"a": spaces.Discrete(2)}), []),
+    ],
+)
+def test_actions_of_all_types_are_recorded(space, names):
+    class Acting(RobotEnv):
+        def _initialize_action_space(self):
+            self.action_space = space
+
+        def compute_command(self, action, command):
+            command[:] = 0.0
+
+    env = cart(Acting)
+    env.eval()
+    for way in (lambda env: env, copy.deepcopy):
+        env = way(env)
+        env.reset(seed=1)
+        given = [env.action_space.sample() for _ in range(3)]
+        for action in given:
+            env.step(action)
+        env.stop()
+        variables = env.log_data["variables"]
+        assert [name for name in variables if name.split(".")[0] == "action"] == names
+        if names:
+            found = np.transpose([variables[name] for name in names])
+            np.testing.assert_array_equal(found[:-1], [np.ravel(each) for each in given])
+    env.close()
+
+
+def test_evaluation_leaves_no_files_behind():
+    env = cart()
+    env.eval()
+    folders = set()
+    for _ in range(40):
+        _, info = env.reset()
+        env.step([0.0])
+        folders.add(Path(info["log_path"]).parent)
+    (folder,) = folders
+    assert len(list(folder.iterdir())) <= 32
+    del env
+    gc.collect()
+    assert not folder.exists()
