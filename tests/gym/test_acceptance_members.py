@@ -2,14 +2,16 @@
 
 import copy
 import gc
+import warnings
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.utils.env_checker import check_env
 
-from physx_core.errors import EpisodeError
+from physx_core.errors import EpisodeError, VisualizerError
 from physx_core.gym import Layer, RobotEnv
 from physx_core.gym.quantities import BodyPositions
 from physx_core.motors import Motor
@@ -45,7 +47,8 @@ def test_all_members_are_there():
         assert env.has_wrapper_attr(name), name
         assert layer.has_wrapper_attr(name), name
     assert all(hasattr(env, name) for name in HOOKS)
-    assert env.metadata["render_modes"] == ["human", "rgb_array"]
+    assert RobotEnv.metadata["render_modes"] == ["human", "rgb_array"]
+    assert env.metadata["render_fps"] == layer.metadata["render_fps"] == 50
     assert env.spec is None
     assert gymnasium.make("physx/Cartpole-v0").unwrapped.spec.id == "physx/Cartpole-v0"
 
@@ -237,6 +240,45 @@ def test_log_data_is_of_the_running_episode_or_of_the_last():
     before = env.log_data["variables"]["state.q.robot.slider"]
     env.stop()
     np.testing.assert_array_equal(env.log_data["variables"]["state.q.robot.slider"], before)
+
+
+def test_a_log_goes_on_where_a_snapshot_was_restored():
+    env = cart(control_period=5e-3)
+    env.eval()
+    env.reset(seed=0)
+    env.step([5.0])
+    state = env.snapshot()
+    for _ in range(300):
+        env.step([-5.0])
+    env.restore(state)
+    assert len(env.log_data["variables"]["time"]) == 5
+    env.step([0.0])
+    env.stop()
+    variables = env.log_data["variables"]
+    np.testing.assert_allclose(variables["time"], 0.005 * np.arange(9), atol=1e-12)
+    assert variables["motor.command.slider"].tolist() == [5.0] * 4 + [0.0] * 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("display", [None, ":0"])
+def test_modes_are_those_that_are_possible(display, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    if display:
+        monkeypatch.setenv("DISPLAY", display)
+        assert cart().metadata["render_modes"] == ["human", "rgb_array"]
+        return
+    env = gymnasium.make("physx/Cartpole-v0", render_mode="rgb_array")
+    assert env.metadata["render_modes"] == ["rgb_array"]
+    try:
+        env.unwrapped.reset()
+        env.unwrapped.render()
+    except VisualizerError as error:
+        pytest.skip(str(error))
+    env.close()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        check_env(gymnasium.make("physx/Cartpole-v0").unwrapped)
 
 
 @pytest.mark.parametrize(

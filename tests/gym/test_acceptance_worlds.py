@@ -11,9 +11,9 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from physx_core.errors import ActionError, ConfigError, EpisodeError, PhysxError, UnknownOptionError
-from physx_core.gym import ComposedEnv, RobotEnv, Simulator
-from physx_core.gym.quantities import BodyPositions
-from physx_core.gym.rewards import Tracking
+from physx_core.gym import ComposedEnv, PDController, RobotEnv, Simulator, build_pipeline
+from physx_core.gym.quantities import BodyPositions, JointPositions, Stacked
+from physx_core.gym.rewards import Minimizing, Sum, Survival, Tracking
 from physx_core.gym.terminations import OutOfBounds
 from physx_core.motors import Motor
 from physx_core.sensors import Encoder
@@ -212,3 +212,79 @@ def test_wrong_arguments_of_methods():
     env.simulation_duration_max = -1.0
     with pytest.raises(ConfigError, match="simulation_duration_max is -1"):
         env.reset()
+
+
+@pytest.mark.parametrize(
+    ("method", "returned", "message"),
+    [
+        ("_sample_state", None, "_sample_state returned None but must return positions and vel"),
+        ("_sample_state", np.zeros(2), "must return positions and velocities"),
+        ("has_terminated", True, "has_terminated returned True but must return whether"),
+        ("refresh_observation", np.zeros(4), "write into `self.observation` in place"),
+        ("compute_command", np.zeros(1), "write into `command` in place"),
+        ("compute_reward", None, "compute_reward returned None but must return a number"),
+        ("_initialize_action_space", None, "must set it to a space of gymnasium"),
+        ("_initialize_observation_space", None, "must set it to a space of gymnasium"),
+    ],
+)
+def test_methods_that_return_something_else_are_named(method, returned, message):
+    kind = type("Mistaken", (RobotEnv,), {method: lambda *arguments: returned})
+    with pytest.raises(ConfigError, match=message):
+        env = cart(kind)
+        env.reset()
+        env.step([0.0])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda env: Tracking(JointPositions, 1.0), r"make one, as in JointPositions\(\.\.\.\)"),
+        (lambda env: Minimizing("power", 1.0), "Minimizing.quantity is 'power'"),
+        (lambda env: Stacked("power", 2), "Stacked.quantity is 'power'"),
+        (lambda env: BodyPositions("cart"), 'is the text "cart" but must be a list'),
+        (lambda env: OutOfBounds(JointPositions(), "a"), "must be numbers"),
+        (lambda env: OutOfBounds(JointPositions(), 1, 0), "the lower one first"),
+        (lambda env: OutOfBounds(JointPositions(), 0, grace=1), 'Did you mean "grace_period"'),
+        (lambda env: Sum([Survival()], weights=[1, 2]), "1 rewards and 2 weights"),
+        (lambda env: ComposedEnv(env, trajectory=3), "trajectory is 3"),
+        (lambda env: PDController("pd", 3, kp=1, kd=1), "is for a RobotEnv"),
+    ],
+)
+def test_wrong_parts_are_named(make, message):
+    env = cart()
+    with pytest.raises(PhysxError, match=message):
+        make(env)
+
+
+def test_numbers_that_do_not_fit_a_quantity_are_named():
+    three = (0.0, 0.0, 0.0)
+    for options, message in (
+        ({"reward": Tracking(JointPositions(), 1.0, target=three, name="pose")}, 'reward "pose"'),
+        ({"terminations": OutOfBounds(JointPositions(), three, name="low")}, 'termination "low"'),
+    ):
+        env = ComposedEnv(RobotEnv("cartpole", 0.02), **options)
+        with pytest.raises(ConfigError, match=message):
+            env.reset()
+            env.step([0.0, 0.0])
+
+
+def test_lists_of_a_file_are_weights_and_names():
+    place = {"cls": "BodyPositions", "kwargs": {"bodies": ["cart", "pole"]}}
+    kept = {"cls": "Minimizing", "kwargs": {"quantity": place, "cutoff": 2.0, "name": "place"}}
+    total = {"cls": "Sum", "kwargs": {"rewards": [{"cls": "Survival"}, kept], "weights": [1, 3]}}
+    wrapper = {"wrapper": {"cls": "ComposedEnv", "kwargs": {"reward": total}}}
+    env = build_pipeline({"cls": "physx/Cartpole-v0"}, [wrapper])()
+    env.reset(seed=0)
+    _, reward, *_, info = env.step(1)
+    assert reward == pytest.approx(1.0 + 1.0 + 3 * info["reward"]["place"])
+
+
+def test_the_own_action_is_cut_and_checked_too():
+    env = cart()
+    env.reset()
+    env.action[:] = 1e9
+    env.step(env.action)
+    assert env.action == env.robot_state.command == env.action_space.high
+    env.action[:] = np.nan
+    with pytest.raises(ActionError, match="nan"):
+        env.step(env.action)

@@ -1,6 +1,8 @@
 """`ParallelVectorEnv` against Gymnasium's own `AsyncVectorEnv`, with real processes."""
 
 import contextlib
+import os
+import signal
 
 import gymnasium
 import numpy as np
@@ -173,3 +175,17 @@ def test_mistakes_and_failures_are_named(nothing_stays_behind):
         env.step(actions)
         with pytest.raises(EnvironmentFailedError, match="the counter is stuck"):
             env.step(actions)
+
+
+def test_it_closes_while_a_process_lives_that_was_forked_meanwhile():
+    env = ParallelVectorEnv(HERE + "Counter", 2, processes=2)
+    child = os.fork()
+    if not child:  # it holds all that the parent had open
+        signal.pause()
+    try:
+        env.reset()
+        env.close()
+        assert os.waitpid(child, os.WNOHANG) == (0, 0)
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)

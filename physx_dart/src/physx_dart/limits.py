@@ -109,7 +109,9 @@ class JointConstraints:
         return np.minimum(bounds, _FASTEST_RETURN)
 
     def acting(self, bounds: Vector, velocities: Vector, reach: float) -> NDArray[np.bool_]:
-        """Return which rows act, shape (rows,).
+        """Return which rows act, shape (rows,): all of friction and motors, and some limits.
+
+        Those of joints that are outside do always, as other joints may push them further.
 
         Args:
             bounds: As `bounds` returned them.
@@ -117,7 +119,9 @@ class JointConstraints:
             reach: How close to its bound a velocity is when a limit counts as acting.
         """
         acts = np.ones(len(self.joints), np.bool_)
-        np.less(self._signs * velocities, bounds + reach, out=acts[: bounds.size].reshape(2, -1))
+        limits = acts[: bounds.size].reshape(bounds.shape)
+        np.less(self._signs * velocities, bounds + reach, out=limits)
+        limits |= bounds > 0
         return acts
 
     def aims(self, bounds: Vector) -> Vector:

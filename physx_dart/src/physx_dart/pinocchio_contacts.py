@@ -6,12 +6,14 @@ of each rim, one of them the deepest; a shape's edges and faces do not touch cor
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pinocchio
+from numpy.typing import NDArray
 
 from physx_core.errors import FeatureNotSupportedError
 from physx_core.interfaces.backend import Vector
@@ -28,7 +30,14 @@ _FASTEST_RETURN = 1.0
 _BOUNCE = 0.1
 """Speed of approach, in m/s, from which things bounce."""
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-_TURNS = 2 * np.pi / 3 * np.arange(3)
+_THIRDS = np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
+"""Cosines and sines of three directions around a rim."""
+_CROSS = np.zeros((3, 9))
+_CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = 1.0, -1.0, 1.0, -1.0, 1.0, -1.0
+"""Makes a vector the matrix, row by row, whose product with another is their cross product."""
+
+
+Places = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +55,8 @@ class Touching:
         jacobian: Of the points along their axes, shape (3 k, nv).
     """
 
-    links: Vector
-    statics: Vector
+    links: Places
+    statics: Places
     points: Vector
     axes: Vector
     gaps: Vector
@@ -62,14 +71,46 @@ class Touching:
             before: Velocities before the step, shape (nv,).
             period: Length of the step, in s.
         """
-        back = np.maximum(_RETURN * self.gaps / period, -_FASTEST_RETURN)
-        along = np.where(self.gaps > 0, self.gaps / period, back)
-        approach = self.jacobian[2::3] @ before
-        bounces = (self.restitution > 0) & (approach < -_BOUNCE)
-        along = np.where(bounces, self.restitution * approach, along)
+        pace = self.gaps / period
+        along = np.where(self.gaps > 0, pace, np.maximum(_RETURN * pace, -_FASTEST_RETURN))
+        if self.restitution.any():
+            approach = self.jacobian[2::3] @ before
+            bounces = (self.restitution > 0) & (approach < -_BOUNCE)
+            along = np.where(bounces, self.restitution * approach, along)
         found = np.zeros(3 * len(along))
         found[2::3] = along
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Near:
+    """Points near one surface: as `Touching`, their places in the finder, and radii around them."""
+
+    statics: Places
+    rows: Places
+    gaps: Vector
+    normals: Vector
+    axes: Vector
+    points: Vector
+    radii: Vector
+
+    @classmethod
+    def at(
+        cls,
+        place: int,
+        surface: Surface,
+        rows: Places,
+        gaps: Vector,
+        normals: Vector,
+        points: Vector,
+        radii: Vector,
+    ) -> _Near:
+        """Add the tangents at the surface of the static of that place."""
+        if isinstance(surface, Plane):
+            axes = np.ones((len(rows), 1, 1)) * np.array(axes_of(*surface.normal.tolist()))
+        else:
+            axes = np.array([axes_of(*normal) for normal in normals.tolist()])
+        return cls(np.full(len(rows), place), rows, gaps, normals, axes, points, radii)
 
 
 class ContactFinder:
@@ -80,27 +121,28 @@ class ContactFinder:
         mover: Mover,
         statics: Sequence[Static],
         model: Any,
+        data: Any,
         frames: Sequence[int],
         features: Sequence[str],
     ) -> None:
-        """Prepare the points.
+        """Prepare the points; `find` computes with the model and its data.
 
         Raises:
             FeatureNotSupportedError: A shape is a mesh.
         """
-        self._model = model
-        self._surfaces: list[tuple[int, Static, Surface]] = [
-            (place, static, surface)
+        self._model, self._data = model, data
+        self._surfaces = [
+            (place, surface)
             for place, static in enumerate(statics)
             for surface in surfaces_of(static, "pinocchio", features)
         ]
         self._up = next(
-            (each.normal for _, _, each in self._surfaces if isinstance(each, Plane)),
+            (each.normal for _, each in self._surfaces if isinstance(each, Plane)),
             np.array([0.0, 0.0, 1.0]),
         )
         links = {name: i for i, name in enumerate(mover.model.links)}
         points: list[tuple[int, Vector, float, int, Shape]] = []
-        rims: list[tuple[int, Vector, Vector, int, Shape]] = []
+        rims: list[tuple[int, Vector, float, int, Shape, Vector]] = []
         for shape in mover.model.shapes if self._surfaces else ():
             if shape.kind == "mesh":
                 advice = 'Use Robot(collisions="boxes") or "capsules".'
@@ -112,117 +154,158 @@ class ContactFinder:
             if shape.kind == "cylinder":
                 for end in (-0.5, 0.5):
                     rim = center + end * shape.size[1] * rotation[:, 2]
-                    rims.append((frame.parentJoint, rim, rotation, link, shape))
+                    rims.append((frame.parentJoint, rim, shape.size[0], link, shape, rotation))
                 continue
             offsets, radius = _points(shape)
             for offset in offsets:
                 spot = center + rotation @ offset
                 points.append((frame.parentJoint, spot, radius, link, shape))
-        self._arrange(points, rims)
+        anchors: list[Any] = [*points, *rims]
+        self._arrange(anchors, len(points))
+        materials, shapes = [static.what for static in statics], [row[4] for row in anchors]
+        of_materials = np.array([(each.friction, each.restitution) for each in materials])
+        of_shapes = np.array([(shape.friction, shape.restitution) for shape in shapes])
+        first, second = of_materials.reshape(-1, 1, 2), of_shapes.reshape(1, -1, 2)
+        self._friction = np.minimum(first[:, :, 0], second[:, :, 0])
+        self._restitution = first[:, :, 1] * second[:, :, 1]
 
-    def _arrange(self, points: list[Any], rims: list[Any]) -> None:
-        """Put points, then three of each rim, into arrays."""
-        rim_points = [row for row in rims for _ in range(3)]
-        joints = [row[0] for row in (*points, *rim_points)]
-        shapes = [row[4] for row in (*points, *rim_points)]
-        self._used = sorted(set(joints))
-        self._joints = np.array([self._used.index(joint) for joint in joints], np.intp)
-        self._links = np.array([row[3] for row in (*points, *rim_points)], np.intp)
-        self._centers = np.array([row[1] for row in (*points, *rim_points)]).reshape(-1, 3)
-        self._radii = np.array([*(row[2] for row in points), *(0.0 for _ in rim_points)])
-        self._friction = np.array([shape.friction for shape in shapes])
-        self._restitution = np.array([shape.restitution for shape in shapes])
-        self._rim_joints = np.array([self._used.index(row[0]) for row in rims], np.intp)
-        self._rim_axes = np.array([row[2] for row in rims]).reshape(-1, 3, 3)
-        self._rim_radii = np.array([row[4].size[0] for row in rims])
-        self._rim_centers = np.array([row[1] for row in rims]).reshape(-1, 3)
+    def _arrange(self, anchors: list[Any], points: int) -> None:
+        """Put points, then the centers of rims, into arrays."""
+        used = sorted({row[0] for row in anchors})
+        model, data = self._model, self._data
+        # Arrays that look into Pinocchio's own memory: they change with each `find`.
+        self._turns = [data.oMi[joint].rotation for joint in used]
+        self._places = [data.oMi[joint].translation for joint in used]
+        self._moved = np.zeros((len(used), model.nv))
+        for row, joint in enumerate(used):
+            for each in (each for each in model.supports[joint] if each > 0):
+                first = model.idx_vs[each]
+                self._moved[row, first : first + model.nvs[each]] = 1.0
+        self._joints = np.array([used.index(row[0]) for row in anchors], np.intp)
+        self._links = np.array([row[3] for row in anchors], np.intp)
+        self._centers = np.array([row[1] for row in anchors]).reshape(-1, 3)
+        self._radii = np.array([row[2] for row in anchors])
+        self._first_rim = points
+        self._rim_axes = np.array([row[5] for row in anchors[points:]]).reshape(-1, 3, 3)
 
     def __bool__(self) -> bool:
         """Return whether anything can ever touch."""
         return len(self._joints) > 0
 
-    def find(self, data: Any, q: Vector, v: Vector, period: float) -> Touching | None:
+    def find(self, q: Vector, v: Vector, period: float) -> Touching | None:
         """Return the points that touch, or may within the next step; None where there are none.
 
         Args:
-            data: What is computed is written to it.
             q: Positions, shape (nq,).
             v: Velocities that the robot would have without contacts, shape (nv,).
             period: Length of the step, in s.
         """
-        pinocchio.forwardKinematics(self._model, data, q, v)
-        rotations = np.array([data.oMi[joint].rotation for joint in self._used])
-        places = np.array([data.oMi[joint].translation for joint in self._used])
-        motions = np.array([data.v[joint].vector for joint in self._used])
-        if len(self._rim_joints):
-            self._centers[len(self._centers) - 3 * len(self._rim_joints) :] = self._rims(rotations)
-        turns, moves = rotations[self._joints], motions[self._joints]
-        points = np.einsum("nij,nj->ni", turns, self._centers) + places[self._joints]
-        local = moves[:, :3] + np.cross(moves[:, 3:], self._centers)
-        speeds = np.einsum("nij,nj->ni", turns, local)
-        found = []
-        for place, static, surface in self._surfaces:
+        motions = pinocchio.computeJointJacobians(self._model, self._data, q)
+        joints, turns = self._joints, np.array(self._turns)
+        points = np.einsum("nij,nj->ni", turns[joints], self._centers)
+        points += np.array(self._places)[joints]
+        # How each joint moves: turn, and drift of what of it is at the world's origin.
+        twists = period * ((self._moved * v) @ motions.T)
+        steps = _moved(twists[joints], points)
+        reach, first = self._radii, self._first_rim
+        if first < len(points):
+            # No point of a rim moves further than its center and its turn take it.
+            spins, reach = _lengths(twists[:, 3:])[joints[first:]], reach.copy()
+            reach[first:] += _lengths(steps[first:]) + reach[first:] * spins
+        found: list[_Near] = []
+        for place, surface in self._surfaces:
             gaps, normals = surface.distances(points)
-            gaps = gaps - self._radii
-            ahead = gaps + period * np.einsum("ij,ij->i", normals, speeds)
-            near = np.flatnonzero((gaps < _MARGIN) | (ahead < _MARGIN))
-            found += [(i, place, static, gaps[i], normals[i], points[i]) for i in near]
-        return self._touching(data, q, found) if found else None
+            ahead = gaps + np.einsum("ij,ij->i", normals, steps)
+            close = np.minimum(gaps, ahead) < reach + _MARGIN
+            if not surface.even:
+                close[first:] = True
+            rows = np.flatnonzero(close)
+            if len(rows) and rows[-1] >= first:
+                rows, rims = rows[rows < first], rows[rows >= first]
+                found += self._near_rims(place, surface, rims, turns, points, twists)
+            if len(rows):
+                radii = self._radii[rows]
+                gaps, normals = gaps[rows] - radii, normals[rows]
+                found.append(_Near.at(place, surface, rows, gaps, normals, points[rows], radii))
+        return self._touching(motions, found) if found else None
 
-    def _rims(self, rotations: Vector) -> Vector:
-        """Return three points of each rim in its joint's frame, one of them the deepest."""
-        axes = self._rim_axes
-        downward = -np.einsum(
-            "nji,nkj,k->ni", axes, rotations[self._rim_joints].swapaxes(1, 2), self._up
-        )
-        first = np.arctan2(downward[:, 1], downward[:, 0])
-        first = np.where(np.hypot(downward[:, 0], downward[:, 1]) > 1e-9, first, 0.0)
-        angles = first[:, None] + _TURNS
-        around = self._rim_radii[:, None, None] * np.stack(
-            [np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1
-        )
-        found = self._rim_centers[:, None] + np.einsum("nij,nkj->nki", axes, around)
-        return found.reshape(-1, 3)
+    def _near_rims(
+        self,
+        place: int,
+        surface: Surface,
+        rims: Places,
+        turns: Vector,
+        points: Vector,
+        twists: Vector,
+    ) -> list[_Near]:
+        """Return those points of rims that touch, or may within the next step."""
+        rows, around = np.repeat(rims, 3), self._rims(rims, turns, points)
+        gaps, normals = surface.distances(around)
+        steps = _moved(twists[self._joints[rows]], around)
+        close = np.minimum(gaps, gaps + np.einsum("ij,ij->i", normals, steps)) < _MARGIN
+        if not close.any():
+            return []
+        rows, gaps, normals, around = rows[close], gaps[close], normals[close], around[close]
+        return [_Near.at(place, surface, rows, gaps, normals, around, np.zeros(len(rows)))]
 
-    def _touching(self, data: Any, q: Vector, found: list[Any]) -> Touching:
-        model, world_axes = self._model, pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        pinocchio.computeJointJacobians(model, data, q)
-        points, axes, jacobians = [], [], []
-        for i, _, _, gap, normal, center in found:
-            joint = self._used[self._joints[i]]
-            point = center - (self._radii[i] + 0.5 * min(gap, 0.0)) * normal
-            x, y, z = point - data.oMi[joint].translation
-            arm = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-            whole = pinocchio.getJointJacobian(model, data, joint, world_axes).reshape(6, -1)
-            points.append(point)
-            axes.append(axes_of(normal))
-            jacobians.append(axes[-1] @ (whole[:3] - arm @ whole[3:]))
-        rows = np.array([row[0] for row in found])
-        materials = [row[2].what for row in found]
-        friction = np.array([material.friction for material in materials])
+    def _rims(self, rows: Places, turns: Vector, points: Vector) -> Vector:
+        """Return three points of each rim, one of them the deepest, shape (3 rows, 3)."""
+        axes = turns[self._joints[rows]] @ self._rim_axes[rows - self._first_rim]
+        along = axes[:, :, 2]
+        downward = (along @ self._up)[:, None] * along - self._up
+        lengths = _lengths(downward)[:, None]
+        upright = lengths <= 1e-9
+        first = np.where(upright, axes[:, :, 0], downward / np.where(upright, 1.0, lengths))
+        around = _THIRDS @ np.stack([first, np.cross(along, first)], axis=1)
+        return (points[rows][:, None] + self._radii[rows][:, None, None] * around).reshape(-1, 3)
+
+    def _touching(self, motions: Vector, found: list[_Near]) -> Touching:
+        rows, statics = _joined(found, "rows"), _joined(found, "statics")
+        gaps, normals = _joined(found, "gaps"), _joined(found, "normals")
+        depths = _joined(found, "radii") + 0.5 * np.minimum(gaps, 0.0)
+        points = _joined(found, "points") - depths[:, None] * normals
+        axes = _joined(found, "axes")
+        turned = (points @ _CROSS).reshape(-1, 3, 3) @ motions[3:]
+        jacobian = axes @ ((motions[:3] - turned) * self._moved[self._joints[rows], None])
         return Touching(
             links=self._links[rows],
-            statics=np.array([row[1] for row in found]),
-            points=np.array(points),
-            axes=np.array(axes),
-            gaps=np.array([row[3] for row in found]),
-            friction=np.minimum(self._friction[rows], friction),
-            restitution=self._restitution[rows] * [each.restitution for each in materials],
-            jacobian=np.concatenate(jacobians),
+            statics=statics,
+            points=points,
+            axes=axes,
+            gaps=gaps,
+            friction=self._friction[statics, rows],
+            restitution=self._restitution[statics, rows],
+            jacobian=jacobian.reshape(-1, jacobian.shape[2]),
         )
 
 
-def axes_of(normal: Vector) -> Vector:
-    """Return two tangents and the normal itself as rows, shape (3, 3)."""
-    x, y, z = normal
+def axes_of(x: float, y: float, z: float) -> tuple[tuple[float, float, float], ...]:
+    """Return two tangents and the normal (x, y, z) itself."""
     if abs(z) > 0.5:
-        first = np.array([z, 0.0, -x]) / np.hypot(x, z)
+        length = math.hypot(x, z)
+        a, b, c = z / length, 0.0, -x / length
     else:
-        first = np.array([y, -x, 0.0]) / np.hypot(x, y)
-    second = np.array(
-        [y * first[2] - z * first[1], z * first[0] - x * first[2], x * first[1] - y * first[0]]
+        length = math.hypot(x, y)
+        a, b, c = y / length, -x / length, 0.0
+    return (a, b, c), (y * c - z * b, z * a - x * c, x * b - y * a), (x, y, z)
+
+
+def _moved(twists: Vector, points: Vector) -> Vector:
+    """Return how far points (n, 3) are moved by drift and turn (n, 6)."""
+    return twists[:, :3] + np.einsum(
+        "nij,nj->ni", (twists[:, 3:] @ _CROSS).reshape(-1, 3, 3), points
     )
-    return np.array([first, second, normal])
+
+
+def _lengths(vectors: Vector) -> Vector:
+    """Return the lengths of rows."""
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+
+
+def _joined(found: list[_Near], name: str) -> Any:
+    """Return one array of all that is near."""
+    parts = [getattr(each, name) for each in found]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _points(shape: Shape) -> tuple[Vector, float]:

@@ -22,7 +22,7 @@ from physx_dart.algorithms import MoverAlgorithms
 from physx_dart.engine import RobotEngine
 from physx_dart.limits import JointConstraints, solve
 from physx_dart.parts import Mover, Static
-from physx_dart.pinocchio_contacts import ContactFinder, Touching
+from physx_dart.pinocchio_contacts import ContactFinder, Places, Touching
 from physx_dart.pinocchio_models import frames_of, load_stepping_model
 from physx_dart.pinocchio_solver import ImpulseSolver
 from physx_dart.rotations import base_accelerations, matrix_from_quaternion
@@ -70,7 +70,9 @@ class PinocchioRobot(RobotEngine):
         self._pushes.extend(pinocchio.Force.Zero() for _ in range(self._free.njoints))
         self._more: tuple[Any, ...] = ()  # the wrenches, while there are any
         self._joints = JointConstraints(self.model.joints, dt)
-        self._contacts = ContactFinder(mover, statics, self._free, self._frames, features)
+        self._contacts = ContactFinder(
+            mover, statics, self._free, self._free_data, self._frames, features
+        )
         self._acted_on = bool(self._contacts) or self._joints.acts
         self._solver = solver
         self._rk4 = world.integrator == "rk4"
@@ -85,6 +87,7 @@ class PinocchioRobot(RobotEngine):
         self._turned: Vector | None = None  # the velocities that `_twist` was made of
         self._twist = self._velocities
         self._torques = np.zeros(self.nv)
+        self._springs = bool(resists.stiffness.any())
         self._smooth = bool(resists.damping.any() or resists.stiffness.any())
         self._touching: Touching | None = None
         self._impulses = np.zeros(0)
@@ -157,6 +160,8 @@ class PinocchioRobot(RobotEngine):
         """Return the held torques less those of dampers and of springs at the step's end."""
         resists = self.resistance
         torques = self._torques - resists.damping * v
+        if not self._springs:
+            return torques
         ahead = q[self.nq - self.nv :] + self._period * v - resists.rest
         return torques - np.where(resists.stiffness, resists.stiffness * ahead, 0.0)
 
@@ -173,13 +178,14 @@ class PinocchioRobot(RobotEngine):
     def _constrained(self, q: Vector, before: Vector, v: Vector) -> Vector:
         """Return velocities (nv,) after the impulses of contacts, limits, servos and friction.
 
-        What acts on one joint may drive another to its limits. So limits that are close take part
-        from the beginning, and those that are left nevertheless join in.
+        Contacts may drive joints out of their limits. So limits that are close take part from the
+        beginning, and those that are left nevertheless join in. Without contacts, as in DART, those
+        limits act that the free motion would leave.
         """
         base, joints = self.base, self._joints
         touching = None
         if self._contacts:
-            touching = self._contacts.find(self._free_data, q, v, self._period)
+            touching = self._contacts.find(q, v, self._period)
         self._touching = touching
         bounds = joints.bounds(q[self.nq - self.nv + base :])
         acts = joints.acting(bounds, v[base:], _REACH if touching else 0.0)
@@ -187,18 +193,17 @@ class PinocchioRobot(RobotEngine):
             return v
         upper = pinocchio.computeMinverse(self._model, self._data, q) * self._upper
         inverse, aims = upper + upper.T, joints.aims(bounds)
+        if touching is None:
+            return self._limited(inverse, v, np.flatnonzero(acts), aims)
         while True:
             rows = np.flatnonzero(acts)
-            if touching is None:
-                after = self._limited(inverse, v, rows, aims)
-            else:
-                after = self._touched(inverse, before, v, touching, rows, aims)
+            after = self._touched(inverse, before, v, touching, rows, aims)
             missed = joints.acting(bounds, after[base:], -_MISSED) & ~acts
             if not missed.any():
                 return after
             acts |= missed
 
-    def _limited(self, inverse: Vector, v: Vector, rows: Vector, aims: Vector) -> Vector:
+    def _limited(self, inverse: Vector, v: Vector, rows: Places, aims: Vector) -> Vector:
         """Return velocities after the impulses of rows of the joints alone."""
         joints = self._joints
         index = joints.joints[rows] + self.base
@@ -212,7 +217,7 @@ class PinocchioRobot(RobotEngine):
         before: Vector,
         v: Vector,
         touching: Touching,
-        rows: Vector,
+        rows: Places,
         aims: Vector,
     ) -> Vector:
         """Return velocities after the impulses of contacts and of rows of the joints."""

@@ -17,6 +17,8 @@ _ITERATIONS = 300
 """Of Pinocchio's solvers; what they left is Newton's method's again."""
 _ACCURACY = 1e-11
 """Of velocities, in m/s, and impulses."""
+_GOOD = 100.0
+"""Error of an iterated solution that is left as it is, as a multiple of an exact one's."""
 _ENDLESS = 1e6
 """Impulse that stands for one without bounds where Pinocchio's solvers want a number."""
 
@@ -76,9 +78,11 @@ class ImpulseSolver:
             raise SimulationError("The state is no longer finite. Use a smaller period.")
         problem = ContactProblem(response, free, friction, least, most)
         best, least_error = problem.newton(np.zeros(len(free)), _NEWTON_STEPS)
+        good = problem.accuracy
         for solver in self._solvers:
-            if least_error < problem.accuracy:
+            if least_error < good:
                 break
+            good = _GOOD * problem.accuracy
             begin = self._iterated(problem, solver)
             if np.isfinite(begin).all():
                 found, error = problem.newton(begin, _NEWTON_STEPS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,7 +18,13 @@ from physx_dart.shapes import Shape
 
 
 class Surface(ABC):
-    """The surface of one thing."""
+    """The surface of one thing.
+
+    Attributes:
+        even: Whether the distances of two points differ by no more than that between them.
+    """
+
+    even: ClassVar[bool] = True
 
     @abstractmethod
     def distances(self, points: Vector) -> tuple[Vector, Vector]:
@@ -33,7 +40,7 @@ class Plane(Surface):
 
     def distances(self, points: Vector) -> tuple[Vector, Vector]:
         """Return distances and normals."""
-        return points @ self.normal - self.height, np.broadcast_to(self.normal, points.shape)
+        return points @ self.normal - self.height, np.ones((len(points), 1)) * self.normal
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +72,7 @@ class Solid(Surface):
 class Heights(Surface):
     """A height field; the distance is that to the plane of the triangle below or above."""
 
+    even: ClassVar[bool] = False
     field: HeightField
 
     def distances(self, points: Vector) -> tuple[Vector, Vector]:

@@ -21,6 +21,9 @@ class Actions(SharedArrays):
         self._floating = vector and np.issubdtype(buffer.dtype, np.floating)
         self._dtype = np.dtype(buffer.dtype) if vector else None
         self._bounds = _bounds(space) if isinstance(space, spaces.Box) else None
+        self._first = self._end = 0
+        if isinstance(space, spaces.Discrete):
+            self._first, self._end = int(space.start), int(space.start + space.n)
 
     def take(self, action: Any) -> None:
         """Check an action and write it, cut at the bounds of its space, into the buffer.
@@ -29,9 +32,14 @@ class Actions(SharedArrays):
             ActionError: Its form is wrong, or an entry is no number.
         """
         buffer = self._buffer
-        if (
+        kind = type(action)
+        if kind is np.int64 or kind is int:
+            if self._first <= action < self._end:
+                buffer[()] = action
+                return
+        elif (
             self._floating
-            and type(action) is np.ndarray
+            and kind is np.ndarray
             and action.shape == buffer.shape
             and action.dtype is self._dtype
         ):

@@ -11,9 +11,9 @@ import gymnasium
 import numpy as np
 
 from physx_core.errors import ConfigError, EpisodeError, SimulationError, UnknownOptionError
+from physx_core.gym import inheritance
 from physx_core.gym.actions import Actions
 from physx_core.gym.buffers import ObservationChecks, copied, copier, fill, neutral
-from physx_core.gym.inheritance import construct_next
 from physx_core.gym.periods import Periods
 from physx_core.gym.pipeline_env import Info, PipelineEnv, Step
 from physx_core.gym.recording import Recording
@@ -67,13 +67,14 @@ class Episodes(PipelineEnv):
         """
         if not isinstance(simulator, Simulator):
             simulator, kwargs = simulator_of(simulator, kwargs), {}
-        construct_next(Episodes, self, kwargs)
+        inheritance.construct_next(Episodes, self, kwargs)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise UnknownOptionError(
                 "render_mode", [str(render_mode)], self.metadata["render_modes"]
             )
         self.simulator, self.render_mode, self.debug = simulator, render_mode, bool(debug)
         self.step_dt = numbers.positive("step_dt", step_dt)
+        self.metadata = inheritance.metadata_of(type(self), self.step_dt)
         option = "simulation_duration_max"
         self.simulation_duration_max = numbers.positive(option, simulation_duration_max)
         self.num_steps = np.full((), -1, np.int64)
@@ -169,6 +170,7 @@ class Episodes(PipelineEnv):
         self.is_simulation_running = simulator.is_simulation_running
         self._initialize_action_space()
         self._initialize_observation_space()
+        inheritance.check_spaces(self)
         self._make_buffers()
         self._own_checks = ObservationChecks(self.observation_space, self._flat_observation)
         self._builds = simulator.builds
@@ -223,7 +225,7 @@ class Episodes(PipelineEnv):
         self.num_steps[...] = self._count = 0
         for layer in layers[1:]:
             layer._setup()
-        positions, velocities = self._sample_state()
+        positions, velocities = inheritance.pair_of(self, "_sample_state", self._sample_state())
         if self._quantities is not None:
             self._quantities.reset()
         try:
@@ -243,7 +245,8 @@ class Episodes(PipelineEnv):
         top._refresh_buffers()
         if self._quantities is not None:
             self._quantities.clear()
-        top.refresh_observation(self.measurements)
+        if top.refresh_observation(self.measurements) is not None:
+            raise inheritance.not_written(top, "refresh_observation", "self.observation")
         self._attend(top)
         self._checks.check_form(top.observation)
         self._checks.check_finite(top.observation)
@@ -252,7 +255,7 @@ class Episodes(PipelineEnv):
         held = top is self and not self._records and self._is_held()
         self._last_step = self.periods.last
         self._schedule = self.periods.schedule(held, self._records and self.debug)
-        terminated, truncated = top.has_terminated(info)
+        terminated, truncated = inheritance.pair_of(top, "has_terminated", top.has_terminated(info))
         if terminated or truncated:
             word = "terminated" if terminated else "truncated"
             raise EpisodeError(
@@ -272,8 +275,7 @@ class Episodes(PipelineEnv):
         """Simulate a step under an action of the top; see `step`."""
         if not self._ready or top is not self.derived:
             raise self._refusal(top)
-        if action is not top.action:
-            self._actions.take(action)
+        self._actions.take(action)
         try:
             self._run(top)
             top.refresh_observation(self.measurements)
@@ -284,7 +286,9 @@ class Episodes(PipelineEnv):
                 self._checks.check_finite(top.observation)
             if self.stepper_state.iter >= self._last_step:
                 truncated = True
-            reward = float(top.compute_reward(terminated, info))
+            reward = top.compute_reward(terminated, info)
+            if type(reward) is not float:
+                reward = inheritance.number_of(top, reward)
             if reward != reward:
                 raise SimulationError(f"The reward of {type(top).__name__} is not a number.")
         except BaseException:
@@ -305,7 +309,8 @@ class Episodes(PipelineEnv):
             if observe:
                 top.refresh_observation(measurements)
             if control:
-                top.compute_command(top.action, command)
+                if top.compute_command(top.action, command) is not None:
+                    raise inheritance.not_written(top, "compute_command", "command")
                 simulator.apply_command()
             if self._records:
                 self.recording.row(self)
@@ -383,6 +388,7 @@ class Episodes(PipelineEnv):
         self.num_steps[...] = self._count = own["num_steps"]
         self._ready, self._why = own["ready"]
         self.reset_options = dict(own["options"])
+        self.recording.rewind(self.stepper_state.t)
         if own["quantities"] is not None:
             self.quantities.restore(own["quantities"])
         super()._restore_own(own)

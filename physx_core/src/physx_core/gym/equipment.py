@@ -194,14 +194,16 @@ class _Drive:
         places = [layout.joints.index(each.joint) for each in motors if each.joint in layout.joints]
         self._places = np.array(places, np.intp)
         self._most = np.array([motor.max_torque for motor in motors])
-        self._cuts = bool(np.isfinite(self._most).any())
+        tame = float(self._most.min(initial=np.inf))
+        self._tame = tame * tame  # square of a length up to which no command needs to be cut
         self._reduction = np.array([motor.reduction for motor in motors])
         self._geared = bool((self._reduction != 1.0).any())
         self._commands = simulation.commands()
         self._own: Vector | None = None  # those of the motors, where they stand side by side
         first = places[0] if places else 0
         if places == list(range(first, first + len(places))):
-            self._own = self._commands[first : first + len(places)]
+            whole = len(places) == len(self._commands)
+            self._own = self._commands if whole else self._commands[first : first + len(places)]
 
     def begin(self) -> None:
         """Begin with commands of 0."""
@@ -211,10 +213,13 @@ class _Drive:
 
     def __call__(self, command: Vector) -> None:
         """Let torques act from now on."""
-        if self._cuts:
+        if command.dot(command) > self._tame:
             command = np.minimum(np.maximum(command, -self._most), self._most)
         if self._geared:
             command = command * self._reduction
+        if self._own is self._commands:
+            self._simulation.set_commands(command)
+            return
         if self._own is not None:
             self._own[:] = command
         else:

@@ -78,7 +78,9 @@ class EquippedWorld(SharedArrays):
         if not isinstance(world, World):
             raise ConfigError(f"A Simulator needs a World, not {world!r}.")
         names = [each.name for each in world.robots]
-        if not names or (robot is not None and robot not in names):
+        if not names:
+            raise ConfigError("The world has no robot that could act: World([Robot(...)], ...).")
+        if robot is not None and robot not in names:
             raise ComponentNotFoundError("robot", str(robot), "The world", names)
         self.world, self.backend = world, backend
         self._robot_name = names[0] if robot is None else robot

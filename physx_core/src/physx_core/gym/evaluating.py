@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from physx_core.errors import ConfigError
-from physx_core.gym.rendering import has_display
+from physx_core.gym.display import has_display
 from physx_core.world import numbers
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from physx_core.errors import UsageError
-from physx_core.gym.rendering import Renderer, has_display
+from physx_core.gym.display import has_display
+from physx_core.gym.rendering import Renderer
 
 if TYPE_CHECKING:
     from physx_core.gym.pipeline_env import PipelineEnv

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from physx_core.errors import LogError, MissingLibraryError, listed
+from physx_core.gym.display import has_display
 from physx_core.gym.log import TIME, Log
 from physx_core.gym.log_file import Source, as_logs
-from physx_core.gym.rendering import has_display
 from physx_core.gym.standard_columns import BASE_POSITION, BASE_VELOCITY
 
 if TYPE_CHECKING:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from physx_core.errors import ConfigError
+
 if TYPE_CHECKING:
     from physx_core.gym.episodes import Episodes
     from physx_core.gym.layer import Info, PipelineEnv
@@ -71,6 +73,8 @@ class Recording:
     def _path(self, env: Episodes) -> Path:
         given = env.reset_options.get("log_path")
         if given is not None:
+            if not isinstance(given, (str, Path)):
+                raise ConfigError(f'The option "log_path" is {given!r} but must be a path.')
             return Path(given)
         if self._folder is None:
             from physx_core.gym.log_folder import LogFolder
@@ -90,6 +94,11 @@ class Recording:
         if self.telemetry.is_recording:
             self.row(env)
         return self.telemetry.log_data
+
+    def rewind(self, time: float) -> None:
+        """Forget what was recorded from a time on, in s: the episode goes on from there."""
+        if self._telemetry is not None:
+            self._telemetry.rewind(time)
 
     def end(self, env: Episodes) -> None:
         """Record the last state, and write the file, if there was a step."""

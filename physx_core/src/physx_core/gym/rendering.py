@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +11,7 @@ from numpy.typing import NDArray
 
 from physx_core import plugins
 from physx_core.errors import UnknownOptionError, VisualizerError
+from physx_core.gym.display import has_display
 from physx_core.gym.drawing import WorldDrawing
 from physx_core.interfaces.visualizer import Visualizer
 from physx_core.scene import Factory
@@ -28,13 +27,6 @@ PICTURE_SIZE = (640, 480)
 """Width and height of a picture, in pixels, unless ``viewer_kwargs`` says otherwise."""
 
 Picture = NDArray[np.uint8]
-
-
-def has_display() -> bool:
-    """Return whether windows can be opened."""
-    if sys.platform in ("win32", "darwin"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def open_viewer(title: str, instances: int = 1, **options: Any) -> Visualizer:

@@ -159,6 +159,16 @@ class Telemetry:
             self._time = self._now[0] = time
             self._table.record(again)
 
+    def rewind(self, time: float) -> None:
+        """Forget the rows of a time and later.
+
+        Args:
+            time: Since the episode's begin, in s.
+        """
+        if self.is_recording:
+            self._table.rewind(time)
+            self._time = -1.0
+
     def end(self) -> None:
         """End the episode and write its file; nothing happens if none is being recorded.
 
@@ -232,6 +242,14 @@ class _Table:
             self._free = _BLOCK
         np.concatenate(self._words, out=self._blocks[-1][-self._free])
         self._free -= 1
+
+    def rewind(self, time: float) -> None:
+        """Forget the rows of a time and later."""
+        times = self.columns()[TIME]
+        kept = int(np.searchsorted(times, time))
+        blocks = -(-kept // _BLOCK)
+        del self._blocks[blocks:]
+        self._free = blocks * _BLOCK - kept
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return copies of the columns by name, each of shape (rows,)."""

@@ -191,7 +191,6 @@ class Communication(SocketService):
             self._report(connection, error)
         finally:
             self._asking = None
-            connection.touch()
 
     def _serve_only(self, connection: Connection) -> None:
         if self._clients == "serve":

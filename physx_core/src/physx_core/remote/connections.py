@@ -3,14 +3,44 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import selectors
 import socket
 import time
 from collections.abc import Sequence
 
+from physx_core.errors import RemoteError
 from physx_core.remote.framing import Reader
 
+MOMENT = 50e-6
+"""How long to look for the next message of a client that is quick, in s."""
+
+_QUICK = 2 * MOMENT
 _PIECE = 1 << 16
 _UNREAD = 1 << 20
+
+
+def listening_socket(address: str, port: int) -> socket.socket:
+    """Return a socket that listens and does not block.
+
+    Args:
+        address: Address of this machine.
+        port: Port, 0 for any that is free.
+
+    Raises:
+        RemoteError: The address is not one of this machine, or the port is in use.
+    """
+    try:
+        found = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)
+        family, place = found[0][0], found[0][4]
+        listener = socket.create_server(place, family=family, backlog=128)
+    except (OSError, OverflowError, UnicodeError, TypeError) as error:
+        raise RemoteError(
+            f"Nothing can be served at {address} port {port}: {error}. Choose port 0 for any "
+            "free port, or an address of this machine; one that another program uses is taken."
+        ) from error
+    listener.setblocking(False)
+    return listener
 
 
 class Connection:
@@ -21,7 +51,8 @@ class Connection:
         reader: Cuts what arrives into bodies.
         name: The other side as ``host:port``, for messages to people.
         body: The next body to be handled, None for none yet.
-        heard: When the other side last sent something, in monotonic s.
+        heard: When the other side last sent something or was answered, in monotonic s.
+        is_quick: Whether the other side sent its last message soon after the answer before.
         ended: Whether the other side sends no more.
         closed: Whether the socket is closed.
         events: What the service's selector looks for.
@@ -43,7 +74,7 @@ class Connection:
         self.socket, self.reader, self.name = connection, reader, name
         self.body: bytes | None = None
         self.heard = self._begun = time.monotonic()
-        self.ended = self.closed = False
+        self.ended = self.closed = self.is_quick = False
         self.events = 0
         self.outgoing = bytearray()
 
@@ -76,7 +107,7 @@ class Connection:
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, size)
 
     def touch(self) -> None:
-        """Let the time of silence begin now: the other side was kept waiting until here."""
+        """Let the time of silence begin now: the other side had to wait until here."""
         self.heard = time.monotonic()
 
     @property
@@ -84,21 +115,37 @@ class Connection:
         """Whether to read on: who sends faster than it is served has to wait."""
         return not self.ended and (self.body is None or self.reader.waiting < _UNREAD)
 
-    def receive(self) -> None:
-        """Take what has arrived.
+    def receive(self) -> bool:
+        """Take what has arrived; return whether it was anything, be it the end.
 
         Raises:
             OSError: The connection is broken.
-            RemoteProtocolError: What has arrived is no message.
         """
         try:
             data = self.socket.recv(_PIECE)
         except BlockingIOError:
-            return
+            return False
         self.ended = not data
         if data:
-            self.heard = time.monotonic()
+            now = time.monotonic()
+            self.is_quick, self.heard = now - self.heard < _QUICK, now
             self.reader.feed(data)
+        return True
+
+    def receive_soon(self) -> bool:
+        """Take what arrives within a moment; return whether it was anything, be it the end.
+
+        For so short a time it is faster to look again and again than to be woken by the system.
+
+        Raises:
+            OSError: The connection is broken.
+        """
+        until = time.monotonic() + MOMENT
+        while not self.receive():
+            if time.monotonic() > until:
+                return False
+            _give_way()
+        return True
 
     def next_body(self) -> bool:
         """Put the next whole message into `body`; return whether there is one.
@@ -143,7 +190,29 @@ class Connection:
             sent = self.socket.send(waiting[:_UNREAD])
         del self.outgoing[:sent]
 
-    def close(self) -> None:
-        """Close the socket; calling it again does nothing."""
+    def watch(self, selector: selectors.BaseSelector) -> None:
+        """Have a selector look for what matters now."""
+        events = selectors.EVENT_READ * self.wants_more
+        events |= selectors.EVENT_WRITE * bool(self.outgoing)
+        if events == self.events:
+            return
+        if not events:
+            selector.unregister(self.socket)
+        elif not self.events:
+            selector.register(self.socket, events, self)
+        else:
+            selector.modify(self.socket, events, self)
+        self.events = events
+
+    def close(self, selector: selectors.BaseSelector) -> None:
+        """Close the socket, which the selector looks at no longer."""
         self.closed = True
+        if self.events:
+            selector.unregister(self.socket)
         self.socket.close()
+
+
+def _give_way() -> None:
+    """Let another process that waits for this processor core go on."""
+    if hasattr(os, "sched_yield"):
+        os.sched_yield()

@@ -162,7 +162,7 @@ def fill(storage: Any, **values: Any) -> None:
     """Write values into a message: arrays, numbers, texts or bytes, by field name.
 
     Raises:
-        ConfigError: The message has no such field.
+        ConfigError: The message has no such field, or the field does not take such a value.
     """
     for name, value in values.items():
         try:
@@ -172,14 +172,20 @@ def fill(storage: Any, **values: Any) -> None:
             raise ConfigError(
                 f'The message {storage.DESCRIPTOR.name} has no field "{name}". It has: {known}.'
             ) from None
-        if not isinstance(present, (bool, int, float, str, bytes)):
-            _extend(storage, name, present, value)
-        elif isinstance(present, bytes) and not isinstance(value, bytes):
-            setattr(storage, name, np.ascontiguousarray(value, np.uint8).tobytes())
-        elif isinstance(value, (np.ndarray, np.generic)):
-            setattr(storage, name, value.item())
-        else:
-            setattr(storage, name, value)
+        try:
+            if not isinstance(present, (bool, int, float, str, bytes)):
+                _extend(storage, name, present, value)
+            elif isinstance(present, bytes) and not isinstance(value, bytes):
+                setattr(storage, name, np.ascontiguousarray(value, np.uint8).tobytes())
+            elif isinstance(value, (np.ndarray, np.generic)):
+                setattr(storage, name, value.item())
+            else:
+                setattr(storage, name, value)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ConfigError(
+                f'The field "{name}" of {storage.DESCRIPTOR.name} does not take {value!r:.100}: '
+                f"{error}."
+            ) from error
 
 
 def encoded_extension(number: int, text: str) -> bytes:
@@ -210,10 +216,16 @@ def _varint(number: int) -> bytes:
 
 def _extend(storage: Any, name: str, repeated: Any, value: Any) -> None:
     """Set a repeated field; many floating numbers go as the bytes that they are on the wire."""
-    if not isinstance(value, np.ndarray):
-        value = np.asarray(value)
     if len(repeated):
         storage.ClearField(name)
+    if isinstance(value, list) and value and type(value[0]) in (float, int):
+        try:
+            repeated.extend(value)
+            return
+        except TypeError:  # it is nested further on, or holds numbers of numpy
+            storage.ClearField(name)
+    if not isinstance(value, np.ndarray):
+        value = np.asarray(value)
     if value.size > _MANY:
         field = storage.DESCRIPTOR.fields_by_name[name]
         kind = _TYPES[field.type]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import heapq
-import itertools
 import logging
+import math
 import selectors
 import socket
 import threading
@@ -14,10 +13,11 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
 
-from physx_core.errors import RemoteError, RemoteProtocolError
-from physx_core.remote.connections import Connection
+from physx_core.errors import RemoteProtocolError
+from physx_core.remote.connections import MOMENT, Connection, listening_socket
 from physx_core.remote.framing import FrameReader, Reader
 from physx_core.remote.protocol import Service
+from physx_core.remote.timers import Timers
 
 LOG = logging.getLogger("physx.remote")
 """Where services say what happened."""
@@ -54,13 +54,12 @@ class SocketService(Service):
         self._wakes: socket.socket
         self._listener: socket.socket | None = None
         self._ready: deque[Connection] = deque()
-        self._timers: list[tuple[float, int, Callable[[], None]]] = []
-        self._numbers = itertools.count()
+        self._timers = Timers()
         self._work: tuple[Connection, Work] | None = None
-        self._resume_at = 0.0
+        self._recent: Connection | None = None
+        self._resume_at = self._looked = 0.0
         self._lock = threading.RLock()
-        self._is_open = self._is_polling = self._has_more = False
-        self._over = self._released = False
+        self._is_open = self._is_polling = self._has_more = self._over = self._released = False
 
     # What a subclass implements ---------------------------------------------------------------
 
@@ -98,16 +97,7 @@ class SocketService(Service):
             RemoteError: The address is not one of this machine, or the port is in use.
         """
         self._open()
-        try:
-            found = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)
-            family, place = found[0][0], found[0][4]
-            self._listener = socket.create_server(place, family=family, backlog=128)
-        except (OSError, OverflowError) as error:
-            raise RemoteError(
-                f"Nothing can be served at {address} port {port}: {error}. Choose port 0 for any "
-                "free port, or an address of this machine; one that another program uses is taken."
-            ) from error
-        self._listener.setblocking(False)
+        self._listener = listening_socket(address, port)
         self.address = self._listener.getsockname()[:2]
         self._selector.register(self._listener, selectors.EVENT_READ)
 
@@ -117,7 +107,7 @@ class SocketService(Service):
         host, port = connected.getpeername()[:2]
         connection = Connection(connected, self.new_reader(), f"{host}:{port}")
         self.connections.append(connection)
-        self._watch(connection)
+        connection.watch(self._selector)
         self.opened(connection)
         return connection
 
@@ -131,7 +121,7 @@ class SocketService(Service):
             self.drop(connection, f"{error}")
             return
         if connection.outgoing:
-            self._watch(connection)
+            connection.watch(self._selector)
 
     def drop(self, connection: Connection, reason: str = "") -> None:
         """Close a connection; what it asked for is finished, but not answered.
@@ -144,9 +134,7 @@ class SocketService(Service):
             return
         if reason:
             LOG.warning("Connection of %s ended: %s", connection.name, reason)
-        if connection.events:
-            self._selector.unregister(connection.socket)
-        connection.close()
+        connection.close(self._selector)
         self.connections.remove(connection)
         if connection in self._ready:
             self._ready.remove(connection)
@@ -154,7 +142,7 @@ class SocketService(Service):
 
     def after(self, seconds: float, action: Callable[[], None]) -> None:
         """Call a function once, some time from now, between messages."""
-        heapq.heappush(self._timers, (time.monotonic() + seconds, next(self._numbers), action))
+        self._timers.add(seconds, action)
 
     # The loop -------------------------------------------------------------------------------
 
@@ -184,6 +172,34 @@ class SocketService(Service):
     def _cycle(self, timeout: float | None) -> None:
         if not self._is_open:
             self._open()
+        if not self._came_soon(timeout):
+            self._look(timeout)
+        if self._work is not None or self._ready or self._timers.next < math.inf:
+            self._turn()
+        else:
+            self._has_more = False
+
+    def _came_soon(self, timeout: float | None) -> bool:
+        """Handle the next message of a quick client that is alone, if it comes within a moment."""
+        connection, self._recent = self._recent, None
+        if connection is None or not connection.is_quick or connection.closed:
+            return False
+        if len(self.connections) > 1 or self._work is not None:
+            return False
+        wait = self._wait(timeout)
+        if (wait is not None and wait < MOMENT) or time.monotonic() - self._looked > _SLICE:
+            return False
+        try:
+            if not connection.receive_soon():
+                return False
+        except OSError as error:
+            self.drop(connection, str(error))
+            return True
+        self._answer(connection)
+        return True
+
+    def _look(self, timeout: float | None) -> None:
+        """Handle what the selector sees."""
         has_guests = False
         for key, events in self._selector.select(self._wait(timeout)):
             if key.data is not None:
@@ -192,10 +208,9 @@ class SocketService(Service):
                 self._waker.recv(1024)
             else:
                 has_guests = True
+        self._looked = time.monotonic()
         if has_guests:  # those who left make room first
             self._accept()
-        if self._work is not None or self._ready or self._timers:
-            self._turn()
 
     def _open(self) -> None:
         """Take what the loop needs from the system."""
@@ -227,23 +242,20 @@ class SocketService(Service):
 
     def _wait(self, timeout: float | None) -> float | None:
         """Return how long nothing happens, unless something arrives."""
-        if not self._timers and self._work is None:
-            return 0.0 if self._has_more else timeout
-        moments = [self._timers[0][0]] if self._timers else []
-        if self._work is not None:
-            moments.append(self._resume_at)
         if self._has_more:
             return 0.0
-        if not moments:
+        moment = self._timers.next
+        if self._work is not None:
+            moment = min(moment, self._resume_at)
+        if moment == math.inf:
             return timeout
-        wait = max(0.0, min(moments) - time.monotonic())
+        wait = max(0.0, moment - time.monotonic())
         return wait if timeout is None else min(wait, timeout)
 
     def _turn(self) -> None:
         """Run timers, and work until there is none, or others have waited long enough."""
         begin = time.monotonic()
-        while self._timers and self._timers[0][0] <= begin:
-            heapq.heappop(self._timers)[2]()
+        self._timers.call_due()
         self._has_more = True
         while not self._over:
             if self._work is not None:
@@ -306,7 +318,11 @@ class SocketService(Service):
 
     def _after(self, connection: Connection) -> None:
         """Look for the next message of a connection, or for its end."""
-        if connection.closed or (connection.is_quiet and connection.events == _READ):
+        if connection.closed:
+            return
+        connection.touch()
+        if connection.is_quiet and connection.events == _READ:
+            self._recent = connection
             return
         try:
             if connection.next_body():
@@ -318,7 +334,7 @@ class SocketService(Service):
         except RemoteProtocolError as error:
             self.drop(connection, str(error))
             return
-        self._watch(connection)
+        connection.watch(self._selector)
 
     def _serve(self, connection: Connection, events: int) -> None:
         """Read and write what a connection has and takes."""
@@ -338,7 +354,7 @@ class SocketService(Service):
         if had_body and connection.ended and not self.admits(connection):
             self.drop(connection, "it left before its turn came")
         elif had_body or (self._work is not None and self._work[0] is connection):
-            self._watch(connection)
+            connection.watch(self._selector)
         elif self._ready or self._work is not None or self._over:
             self._after(connection)
         else:
@@ -354,20 +370,6 @@ class SocketService(Service):
             self.drop(connection, str(error))
             return
         self._after(connection)
-
-    def _watch(self, connection: Connection) -> None:
-        """Have the selector look for what matters now."""
-        events = selectors.EVENT_READ * connection.wants_more
-        events |= selectors.EVENT_WRITE * bool(connection.outgoing)
-        if events == connection.events:
-            return
-        if not events:
-            self._selector.unregister(connection.socket)
-        elif not connection.events:
-            self._selector.register(connection.socket, events, connection)
-        else:
-            self._selector.modify(connection.socket, events, connection)
-        connection.events = events
 
     def _accept(self) -> None:
         """Take some of those who wait at the door."""

@@ -14,6 +14,7 @@ import numpy as np
 from physx_core.devices import as_slice, places_of
 from physx_core.errors import ConfigError, FeatureNotSupportedError
 from physx_core.interfaces.backend import Simulation, Vector
+from physx_core.interfaces.layout import Part
 from physx_core.sensors.description import (
     ContactSensor,
     EffortSensor,
@@ -64,12 +65,43 @@ class ImuTruth:
         self._arms = [_unless(sensor.position, (0.0, 0.0, 0.0)) for sensor in sensors]
         self._rotations = [_unless(sensor.rotation, _AHEAD) for sensor in sensors]
         self._gravity = tuple(float(part) for part in world.gravity)
+        layout = simulation.layout
+        floating = [part for part in layout.parts.values() if part.floating]
+        bases = {layout.bodies[part.bodies.start]: part for part in floating}
+        self._bases = [bases[body] for body in self._bodies if body in bases]
 
     def measure(self, simulation: Simulation, out: Vector) -> None:
         """Write orientation, angular velocity and acceleration."""
+        if len(self._bases) == len(out):
+            self._measure_bases(simulation, out)
+            return
         motions = simulation.body_motions(self._bodies).tolist()
         for row, motion in enumerate(motions):
             out[row] = self._measured(motion, self._arms[row], self._rotations[row])
+
+    def _measure_bases(self, simulation: Simulation, out: Vector) -> None:
+        """Do so where all are on bases that float, whose motion is a part of the state."""
+        state = simulation.positions(), simulation.velocities(), simulation.accelerations()
+        for row, base in enumerate(self._bases):
+            first = base.velocities.start
+            x, y, z, w = state[0][base.positions][3:7].tolist()
+            attitude: Sequence[float] = (x, y, z, w) if w >= 0 else (-x, -y, -z, -w)
+            g, h, o, p, q, r = state[1][first : first + 6].tolist()
+            a, b, c, d, e, f = state[2][first : first + 6].tolist()
+            # The velocity is along axes that turn themselves.
+            i, j, k = turned_back(attitude, *self._gravity)
+            s, t, u = cross(p, q, r, g, h, o)
+            a, b, c = a + s - i, b + t - j, c + u - k
+            arm, rotation = self._arms[row], self._rotations[row]
+            if arm is not None:
+                i, j, k = cross(d, e, f, *arm)
+                s, t, u = cross(p, q, r, *cross(p, q, r, *arm))
+                a, b, c = a + i + s, b + j + t, c + k + u
+            if rotation is not None:
+                attitude = product(attitude, rotation)
+                p, q, r = turned_back(rotation, p, q, r)
+                a, b, c = turned_back(rotation, a, b, c)
+            out[row] = (*attitude, p, q, r, a, b, c)
 
     def _measured(
         self, motion: list[float], arm: Sequence[float] | None, rotation: Sequence[float] | None

@@ -7,9 +7,10 @@ import os
 import subprocess
 import threading
 
+_END = "end"
 # Each line names all process groups that there are; the last one counts when no more can come.
 _SCRIPT = (
-    "while read -r line; do groups=$line; done; "
+    f'while read -r line; do [ "$line" = {_END} ] && exit; groups=$line; done; '
     'for group in $groups; do kill -s KILL -- "-$group"; done'
 )
 
@@ -19,8 +20,8 @@ class Guard:
 
     A client whose server is gone leaves on its own, unless it is stopped, or an engine keeps it
     from running any Python. The shell waits at the end of a pipe that only this process can write
-    to, and which closes when this process ends, be it with SIGKILL. There is a shell as long as
-    there are groups.
+    to, and which closes when this process ends, be it with SIGKILL; with those that it forked, for
+    they have the pipe too. There is a shell as long as there are groups.
     """
 
     def __init__(self) -> None:
@@ -51,11 +52,14 @@ class Guard:
             self._groups.discard(group)
             self._tell()
             if not self._groups and self._shell is not None:
+                self._write(_END)  # a forked process may hold the pipe open for long
                 shell, self._shell = self._shell, None
                 shell.communicate()
 
     def _tell(self) -> None:
+        self._write(" ".join(map(str, sorted(self._groups))))
+
+    def _write(self, line: str) -> None:
         if self._shell is not None and self._shell.stdin is not None:
-            line = " ".join(map(str, sorted(self._groups))) + "\n"
             with contextlib.suppress(OSError):  # somebody ended the shell
-                os.write(self._shell.stdin.fileno(), line.encode())
+                os.write(self._shell.stdin.fileno(), f"{line}\n".encode())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import gymnasium
 import numpy as np
@@ -12,10 +12,8 @@ import numpy as np
 from physx_core.errors import ConfigError, SimulationError
 from physx_core.gym.buffers import neutral
 from physx_core.gym.pickling import SharedArrays
+from physx_core.gym.pipeline_env import PipelineEnv
 from physx_core.interfaces.backend import Vector
-
-if TYPE_CHECKING:
-    from physx_core.gym.layer import PipelineEnv
 
 
 class Block(SharedArrays, ABC):
@@ -43,6 +41,10 @@ class Block(SharedArrays, ABC):
         Raises:
             ConfigError: The name or the ratio cannot be.
         """
+        if not isinstance(env, PipelineEnv):
+            raise ConfigError(
+                f"{type(self).__name__} is for a RobotEnv or a layer of one, not for {env!r}."
+            )
         if not isinstance(name, str) or not name or "." in name:
             raise ConfigError(f"The name of a block is {name!r} but must be a text without dots.")
         is_number = isinstance(update_ratio, (int, np.integer)) and not isinstance(

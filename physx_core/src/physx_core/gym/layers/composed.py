@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from physx_core.errors import ConfigError
 from physx_core.gym.layer import Info, Layer, PipelineEnv
@@ -28,7 +29,7 @@ class ComposedEnv(Layer):
         env: PipelineEnv,
         *,
         reward: Reward | None = None,
-        terminations: Sequence[Termination] = (),
+        terminations: Sequence[Termination] | Termination = (),
         trajectory: Trajectory | None = None,
     ) -> None:
         """Put rewards and terminations on an environment.
@@ -36,7 +37,7 @@ class ComposedEnv(Layer):
         Args:
             env: The environment.
             reward: What to add to the reward.
-            terminations: What else ends an episode; names differ.
+            terminations: What else ends an episode: one or several, whose names differ.
             trajectory: The reference that quantities may be compared to; None: there is none, or
                 that of a layer below.
 
@@ -44,18 +45,15 @@ class ComposedEnv(Layer):
             ConfigError: Something is no reward or termination, two terminations have one name, or
                 the trajectory is of another robot.
         """
-        if reward is not None and not isinstance(reward, Reward):
-            raise ConfigError(f"ComposedEnv.reward is {reward!r}, which is no Reward.")
-        for each in terminations:
-            if not isinstance(each, Termination):
-                raise ConfigError(f"{each!r} is no Termination.")
-        names = [each.name for each in terminations]
-        if len(set(names)) < len(names):
-            raise ConfigError(f"Two terminations have one name: {sorted(names)}.")
+        if isinstance(terminations, Termination):
+            terminations = (terminations,)
+        _check(reward, terminations)
         self.reward, self.terminations = reward, tuple(terminations)
         super().__init__(env)
         quantities = env.quantities
         if trajectory is not None:
+            if not isinstance(trajectory, Trajectory):
+                raise ConfigError(f"ComposedEnv.trajectory is {trajectory!r}, which is none.")
             state = env.robot_state
             shapes = (trajectory.positions.shape[1], trajectory.velocities.shape[1])
             if shapes != (len(state.q), len(state.v)):
@@ -93,3 +91,19 @@ class ComposedEnv(Layer):
             parts[self.reward.name] = own
             total += own
         return total
+
+
+def _check(reward: Any, terminations: Sequence[Any]) -> None:
+    """Check what is added to an environment.
+
+    Raises:
+        ConfigError: Something is no reward or termination, or two terminations have one name.
+    """
+    if reward is not None and not isinstance(reward, Reward):
+        raise ConfigError(f"ComposedEnv.reward is {reward!r}, which is no Reward.")
+    for each in terminations:
+        if not isinstance(each, Termination):
+            raise ConfigError(f"{each!r} is no Termination.")
+    names = [each.name for each in terminations]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"Two terminations have one name: {sorted(names)}.")

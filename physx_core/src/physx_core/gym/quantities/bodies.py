@@ -135,6 +135,7 @@ class RelativePoses(Quantity):
 
     def __post_init__(self) -> None:
         """Check that there is something to compare."""
+        super().__post_init__()
         if len(self.bodies) < 2:
             raise ConfigError(f"RelativePoses needs at least two bodies, not {self.bodies}.")
 

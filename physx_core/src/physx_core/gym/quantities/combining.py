@@ -75,6 +75,7 @@ class Stacked(Remembering):
 
     def __post_init__(self) -> None:
         """Check the number of steps."""
+        super().__post_init__()
         if self.steps < 1:
             raise ConfigError(f"Stacked needs at least 1 step, not {self.steps}.")
 

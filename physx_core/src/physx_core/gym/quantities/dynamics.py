@@ -134,6 +134,7 @@ class MechanicalPower(Quantity):
 
     def __post_init__(self) -> None:
         """Check the option."""
+        super().__post_init__()
         if self.braking not in ("regained", "lost", "shared", "penalized"):
             raise ConfigError(
                 f'MechanicalPower.braking is "{self.braking}": "regained", "lost", "shared" or '

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -26,6 +27,23 @@ class Quantity(ABC):
     computed at most once for each state of the simulation. What another quantity says is asked for
     with `Moment.get`.
     """
+
+    def __post_init__(self) -> None:
+        """Take lists as tuples, and check that what it is made of are quantities.
+
+        Raises:
+            ConfigError: They are not, or a text is given for a list.
+        """
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            value, where = getattr(self, field.name), f"{type(self).__name__}.{field.name}"
+            if isinstance(value, list):
+                value = tuple(value)
+                object.__setattr__(self, field.name, value)
+            if isinstance(value, str) and str(field.type).startswith("tuple"):
+                raise ConfigError(f'{where} is the text "{value}" but must be a list.')
+            if field.name in ("quantity", "quantities"):
+                for each in value if isinstance(value, tuple) else (value,):
+                    check_quantity(where, each)
 
     @abstractmethod
     def compute(self, moment: Moment) -> Any:
@@ -313,6 +331,19 @@ class Quantities(Mapping[str, Any]):
         self.reset()
         self._begins = False
         self._memories = {quantity: copied(kept) for quantity, kept in state}
+
+
+def check_quantity(where: str, value: Any) -> Quantity:
+    """Return a value that is a quantity.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    if not isinstance(value, Quantity):
+        made = isinstance(value, type) and issubclass(value, Quantity)
+        hint = f": make one, as in {value.__name__}(...)" if made else ""
+        raise ConfigError(f"{where} is {value!r}, which is no Quantity{hint}.")
+    return value
 
 
 def as_array(value: Any) -> Vector:

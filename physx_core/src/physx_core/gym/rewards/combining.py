@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from physx_core.errors import ConfigError
 from physx_core.gym.quantities import Quantities, Quantity
@@ -20,10 +21,15 @@ class _Mixture(Reward):
     """
 
     def __init__(
-        self, rewards: Sequence[Reward] | Mapping[Reward, float], name: str, *, normalize: bool
+        self,
+        rewards: Sequence[Reward] | Mapping[Reward, float],
+        name: str,
+        weights: Sequence[float] | None,
+        *,
+        normalize: bool,
     ) -> None:
         super().__init__(name)
-        weighted = dict(rewards) if isinstance(rewards, Mapping) else dict.fromkeys(rewards, 1.0)
+        weighted = _weighted(name, rewards, weights)
         if not weighted or not all(isinstance(each, Reward) for each in weighted):
             raise ConfigError(f'"{name}" needs rewards, not {list(weighted)}.')
         names = [part for each in weighted for part in each.names]
@@ -66,6 +72,22 @@ class _Mixture(Reward):
         return found
 
 
+def _weighted(name: str, rewards: Any, weights: Sequence[float] | None) -> dict[Any, float]:
+    """Return the weight of each reward.
+
+    Raises:
+        ConfigError: There are weights for other rewards.
+    """
+    if weights is None:
+        return dict(rewards) if isinstance(rewards, Mapping) else dict.fromkeys(rewards, 1.0)
+    if isinstance(rewards, Mapping) or len(weights) != len(rewards):
+        raise ConfigError(
+            f'"{name}" has {len(rewards)} rewards and {len(weights)} weights: give a list of '
+            "rewards and as many weights, or the weight of each reward."
+        )
+    return dict(zip(rewards, weights, strict=True))
+
+
 class Sum(_Mixture):
     """The weighted sum of rewards."""
 
@@ -74,6 +96,7 @@ class Sum(_Mixture):
         rewards: Sequence[Reward] | Mapping[Reward, float],
         name: str = "total",
         *,
+        weights: Sequence[float] | None = None,
         normalize: bool = False,
     ) -> None:
         """Choose the parts.
@@ -81,13 +104,14 @@ class Sum(_Mixture):
         Args:
             rewards: Rewards, or the weight of each.
             name: Of the sum.
+            weights: Of each of a list of rewards, as in a pipeline's file; None: 1.
             normalize: Divide by the sum of the weights; the sum is then within 0 and 1, as all of
                 its parts must be.
 
         Raises:
             ConfigError: There are none, two have one name, or they cannot be normalized.
         """
-        super().__init__(rewards, name, normalize=normalize)
+        super().__init__(rewards, name, weights, normalize=normalize)
 
     def compute(self, quantities: Quantities, terminated: bool, info: dict[str, float]) -> float:
         """Return the sum."""
@@ -99,18 +123,23 @@ class Product(_Mixture):
     """The weighted geometric mean of rewards within 0 and 1: good only where all of them are."""
 
     def __init__(
-        self, rewards: Sequence[Reward] | Mapping[Reward, float], name: str = "total"
+        self,
+        rewards: Sequence[Reward] | Mapping[Reward, float],
+        name: str = "total",
+        *,
+        weights: Sequence[float] | None = None,
     ) -> None:
         """Choose the parts.
 
         Args:
             rewards: Normalized rewards, or the weight of each.
             name: Of the product.
+            weights: Of each of a list of rewards, as in a pipeline's file; None: 1.
 
         Raises:
             ConfigError: There are none, two have one name, or one is not normalized.
         """
-        super().__init__(rewards, name, normalize=True)
+        super().__init__(rewards, name, weights, normalize=True)
 
     def compute(self, quantities: Quantities, terminated: bool, info: dict[str, float]) -> float:
         """Return the product."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from physx_core.errors import ConfigError
 from physx_core.gym.quantities import Quantities, Quantity, Reference
-from physx_core.gym.quantities.quantity import as_array
+from physx_core.gym.quantities.quantity import as_array, check_quantity
 from physx_core.world import numbers
 
 _AT_CUTOFF = math.log(0.01)
@@ -85,10 +85,10 @@ class Minimizing(Reward):
             name: None: that of the quantity's class.
 
         Raises:
-            ConfigError: The cutoff is not positive.
+            ConfigError: It is no quantity, or the cutoff is not positive.
         """
+        self.quantity = check_quantity(f"{type(self).__name__}.quantity", quantity)
         super().__init__(name or type(quantity).__name__)
-        self.quantity = quantity
         self.cutoff = numbers.positive(f'cutoff of "{self.name}"', cutoff)
 
     @property
@@ -140,4 +140,11 @@ class Tracking(Minimizing):
         target = self.target
         wanted = quantities.get_value(target) if isinstance(target, Quantity) else target
         value = quantities.get_value(self.quantity)
-        return self._kernel(self.difference(as_array(value), as_array(wanted)))
+        try:
+            error = self.difference(as_array(value), as_array(wanted))
+        except ValueError as cause:
+            raise ConfigError(
+                f'The reward "{self.name}" compares {np.shape(value)} numbers with a target of '
+                f"{np.shape(wanted)}: {cause}"
+            ) from cause
+        return self._kernel(error)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, UnknownOptionError
 from physx_core.gym.quantities import Computed, Delta, Quantities, Quantity, Reference, Stacked
-from physx_core.gym.quantities.quantity import as_array
+from physx_core.gym.quantities.quantity import as_array, check_quantity
 from physx_core.world import numbers
 
 
@@ -32,8 +32,16 @@ class Termination(ABC):
         grace_period: float = 0.0,
         is_truncation: bool = False,
         training_only: bool = False,
+        **unknown: Any,
     ) -> None:
-        """Keep the options."""
+        """Keep the options.
+
+        Raises:
+            UnknownOptionError: There is no option of a name.
+        """
+        if unknown:
+            known = ("grace_period", "is_truncation", "training_only")
+            raise UnknownOptionError(f'The termination "{name}"', unknown, known)
         if not isinstance(name, str) or not name:
             raise ConfigError(f"The name of a termination must be a text, not {name!r}.")
         self.name = name
@@ -71,14 +79,21 @@ class OutOfBounds(Termination):
             options: Those of `Termination`.
 
         Raises:
-            ConfigError: There are no bounds, or the lower is above the higher.
+            ConfigError: It is no quantity, there are no bounds, or the lower is above the higher.
         """
+        self.quantity = check_quantity(f"{type(self).__name__}.quantity", quantity)
         super().__init__(name or type(quantity).__name__, **options)
-        self.quantity = quantity
-        self.low = as_array(-np.inf if low is None else low)
-        self.high = as_array(np.inf if high is None else high)
-        if (low is None and high is None) or not (self.low <= self.high).all():
-            raise ConfigError(f'The bounds of "{self.name}" are {low!r} and {high!r}.')
+        try:
+            self.low = as_array(-np.inf if low is None else low)
+            self.high = as_array(np.inf if high is None else high)
+            fits = bool((self.low <= self.high).all())
+        except (TypeError, ValueError):
+            fits = False
+        if not fits or (low is None and high is None):
+            raise ConfigError(
+                f'The bounds of "{self.name}" are {low!r} and {high!r}, but must be numbers, one '
+                "of them at least, the lower one first."
+            )
 
     @property
     def watched(self) -> tuple[Quantity, ...]:
@@ -90,7 +105,13 @@ class OutOfBounds(Termination):
         return self._is_out(quantities.get_value(self.quantity))
 
     def _is_out(self, value: Any) -> bool:
-        return bool(((value < self.low) | (value > self.high)).any())
+        try:
+            return bool(((value < self.low) | (value > self.high)).any())
+        except ValueError as error:
+            raise ConfigError(
+                f'The termination "{self.name}" compares {np.shape(value)} numbers with bounds of '
+                f"{self.low.shape} and {self.high.shape}: {error}"
+            ) from error
 
 
 class Drift(OutOfBounds):

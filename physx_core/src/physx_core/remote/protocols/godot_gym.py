@@ -136,11 +136,11 @@ class GymnasiumScene(RLEnvironment):
             raise RequestError("There is no episode, or it is over: reset first.")
         taken = from_json(self.worlds.action_space, action)
         total = 0.0
-        for _ in range(self.repeat_action):
+        for left in reversed(range(self.repeat_action)):
             agent.observation, reward, terminated, truncated, info = self.worlds.step(0, taken)
             total += reward
             outcome.set(total, terminated, truncated, info)
-            if terminated or truncated:
+            if terminated or truncated or not left:
                 return
             if self.communication.is_abandoned:
                 raise RequestError("The client left in the middle of a step.")

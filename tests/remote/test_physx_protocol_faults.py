@@ -1,0 +1,399 @@
+"""The protocol physx among strangers, liars and accidents: the service says so and lives on."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import threading
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from physx_core.errors import (
+    RemoteClosedError,
+    RemoteError,
+    RemoteProtocolError,
+    RemoteTimeoutError,
+    RequestError,
+)
+from physx_core.remote import PhysxObserver, connect, connect_vector, serve
+from physx_core.remote.clients.physx_link import PhysxLink
+from physx_core.remote.protocols.physx_wire import ACT
+from physx_core.transport.failures import decode_error
+from physx_core.transport.frames import HEADER, Kind, header, pack
+from physx_core.transport.values import pack_value
+
+TOKEN = "0123456789abcdef"
+PATIENCE = 30.0
+HELLO = pack(Kind.HELLO, struct.pack("<8sI32s", b"physxtcp", 1, bytes(32)))
+ACTIONS = {"action0": np.zeros((1, 2), np.float32)}
+
+
+class Fragile(gymnasium.Env):
+    """Fails where its action says so; waits in a step for whoever sets `go`."""
+
+    observation_space = spaces.Box(-9, 9, (2,), np.float64)
+    action_space = spaces.Box(-9, 9, (2,), np.float32)
+
+    def __init__(self):
+        self.steps, self.closed = 0, False
+        self.begun, self.go = threading.Event(), threading.Event()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if options and "fail" in options:
+            raise KeyError("no such room")
+        return np.zeros(2), {}
+
+    def step(self, action):
+        match int(action[0]):
+            case 1:
+                raise ArithmeticError("the wheel came off")
+            case 2:
+                return np.zeros(3), 0.0, False, False, {}
+            case 3:
+                self.begun.set()
+                assert self.go.wait(PATIENCE)
+        self.steps += 1
+        return np.full(2, float(self.steps)), 0.0, False, False, {}
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def env():
+    return Fragile()
+
+
+@pytest.fixture
+def serving():
+    """Serve an environment over physx in a thread."""
+    with contextlib.ExitStack() as stack:
+
+        def serving(environment, **options):
+            service = serve(environment, "physx", token=TOKEN, **options)
+            thread = threading.Thread(target=service.run)
+            thread.start()
+            stack.callback(thread.join, PATIENCE)
+            stack.callback(service.close)
+            return service
+
+        yield serving
+
+
+@pytest.fixture
+def service(serving, env):
+    yield serving(env)
+    env.go.set()
+
+
+def lives(service):
+    """Whether the next client is served."""
+    with connect(_text(service), token=TOKEN) as env:
+        env.reset()
+        return env.step([0.0, 0.0])[0].shape == (2,)
+
+
+def _text(service):
+    return "{}:{}".format(*service.address)
+
+
+def _raw(service):
+    return socket.create_connection(service.address, PATIENCE)
+
+
+def _is_closed(stranger):
+    """Wait for the end of a connection."""
+    with contextlib.suppress(ConnectionError):
+        while stranger.recv(65536):
+            continue
+    return True
+
+
+# Strangers ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        b"GET / HTTP/1.1\r\nHost: physx.example\r\n\r\n",
+        bytes(range(256)) * 8,
+        header(Kind.HELLO, 1 << 30),
+        struct.pack("<IHHQ", 257, Kind.HELLO, 0, 0),
+        HELLO + HELLO,
+        HELLO + pack(Kind.PROOF, bytes(32), ACT),
+        pack(Kind.PROOF, bytes(32), ACT),
+        pack(Kind.HELLO, b"x" * 44),
+        pack(Kind.HELLO, b"x"),
+        pack_value(Kind.REQUEST, {"do": "last"}, "request"),
+    ],
+    ids=["http", "noise", "1GB", "257B", "twice", "lie", "proof", "magic", "short", "request"],
+)
+def test_strangers_are_turned_away(service, said):
+    with _raw(service) as stranger:
+        stranger.sendall(said)
+        assert _is_closed(stranger)
+    assert lives(service)
+
+
+def test_another_version_of_the_handshake(service):
+    with _raw(service) as stranger:
+        stranger.sendall(pack(Kind.HELLO, struct.pack("<8sI32s", b"physxtcp", 9, bytes(32))))
+        length, kind, _, _ = HEADER.unpack(_exactly(stranger, HEADER.size))
+        assert kind == Kind.CHALLENGE and b"physxtcp" in _exactly(stranger, length)
+    assert lives(service)
+
+
+def test_neither_side_trusts_one_with_another_token(service):
+    with pytest.raises(RemoteError, match="does not know this client's token"):
+        connect(_text(service), token="another-token-of-good-length")
+    assert lives(service)
+
+
+def test_a_client_that_wants_to_run_an_instance(service):
+    with pytest.raises(RemoteError, match="not the server of a run"):
+        PhysxLink(service.address, 0, token=TOKEN)
+    assert lives(service)
+
+
+def test_silent_strangers_are_closed(serving, env):
+    service = serving(env, handshake_timeout=0.05)
+    with _raw(service) as silent, _raw(service) as half, _raw(service) as slow:
+        half.sendall(HELLO)
+        slow.sendall(HELLO[:5])
+        assert all(_is_closed(stranger) for stranger in (silent, half, slow))
+    assert lives(service)
+
+
+def test_fifty_clients_at_once(service):
+    with contextlib.ExitStack() as stack:
+        strangers = [stack.enter_context(_raw(service)) for _ in range(20)]
+        actor = stack.enter_context(connect(_text(service), token=TOKEN))
+        observers = [
+            stack.enter_context(PhysxObserver(_text(service), token=TOKEN)) for _ in range(29)
+        ]
+        actor.reset()
+        actor.step([0.0, 0.0])
+        for observer in observers:
+            assert [observer.next(PATIENCE).number for _ in range(2)] == [1, 2]
+        for stranger in strangers[::2]:
+            stranger.sendall(b"x" * 100)
+    assert lives(service)
+
+
+def test_too_many_clients(serving, env):
+    service = serving(env, max_clients=2)
+    with connect(_text(service), token=TOKEN) as actor, _raw(service):
+        with pytest.raises(RemoteClosedError, match="too many"):
+            PhysxObserver(_text(service), token=TOKEN)
+        actor.reset()
+    assert lives(service)
+
+
+# Clients that are trusted and err -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        b"\xff" * 40,
+        header(Kind.ACTIONS, 1 << 30),
+        struct.pack("<IHHQ", 10, 999, 0, 0),
+        struct.pack("<IHHQ", 10, Kind.REQUEST, 5, 0),
+        pack(Kind.ACTIONS, b"\xff" * 40, 1),
+        pack(Kind.REQUEST, struct.pack("<I", 4) + b"[1,2", 1),
+        pack(Kind.REQUEST, b"", 1),
+    ],
+    ids=["noise", "1GB", "kind", "spare", "values", "json", "empty"],
+)
+def test_what_is_no_message_ends_the_connection(service, said):
+    link = PhysxLink(service.address, ACT, token=TOKEN)
+    link.send(said)
+    with pytest.raises(RemoteClosedError):
+        link.receive()
+    assert lives(service)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        (Kind.REQUEST, {"do": "dance"}),
+        (Kind.REQUEST, {}),
+        (Kind.REQUEST, [1, 2]),
+        (Kind.REQUEST, {"do": "reset", "worlds": "all"}),
+        (Kind.REQUEST, {"do": "reset", "seeds": [1, 2]}),
+        (Kind.REQUEST, {"do": "reset", "seeds": [-1]}),
+        (Kind.REQUEST, {"do": "reset", "options": [1]}),
+        (Kind.REQUEST, {"do": "restore", "snapshot": "x"}),
+        (Kind.REQUEST, {"do": "render", "world": None}),
+        (Kind.ACTIONS, {}),
+        (Kind.ACTIONS, [1]),
+        (Kind.ACTIONS, {"action0": 3}),
+        (Kind.ACTIONS, {"action0": np.zeros((1, 2))}),
+        (Kind.ACTIONS, {"action0": np.zeros((2, 2), np.float32)}),
+        (Kind.ACTIONS, {"action0": np.zeros((1, 2), np.float32), "more": np.zeros(1)}),
+        (Kind.ACTIONS, {"worlds": np.zeros(1), **ACTIONS}),
+        (Kind.SETUP, {"do": "last"}),
+    ],
+)
+def test_requests_that_cannot_be_carried_out_are_answered(service, kind, value):
+    link = PhysxLink(service.address, ACT, token=TOKEN)
+    link.send(pack_value(kind, value, "request", 5))
+    frame = link.receive()
+    assert (frame.kind, frame.number) == (Kind.REFUSAL, 5)
+    assert isinstance(decode_error(frame.payload), RequestError)
+    link.send(pack_value(Kind.REQUEST, {"do": "reset"}, "request", 6))
+    assert (link.receive().kind, link.is_closed) == (Kind.ANSWER, False)
+    link.close()
+    assert lives(service)
+
+
+def test_requests_byte_by_byte_and_all_at_once(service):
+    link = PhysxLink(service.address, ACT, token=TOKEN)
+    reset = pack_value(Kind.REQUEST, {"do": "reset"}, "request", 1)
+    step = pack_value(Kind.ACTIONS, ACTIONS, "actions", 2)
+    for byte in reset + step:
+        link.send(bytes([byte]))
+    assert [link.receive().number for _ in range(2)] == [1, 2]
+    link.send((reset + step) * 20)
+    assert [link.receive().number for _ in range(40)] == [1, 2] * 20
+    link.close()
+
+
+@pytest.mark.parametrize("how", ["fin", "rst"])
+@pytest.mark.parametrize("state", ["guest", "half a proof", "actor", "half a request", "answer"])
+def test_a_client_that_is_gone(service, state, how):
+    if state in ("guest", "half a proof"):
+        gone = _raw(service)
+        gone.sendall(HELLO + pack(Kind.PROOF, bytes(32))[: 20 * (state != "guest")])
+    else:
+        gone = PhysxLink(service.address, ACT, token=TOKEN)._socket
+        step = pack_value(Kind.ACTIONS, ACTIONS, "actions", 2)
+        gone.setblocking(True)
+        gone.sendall({"actor": b"", "half a request": step[:-3], "answer": step}[state])
+    if how == "rst":
+        gone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    gone.close()
+    assert lives(service)
+
+
+def test_a_client_that_leaves_in_the_middle_of_a_step(service, env):
+    leaving = PhysxLink(service.address, ACT, token=TOKEN)
+    leaving.send(pack_value(Kind.REQUEST, {"do": "reset"}, "request", 1))
+    leaving.receive()
+    action = {"action0": np.array([[3, 0]], np.float32)}
+    leaving.send(pack_value(Kind.ACTIONS, action, "actions", 2))
+    assert env.begun.wait(PATIENCE)
+    leaving.close()
+    env.go.set()
+    assert lives(service)
+    assert env.steps == 2, "the step was finished, and then the next client's"
+
+
+# Environments that fail ---------------------------------------------------------------------------
+
+
+def test_an_exception_comes_with_its_traceback(service, caplog):
+    with connect(_text(service), token=TOKEN) as env:
+        env.reset()
+        with pytest.raises(RequestError, match="World 0 failed in step.*the wheel came off") as told:
+            env.step([1.0, 0.0])
+        assert "match int(action[0])" not in str(told.value)
+        assert 'raise ArithmeticError("the wheel came off")' in str(told.value.__cause__)
+        with pytest.raises(RequestError, match="no such room"):
+            env.reset(options={"fail": True})
+        with pytest.raises(RemoteError, match=r"shape \(3,\)"):
+            env.step([2.0, 0.0])
+        assert env.step([0.0, 0.0])[0].tolist() == [1.0, 1.0]
+    assert caplog.text.count("the wheel came off") >= 1
+    assert lives(service)
+
+
+def test_one_world_of_several_fails(serving):
+    service = serving(Fragile, num_worlds=3)
+    with contextlib.closing(connect_vector(_text(service), token=TOKEN)) as env:
+        env.reset()
+        with pytest.raises(RequestError, match="World 1 failed"):
+            env.step(np.array([[0, 0], [1, 0], [0, 0]]))
+        steps = env.step(np.zeros((3, 2)))[0][:, 0]
+        assert steps.tolist() == [2, 1, 1], "the first had made its step"
+
+
+def test_an_answer_that_takes_too_long(service, env):
+    late = connect(_text(service), token=TOKEN, timeout=0.1)
+    late.reset()
+    with pytest.raises(RemoteTimeoutError, match="longer timeout"):
+        late.step([3.0, 0.0])
+    with pytest.raises(RemoteClosedError, match="longer than"):
+        late.step([0.0, 0.0])
+    env.go.set()
+    assert lives(service)
+
+
+# Services that fail -------------------------------------------------------------------------------
+
+
+def test_the_service_ends(service, env):
+    client = connect(_text(service), token=TOKEN)
+    observer = PhysxObserver(_text(service), token=TOKEN)
+    client.reset()
+    service.close()
+    with pytest.raises(RemoteClosedError, match="ended the connection"):
+        client.step([0.0, 0.0])
+    with pytest.raises(RemoteClosedError):
+        while observer.next(PATIENCE):
+            continue
+    with pytest.raises(RemoteTimeoutError, match="Start the service first"):
+        connect(_text(service), token=TOKEN, connect_timeout=0.05)
+
+
+def test_closing_waits_for_the_step(service, env):
+    client = PhysxLink(service.address, ACT, token=TOKEN)
+    client.send(pack_value(Kind.REQUEST, {"do": "reset"}, "request", 1))
+    client.receive()
+    client.send(pack_value(Kind.ACTIONS, {"action0": np.array([[3, 0]], np.float32)}, "a", 2))
+    assert env.begun.wait(PATIENCE)
+    service.close()
+    assert not env.closed, "it is at work"
+    env.go.set()
+    with pytest.raises(RemoteClosedError):
+        while client.receive():
+            continue
+
+
+@pytest.mark.parametrize(
+    ("said", "error"),
+    [(b"\xff" * 64, RemoteError), (header(Kind.CHALLENGE, 1 << 30), RemoteError), (b"", None)],
+    ids=["noise", "1GB", "nothing"],
+)
+def test_what_is_no_service(said, error):
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def answer():
+            guest, _ = listener.accept()
+            with guest:
+                guest.recv(100)
+                guest.sendall(said)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with pytest.raises(error or RemoteClosedError):
+            connect("{}:{}".format(*listener.getsockname()), token=TOKEN)
+        thread.join(PATIENCE)
+
+
+def test_an_answer_that_is_too_long(service):
+    with connect(_text(service), token=TOKEN, max_answer=40) as env:
+        with pytest.raises(RemoteProtocolError):
+            env.reset()
+
+
+def _exactly(stranger, count):
+    data = b""
+    while len(data) < count:
+        data += stranger.recv(count - len(data))
+    return data
