@@ -1,7 +1,8 @@
-"""Steps gym_jiminy's environments, for `benchmarks/gym.py`, which starts it with another interpreter.
+"""Steps gym_jiminy's environments for `benchmarks/gym.py`, which starts it with another Python.
 
-A line on standard input is an environment's name and a time in s; the answer is a line of JSON: steps per
-second of time in `step`, and the periods of control and integration that were used.
+A line on standard input is an environment's name and a time in s; the answer is a line of JSON:
+steps per second, with and without the time of resets, the time of a step, and that between two
+steps of the integrator.
 
     pip install -r benchmarks/requirements-jiminy.txt      # in an environment of its own
 """
@@ -27,19 +28,21 @@ def made(name: str) -> tuple[Any, list[Any]]:
     return env, [env.action_space.sample() for _ in range(ACTIONS)]
 
 
-def steps_per_second(env: Any, actions: list[Any], seconds: float) -> float:
-    """Return steps per second of time in `step`; resets are not counted."""
-    clock, spent, steps = time.perf_counter, 0.0, 0
+def steps_per_second(env: Any, actions: list[Any], seconds: float) -> tuple[float, float]:
+    """Return steps per second: with the resets at the ends of episodes, and of time in `step`."""
+    clock, stepping, resetting, steps = time.perf_counter, 0.0, 0.0, 0
     env.reset()
-    while spent < seconds:
-        action = actions[steps % ACTIONS]
+    while stepping + resetting < seconds:
+        action = actions[steps % len(actions)]
         begin = clock()
         _, _, terminated, truncated, _ = env.step(action)
-        spent += clock() - begin
+        stepping += clock() - begin
         steps += 1
         if terminated or truncated:
+            begin = clock()
             env.reset()
-    return steps / spent
+            resetting += clock() - begin
+    return steps / (stepping + resetting), steps / stepping
 
 
 def integrations(env: Any, actions: list[Any]) -> float:
@@ -62,8 +65,10 @@ def main() -> None:
             known[name] = made(name)
             steps_per_second(*known[name], 0.1)
         env, actions = known[name]
+        whole, step = steps_per_second(env, actions, float(seconds))
         found = {
-            "rate": steps_per_second(env, actions, float(seconds)),
+            "rate": whole,
+            "rate_of_step": step,
             "step_dt": env.step_dt,
             "period": integrations(env, actions),
         }

@@ -9,6 +9,7 @@ Whatever is compared runs in turn, in one run. Starting processes does not count
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import secrets
@@ -16,6 +17,7 @@ import socket
 import statistics
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -79,20 +81,30 @@ def place_of(line: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def raw_round_trips(port: int, request: bytes, answer: int) -> Callable[[], int]:
-    """Return what sends and receives the same bytes as `godot_gym`, and does nothing with them."""
+def raw_round_trip(port: int, request: bytes, answer: int) -> Callable[[], object]:
+    """Return what sends and receives the same bytes as godot-gym, and does nothing with them."""
     connection = socket.create_connection(("127.0.0.1", port))
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    def ask() -> int:
-        for _ in range(REQUESTS):
-            connection.sendall(request)
-            received = 0
-            while received < answer:
-                received += len(connection.recv(1 << 16))
-        return REQUESTS
+    def ask() -> None:
+        connection.sendall(request)
+        received = 0
+        while received < answer:
+            received += len(connection.recv(1 << 16))
 
     return ask
+
+
+def latency(ask: Callable[[], object]) -> float:
+    """Return how long one of many requests takes, in s: the median, whatever else the machine does.
+
+    A mean would tell as much about the programs that run beside this one.
+    """
+    moments = [time.perf_counter()]
+    for _ in range(REQUESTS):
+        ask()
+        moments.append(time.perf_counter())
+    return statistics.median(after - before for before, after in itertools.pairwise(moments))
 
 
 def godot_gym(cores: list[int]) -> float:
@@ -119,21 +131,20 @@ def godot_gym(cores: list[int]) -> float:
             for name, n in (("raw", "0"), ("raw and physics", str(FRAME_STEPS)))
         }
 
-        def steps() -> int:
-            for _ in range(REQUESTS):
-                client.step(ACTION, WANTED)
-            return REQUESTS
-
         candidates = {
-            name: raw_round_trips(port, bytes(sizes[0]), sizes[1]) for name, port in ports.items()
+            name: raw_round_trip(port, bytes(sizes[0]), sizes[1]) for name, port in ports.items()
         }
-        measured = rates({**candidates, "godot-gym": steps}, ROUNDS)
+        candidates["godot-gym"] = lambda: client.step(ACTION, WANTED)
+        measured: dict[str, list[float]] = {name: [] for name in candidates}
+        for _ in range(ROUNDS):
+            for name, ask in candidates.items():
+                measured[name].append(latency(ask))
     where = "each process on a core of its own" if cores else "on cores of the kernel's choice"
     print(f"godot-gym over DART, repeat_action=1, {sizes[0]} bytes there, {sizes[1]} back, {where}")
     for name, each in measured.items():
-        print(f"  {name:28} {statistics.median(each):12,.0f} requests/s")
+        print(f"  {name:28} {1e6 * statistics.median(each):8,.0f} µs")
     pairs = zip(measured["raw and physics"], measured["godot-gym"], strict=True)
-    return statistics.median(raw / mine for raw, mine in pairs)
+    return statistics.median(mine / raw for raw, mine in pairs)
 
 
 def _answer_size(client: GodotGymClient) -> int:
@@ -163,34 +174,35 @@ def all_godot_gym() -> bool:
 
 def worlds_together(environment: str, target: float) -> bool:
     """Compare one request for all worlds with single requests, on one connection."""
-    with served(environment, "--num-worlds", str(WORLDS)) as line:
-        with PhysxClient(place_of(line)) as client:
-            together = PhysxVectorEnv(client)
-            single = [PhysxEnv(client, world) for world in range(WORLDS)]
-            actions = np.ones(WORLDS, np.int64)
+    with contextlib.ExitStack() as stack:
+        line = stack.enter_context(served(environment, "--num-worlds", str(WORLDS)))
+        client = stack.enter_context(PhysxClient(place_of(line)))
+        together = PhysxVectorEnv(client)
+        single = [PhysxEnv(client, world) for world in range(WORLDS)]
+        actions = np.ones(WORLDS, np.int64)
 
-            def one_request() -> Iterator[int]:
-                together.reset(seed=0)
-                yield 0
-                for step in range(STEPS):
-                    actions[:] = step % 2
-                    together.step(actions)
-                yield STEPS * WORLDS
+        def one_request() -> Iterator[int]:
+            together.reset(seed=0)
+            yield 0
+            for step in range(STEPS):
+                actions[:] = step % 2
+                together.step(actions)
+            yield STEPS * WORLDS
 
-            def single_requests() -> Iterator[int]:
-                together.reset(seed=0)
-                yield 0
-                over = [False] * WORLDS
-                for step in range(STEPS):
-                    for world, env in enumerate(single):
-                        over[world] = _one_step(env, over[world], step % 2)
-                yield STEPS * WORLDS
+        def single_requests() -> Iterator[int]:
+            together.reset(seed=0)
+            yield 0
+            over = [False] * WORLDS
+            for step in range(STEPS):
+                for world, env in enumerate(single):
+                    over[world] = _one_step(env, over[world], step % 2)
+            yield STEPS * WORLDS
 
-            candidates: dict[str, Any] = {
-                "16 single requests": single_requests,
-                "16 worlds in one request": one_request,
-            }
-            measured = rates(candidates, ROUNDS)
+        candidates: dict[str, Any] = {
+            "16 single requests": single_requests,
+            "16 worlds in one request": one_request,
+        }
+        measured = rates(candidates, ROUNDS)
     return report(
         f"{environment}, {WORLDS} worlds on one connection of the protocol physx",
         "steps", measured, "16 single requests", target, "16 worlds in one request",

@@ -13,8 +13,8 @@ from physx_core.remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
 from physx_core.remote.messages import fill
 from physx_core.world import Ground, JointSettings, Robot, World
 
-PERIOD = 1 / 180
-FRAME_STEPS = 3
+PERIOD = 1 / 240
+FRAME_STEPS = 4
 WHEELS = ("left_wheel_joint", "right_wheel_joint")
 VALUES = 16
 ACTION = [2.0, 3.0]

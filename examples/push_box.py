@@ -4,8 +4,8 @@
     python examples/push_box.py --episodes 5 --render push_box.rrd
     python examples/push_box.py --learn 200000              # PPO of stable-baselines3 instead
 
-Prints how many episodes succeeded; exits with 1 if the scripted policy failed in more than one of ten.
-`--render` writes the last episode as a recording that Rerun opens.
+Prints how many episodes succeeded; exits with 1 if the scripted policy failed in more than one of
+ten. `--render` writes the last episode as a recording that Rerun opens.
 """
 
 import argparse

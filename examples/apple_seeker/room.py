@@ -39,7 +39,7 @@ def room() -> World:
         position=(-1.5, 0.0, 0.15),
         joints=dict.fromkeys(WHEELS, servo),
     )
-    return World([robot], objects=walls, ground=Ground(), period=1 / 180)
+    return World([robot], objects=walls, ground=Ground(), period=1 / 240)
 
 
 class Seeker(RLAgent):

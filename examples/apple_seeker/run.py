@@ -61,15 +61,13 @@ def main() -> int:
             rng = np.random.default_rng(0)
             for episode in range(episodes):
                 seen, info = room.reset(seed=episode)
-                before, over = info["left"], False
-                for step in range(steps):
+                before, step, over = info["left"], 0, False
+                while step < steps and not over:
                     seen, reward, over, _, info = room.step(policy(seen, rng))
-                    found += int(reward)
-                    if over:
-                        break
-                taken += step + 1
+                    found, step = found + int(reward), step + 1
+                taken += step
                 count = before - info["left"]
-                print(f"episode {episode}: {count} of {before} apples, {step + 1} steps")
+                print(f"episode {episode}: {count} of {before} apples, {step} steps")
     finally:
         server.terminate()
         server.wait()

@@ -1,8 +1,8 @@
 """A quadruped gets up from its knees, stands, and walks in place: a pipeline of blocks at work.
 
-`pipeline.toml` describes the environment: a Unitree A1 whose joints are driven by a PD controller above a
-limit of torques, 200 times a second, and an attitude filter that sees the inertial sensor alone. This
-script only says, 50 times a second, where the joints shall be.
+`pipeline.toml` describes the environment: a Unitree A1 whose joints are driven by a PD controller
+above a limit of torques, 200 times a second, and an attitude filter that sees the inertial sensor
+alone. This script only says, 50 times a second, where the joints shall be.
 
     pip install "physx-dart[robots]"
     python examples/quadruped/run.py                        # 20 s of walking
@@ -85,7 +85,9 @@ def main():
     print(f"walked for {len(seen['time']) * env.step_dt:.1f} s of {seconds:.1f} s")
     print(f"  height of the trunk   {seen['height'].min():.3f} to {seen['height'].max():.3f} m")
     print(f"  lift of the feet      {', '.join(f'{100 * each:.0f}' for each in lift)} cm")
-    print(f"  where it ended        {seen['place'][0]:.2f}, {seen['place'][1]:.2f} m from its start")
+    print(
+        f"  where it ended        {seen['place'][0]:.2f}, {seen['place'][1]:.2f} m from its start"
+    )
     print(f"  tilt                  at most {math.degrees(seen['tilt'].max()):.1f} degrees")
     print(f"  error of the filter   at most {math.degrees(wrong.max()):.1f} degrees")
     if chosen.render:

@@ -226,3 +226,26 @@ def test_a_quadruped_stands(engine, example):
         assert np.abs(slip[:, :3]).max() < 1e-3
         touched = {simulation.layout.names[i] for i in simulation.contacts()["body_a"]}
         assert touched == {f"{leg}_foot" for leg in ("FL", "FR", "RL", "RR")}
+
+
+def test_legs_at_their_limits_carry_without_chatter(pinocchio):
+    """What pushes joints over their limits are contacts: the free motion alone does not."""
+    world = World([Robot("ant", fixed_base=False)], ground=Ground(), period=2e-3)
+    with pinocchio.build(world) as simulation:
+        q = simulation.positions()
+        q[2], q[8::2] = 0.377, 1.0
+        velocities = np.zeros(14)
+        velocities[5] = 1.0  # turns on its feet until the hips are at their limits
+        simulation.set_state(q, velocities)
+        simulation.step(2000)
+        begin = simulation.positions()
+        hips = begin[7::2]
+        assert np.isclose(np.abs(hips), 0.6, atol=1e-6).any()
+        weight = 9.81 * simulation.mass_matrix(begin)[0, 0]
+        simulation.step(400)
+        for _ in range(100):
+            simulation.step()
+            force = simulation.contacts()["force"].sum(axis=0)
+            np.testing.assert_allclose(force, [0, 0, weight], atol=1e-3 * weight)
+            assert np.abs(simulation.velocities()).max() < 1e-3
+        assert np.abs(simulation.positions() - begin).max() < 1e-3

@@ -211,7 +211,7 @@ def thrown(backend, termination):
     for _ in range(30):
         *_, info = top.step(rng.uniform(-1, 1, 8) * env.action_space.high)
         yield env, termination.name in info.get("terminations", [])
-        env._ready = True  # to see what comes after
+        env._Episodes__ready = True  # to see what comes after
 
 
 def roll_and_pitch(env):

@@ -188,3 +188,35 @@ def test_make_vec_runs_them_in_processes(nothing_stays_behind):
         np.testing.assert_array_equal(many[0], single.step(2)[0])
     finally:
         env.close()
+
+
+class Own(RobotEnv):
+    """Calls its own attributes what an environment might call its own."""
+
+    def __init__(self):
+        super().__init__("cartpole", 0.02)
+        self.names = ["_last", "_count", "_ready", "_why", "_copies", "_n", "_state", "_actions"]
+        for name in self.names:
+            setattr(self, name, "mine")
+
+    def _run(self):
+        raise AssertionError("nobody calls this")
+
+    _begin = _refusal = _attend = _run
+
+    def compute_reward(self, terminated, info):
+        return float(all(getattr(self, name) == "mine" for name in self.names))
+
+
+def test_subclasses_call_their_attributes_as_they_like():
+    env = Own()
+    env.reset(seed=0)
+    assert env.step(np.ones(2))[1] == 1.0
+    state = env.snapshot()
+    following = env.step(np.ones(2))[0]["states"]["agent"]["q"]
+    for other in (env, pickle.loads(pickle.dumps(env)), Own()):  # noqa: S301 - our own
+        other.restore(state)
+        np.testing.assert_array_equal(other.step(np.ones(2))[0]["states"]["agent"]["q"], following)
+    env.stop()
+    with pytest.raises(physx_core.errors.EpisodeError, match="stopped"):
+        env.step(np.ones(2))

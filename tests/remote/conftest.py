@@ -201,6 +201,22 @@ def in_thread(start):
 
 
 @pytest.fixture
+def serving():
+    """Serve an environment over physx in a thread, which is the service's `thread`."""
+    with contextlib.ExitStack() as stack:
+
+        def serving(environment, token="0123456789abcdef", **options):
+            service = serve(environment, "physx", token=token, **options)
+            service.thread = threading.Thread(target=service.run)
+            service.thread.start()
+            stack.callback(service.thread.join, PATIENCE)
+            stack.callback(service.close)
+            return service
+
+        yield serving
+
+
+@pytest.fixture
 def scene():
     return Scene()
 

@@ -11,8 +11,15 @@ import numpy as np
 import pytest
 
 from physx_core import Field, Robot, World, plugins
-from physx_core.errors import ConfigError
-from physx_core.remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
+from physx_core.errors import ConfigError, PhysxError, RequestError, UsageError
+from physx_core.remote import (
+    GodotGymClient,
+    Messages,
+    RLAgent,
+    RLEnvironment,
+    RLEnvWorld,
+    connect,
+)
 from physx_core.remote.messages import fill
 
 LIVES = {"observation": {"world": []}}
@@ -243,3 +250,86 @@ def test_a_value_that_a_field_does_not_take_is_named(peer, scene):
     nested = scene.messages.Message().agent_data
     fill(nested, a=[[1, 2], [3, 4]], d=[np.float32(1.0), 2])
     assert [*nested.a, *nested.d] == [1, 2, 3, 4, 1, 2]
+
+
+# Mistakes ------------------------------------------------------------------------------------
+
+
+class Forgetful(RLEnvironment):
+    def __init__(self):
+        self.calls = []
+
+
+SERVED = [
+    (None, {}, "None is no environment. What can be served"),
+    (RLAgent, {}, "which is no gymnasium environment"),
+    (Forgetful, {}, r"Forgetful.__init__ must call super\(\).__init__\(\)"),
+    (OnDart, {"env_kwargs": {"size": 3}}, "does not take these arguments"),
+    (OnDart, {"env_kwargs": [1]}, "env_kwargs is .* must be a dictionary"),
+    (OnDart, {"address": None}, "address is None"),
+    (OnDart, {"port": "9090"}, "port is '9090'"),
+    (OnDart, {"port": 70_000}, "from 0 to 65535"),
+    (OnDart, {"patience": "5"}, "patience is '5'"),
+    (OnDart, {"max_request": 1.5}, "max_request is 1.5"),
+    ("gym/CartPole-v1", {"num_worlds": "2"}, "num_worlds is '2'"),
+]
+
+
+@pytest.mark.parametrize(("environment", "options", "said"), SERVED)
+def test_a_mistake_in_an_argument_of_serve(start, environment, options, said):
+    with pytest.raises(PhysxError, match=said):
+        start(environment, **options)
+
+
+def test_an_environment_is_served_once(start, scene_class):
+    environment = scene_class()
+    with pytest.raises(UsageError, match="takes no env_kwargs"):
+        start(environment, env_kwargs={"size": 1})
+    start(environment).close()
+    with pytest.raises(UsageError, match="served already"):
+        start(environment)
+    closed = scene_class()
+    closed.close()
+    with pytest.raises(UsageError, match="make another environment"):
+        start(closed)
+
+
+@pytest.mark.parametrize(("name", "value"), [("repeat_action", -1), ("frame_steps", 0)])
+def test_a_mistake_in_a_setting(scene_class, name, value):
+    with pytest.raises(PhysxError, match=f"{name} is a whole number"):
+        setattr(scene_class(), name, value)
+
+
+def test_a_speed_that_is_none(start, scene_class):
+    environment = scene_class()
+    environment.time_speed = 0
+    with pytest.raises(PhysxError, match="time_speed is a number greater than 0"):
+        start(environment)
+
+
+CONNECTED = [
+    ({"timout": 1}, 'Did you mean "timeout"'),
+    ({"timeout": 0}, "timeout is 0"),
+    ({"connect_timeout": None}, "connect_timeout is None"),
+    ({"max_answer": "1 MB"}, "max_answer is '1 MB'"),
+    ({"action_space": 3}, "no gymnasium.Space"),
+    ({"requested_observation": ["state"]}, "must be a dictionary"),
+    ({"repeat_action": -1}, "repeat_action is a whole number"),
+    ({"time_speed": "fast"}, "time_speed is a number"),
+]
+
+
+@pytest.mark.parametrize(("options", "said"), CONNECTED)
+def test_a_mistake_in_an_argument_of_connect(in_thread, options, said):
+    host, port = in_thread("gym/CartPole-v1").address
+    with pytest.raises(PhysxError, match=said):
+        connect(f"{host}:{port}", "godot-gym", **options)
+
+
+def test_arrays_may_be_in_requests(in_thread, scene):
+    with GodotGymClient(scene.messages, in_thread(scene).address) as client:
+        client.step(np.array([0.5]), {})
+        with pytest.raises(RequestError, match="neither"):
+            client.step(object(), {})
+        client.step(np.float32(1), {})
+    assert [value for name, value in scene.calls if name == "set_action"] == [[0.5], 1.0]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 import warnings
 from collections import OrderedDict
+from typing import ClassVar
 
 import gymnasium
 import numpy as np
@@ -28,10 +28,8 @@ from physx_core.remote import (
     PhysxClient,
     PhysxEnv,
     PhysxObserver,
-    RLEnvironment,
     connect,
     connect_vector,
-    serve,
 )
 
 TOKEN = "0123456789abcdef"
@@ -68,7 +66,7 @@ class Episodes(gymnasium.Env):
 
     observation_space = spaces.Dict(n=spaces.Discrete(100), x=spaces.Box(-9, 9, (2,), np.float64))
     action_space = spaces.Box(-1, 1, (2,), np.float32)
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 30}
 
     def __init__(self, large=0):
         self.render_mode = "rgb_array"
@@ -107,25 +105,15 @@ class Episodes(gymnasium.Env):
 
 
 @pytest.fixture
-def serving():
-    """Serve an environment over physx in a thread."""
-    with contextlib.ExitStack() as stack:
-
-        def serving(environment, **options):
-            service = serve(environment, "physx", token=TOKEN, **options)
-            thread = threading.Thread(target=service.run)
-            thread.start()
-            stack.callback(thread.join, PATIENCE)
-            stack.callback(service.close)
-            return "{}:{}".format(*service.address)
-
-        yield serving
+def place(serving):
+    """Serve an environment and return its address."""
+    return lambda *args, **options: "{}:{}".format(*serving(*args, **options).address)
 
 
 @pytest.fixture
-def client(serving):
+def client(place):
     """A client of three worlds of `Episodes`, and its `address`."""
-    address = serving(Episodes, num_worlds=3)
+    address = place(Episodes, num_worlds=3)
     host, port = address.split(":")
     with PhysxClient((host, int(port)), token=TOKEN) as client:
         client.address = address
@@ -135,8 +123,8 @@ def client(serving):
 # One world ---------------------------------------------------------------------------------------
 
 
-def test_every_kind_of_space_goes_there_and_back(serving, caplog):
-    with connect(serving(Echo), token=TOKEN) as env:
+def test_every_kind_of_space_goes_there_and_back(place, caplog):
+    with connect(place(Echo), token=TOKEN) as env:
         assert env.observation_space == ALL and env.action_space == ALL
         assert list(env.observation_space.spaces) == list(ALL.spaces)
         observation, info = env.reset(seed=3, options={"deep": [1, {"x": None}]})
@@ -153,14 +141,14 @@ def test_every_kind_of_space_goes_there_and_back(serving, caplog):
     assert caplog.text.count("object") == 1, "what cannot travel is named once"
 
 
-def test_the_environment_checker_has_nothing_to_say(serving):
-    with connect(serving(Episodes), token=TOKEN) as env, warnings.catch_warnings():
+def test_the_environment_checker_has_nothing_to_say(place):
+    with connect(place(Episodes), token=TOKEN) as env, warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env, skip_render_check=True)
     assert env.metadata == Episodes.metadata and env.render_mode == "rgb_array"
 
 
-def test_the_same_trajectory_in_process_and_over_both_protocols(serving, in_thread):
+def test_the_same_trajectory_in_process_and_over_both_protocols(place, in_thread):
     service = in_thread("physx/Cartpole-v0")
     rng = np.random.default_rng(5)
     actions = rng.integers(0, 3, 60).tolist()
@@ -170,7 +158,7 @@ def test_the_same_trajectory_in_process_and_over_both_protocols(serving, in_thre
     for env in (
         here,
         connect(address, "godot-gym"),
-        connect(serving("physx/Cartpole-v0"), "physx", token=TOKEN),
+        connect(place("physx/Cartpole-v0"), "physx", token=TOKEN),
     ):
         with contextlib.closing(env):
             trajectory = [env.reset(seed=11)[0]]
@@ -206,11 +194,9 @@ def test_rendering(client):
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_worlds_do_what_gymnasium_does_one_after_the_other(serving, mode):
+def test_worlds_do_what_gymnasium_does_one_after_the_other(place, mode):
     wanted = SyncVectorEnv([Episodes] * 3, autoreset_mode=mode)
-    found = connect_vector(
-        serving(Episodes, num_worlds=3), token=TOKEN, autoreset_mode=mode.value
-    )
+    found = connect_vector(place(Episodes, num_worlds=3), token=TOKEN, autoreset_mode=mode.value)
     assert found.metadata["autoreset_mode"] is mode
     assert found.single_action_space == wanted.single_action_space
     assert found.observation_space == batch_space(Episodes.observation_space, 3)
@@ -251,8 +237,8 @@ def test_worlds_that_do_not_exist(client, worlds):
     client.reset()
 
 
-def test_vector_environments_check_what_they_are_given(serving):
-    with contextlib.closing(connect_vector(serving(Episodes, num_worlds=2), token=TOKEN)) as env:
+def test_vector_environments_check_what_they_are_given(place):
+    with contextlib.closing(connect_vector(place(Episodes, num_worlds=2), token=TOKEN)) as env:
         for seed, options in ((None, {"reset_mask": np.array([True, False])}), ([1], None)):
             with pytest.raises(ConfigError):
                 env.reset(seed=seed, options=options)
@@ -263,10 +249,10 @@ def test_vector_environments_check_what_they_are_given(serving):
             env.reset(options={"reset_mask": np.zeros(2, np.bool_)})
         assert [picture[0, 0, 0] for picture in env.render()] == [0, 0]
     with pytest.raises(ConfigError, match="NextStep"):
-        connect_vector(serving(Episodes), token=TOKEN, autoreset_mode="never")
+        connect_vector(place(Episodes), token=TOKEN, autoreset_mode="never")
 
 
-# Snapshots ------------------------------------------------------------------------------------------
+# Snapshots ------------------------------------------------------------------------------------
 
 
 def test_a_snapshot_of_one_world_goes_on_in_another(client):
@@ -284,23 +270,23 @@ def test_a_snapshot_of_one_world_goes_on_in_another(client):
         client.restore(number)
 
 
-def test_snapshots_that_cannot_be_made(serving):
-    with connect(serving("gym/CartPole-v1"), token=TOKEN) as env:
+def test_snapshots_that_cannot_be_made(place):
+    with connect(place("gym/CartPole-v1"), token=TOKEN) as env:
         assert not env.client.has_snapshots
         with pytest.raises(RequestError, match="not begun"):
             env.snapshot()
         env.reset()
         with pytest.raises(UsageError, match="no snapshots"):
             env.snapshot()
-    with connect(serving(Episodes, max_snapshots=1), token=TOKEN) as env:
+    with connect(place(Episodes, max_snapshots=1), token=TOKEN) as env:
         env.reset()
         env.snapshot()
         with pytest.raises(RequestError, match="max_snapshots"):
             env.snapshot()
 
 
-def test_a_robot_goes_back_to_where_it_was(serving):
-    with connect(serving("physx/Cartpole-v0"), token=TOKEN) as env:
+def test_a_robot_goes_back_to_where_it_was(place):
+    with connect(place("physx/Cartpole-v0"), token=TOKEN) as env:
         env.reset(seed=2)
         number = env.snapshot()
         first = [env.step(2) for _ in range(5)]
@@ -356,8 +342,8 @@ def test_an_observer_changes_nothing(client):
     assert client.step({"action0": np.zeros((3, 2), np.float32)}).arrays["reward"].sum() == 0
 
 
-def test_an_observer_that_does_not_read_holds_nobody_up(serving):
-    address = serving(Episodes, env_kwargs={"large": 20_000})
+def test_an_observer_that_does_not_read_holds_nobody_up(place):
+    address = place(Episodes, env_kwargs={"large": 20_000})
     steps = 60
     with connect(address, token=TOKEN) as env, PhysxObserver(address, token=TOKEN) as observer:
         env.reset()
@@ -389,34 +375,6 @@ def test_one_client_acts_and_another_after_it(client):
         assert rows.arrays["observation0"].tolist() == [2, 2, 2], "the worlds are as they were"
 
 
-def test_what_cannot_be_served():
-    class Scene(RLEnvironment):
-        pass
-
-    with pytest.raises(UsageError, match="godot-gym"):
-        serve(Scene(), "physx", token=TOKEN)
-    with pytest.raises(ConfigError, match="at least 16"):
-        serve(Episodes, "physx", token="short")
-    with pytest.raises(ConfigError, match="handshake_timeout"):
-        serve(Episodes, "physx", handshake_timeout=0)
-
-
-def test_a_token_of_ones_own_and_none_at_all(serving, monkeypatch, tmp_path):
-    monkeypatch.delenv("PHYSX_TOKEN", raising=False)
-    with serve(Episodes, "physx") as service:
-        assert len(service.token) == 64
-    with pytest.raises(ConfigError, match="PHYSX_TOKEN"):
-        connect("127.0.0.1:1")
-    file = tmp_path / "token"
-    file.write_text(TOKEN)
-    file.chmod(0o600)
-    with connect(serving(Episodes), token_file=str(file)) as env:
-        env.reset()
-    monkeypatch.setenv("PHYSX_TOKEN", TOKEN)
-    with connect(serving(Episodes)) as env:
-        env.reset()
-
-
 def _place(address):
     host, _, port = address.rpartition(":")
     return host, int(port)
@@ -428,4 +386,4 @@ def _listed(value):
         return {key: _listed(item) for key, item in value.items()}
     if isinstance(value, tuple):
         return [_listed(item) for item in value]
-    return value.tolist() if getattr(value, "dtype", None) == object else value
+    return value.tolist() if getattr(value, "dtype", None) == np.dtype(object) else value

@@ -6,6 +6,7 @@ import contextlib
 import socket
 import struct
 import threading
+import time
 
 import gymnasium
 import numpy as np
@@ -15,11 +16,10 @@ from gymnasium import spaces
 from physx_core.errors import (
     RemoteClosedError,
     RemoteError,
-    RemoteProtocolError,
     RemoteTimeoutError,
     RequestError,
 )
-from physx_core.remote import PhysxObserver, connect, connect_vector, serve
+from physx_core.remote import PhysxObserver, connect, connect_vector
 from physx_core.remote.clients.physx_link import PhysxLink
 from physx_core.remote.protocols.physx_wire import ACT
 from physx_core.transport.failures import decode_error
@@ -70,32 +70,23 @@ def env():
 
 
 @pytest.fixture
-def serving():
-    """Serve an environment over physx in a thread."""
-    with contextlib.ExitStack() as stack:
-
-        def serving(environment, **options):
-            service = serve(environment, "physx", token=TOKEN, **options)
-            thread = threading.Thread(target=service.run)
-            thread.start()
-            stack.callback(thread.join, PATIENCE)
-            stack.callback(service.close)
-            return service
-
-        yield serving
-
-
-@pytest.fixture
 def service(serving, env):
     yield serving(env)
     env.go.set()
 
 
 def lives(service):
-    """Whether the next client is served."""
-    with connect(_text(service), token=TOKEN) as env:
-        env.reset()
-        return env.step([0.0, 0.0])[0].shape == (2,)
+    """Whether the next client is served, at the latest once the service knows that others left."""
+    until = time.monotonic() + PATIENCE
+    while True:
+        try:
+            with connect(_text(service), token=TOKEN) as env:
+                env.reset()
+                return env.step([0.0, 0.0])[0].shape == (2,)
+        except RemoteError as error:
+            is_full = "acts here already" in str(error) or "too many" in str(error)
+            if not is_full or time.monotonic() > until:
+                raise
 
 
 def _text(service):
@@ -166,6 +157,7 @@ def test_silent_strangers_are_closed(serving, env):
         half.sendall(HELLO)
         slow.sendall(HELLO[:5])
         assert all(_is_closed(stranger) for stranger in (silent, half, slow))
+    service._timeout = PATIENCE  # the next one may be slow, but is no stranger
     assert lives(service)
 
 
@@ -300,7 +292,7 @@ def test_a_client_that_leaves_in_the_middle_of_a_step(service, env):
 def test_an_exception_comes_with_its_traceback(service, caplog):
     with connect(_text(service), token=TOKEN) as env:
         env.reset()
-        with pytest.raises(RequestError, match="World 0 failed in step.*the wheel came off") as told:
+        with pytest.raises(RequestError, match="World 0 failed.*the wheel came off") as told:
             env.step([1.0, 0.0])
         assert "match int(action[0])" not in str(told.value)
         assert 'raise ArithmeticError("the wheel came off")' in str(told.value.__cause__)
@@ -324,72 +316,15 @@ def test_one_world_of_several_fails(serving):
 
 
 def test_an_answer_that_takes_too_long(service, env):
-    late = connect(_text(service), token=TOKEN, timeout=0.1)
+    late = connect(_text(service), token=TOKEN)
     late.reset()
+    late.client.timeout = 0.05
     with pytest.raises(RemoteTimeoutError, match="longer timeout"):
         late.step([3.0, 0.0])
     with pytest.raises(RemoteClosedError, match="longer than"):
         late.step([0.0, 0.0])
     env.go.set()
     assert lives(service)
-
-
-# Services that fail -------------------------------------------------------------------------------
-
-
-def test_the_service_ends(service, env):
-    client = connect(_text(service), token=TOKEN)
-    observer = PhysxObserver(_text(service), token=TOKEN)
-    client.reset()
-    service.close()
-    with pytest.raises(RemoteClosedError, match="ended the connection"):
-        client.step([0.0, 0.0])
-    with pytest.raises(RemoteClosedError):
-        while observer.next(PATIENCE):
-            continue
-    with pytest.raises(RemoteTimeoutError, match="Start the service first"):
-        connect(_text(service), token=TOKEN, connect_timeout=0.05)
-
-
-def test_closing_waits_for_the_step(service, env):
-    client = PhysxLink(service.address, ACT, token=TOKEN)
-    client.send(pack_value(Kind.REQUEST, {"do": "reset"}, "request", 1))
-    client.receive()
-    client.send(pack_value(Kind.ACTIONS, {"action0": np.array([[3, 0]], np.float32)}, "a", 2))
-    assert env.begun.wait(PATIENCE)
-    service.close()
-    assert not env.closed, "it is at work"
-    env.go.set()
-    with pytest.raises(RemoteClosedError):
-        while client.receive():
-            continue
-
-
-@pytest.mark.parametrize(
-    ("said", "error"),
-    [(b"\xff" * 64, RemoteError), (header(Kind.CHALLENGE, 1 << 30), RemoteError), (b"", None)],
-    ids=["noise", "1GB", "nothing"],
-)
-def test_what_is_no_service(said, error):
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-
-        def answer():
-            guest, _ = listener.accept()
-            with guest:
-                guest.recv(100)
-                guest.sendall(said)
-
-        thread = threading.Thread(target=answer)
-        thread.start()
-        with pytest.raises(error or RemoteClosedError):
-            connect("{}:{}".format(*listener.getsockname()), token=TOKEN)
-        thread.join(PATIENCE)
-
-
-def test_an_answer_that_is_too_long(service):
-    with connect(_text(service), token=TOKEN, max_answer=40) as env:
-        with pytest.raises(RemoteProtocolError):
-            env.reset()
 
 
 def _exactly(stranger, count):

@@ -20,6 +20,7 @@ from physx_core.cli.options import argument_registry
 from physx_core.errors import ConfigError, UsageError
 from physx_core.remote.protocol import Service
 from physx_core.remote.protocols.godot_rl_launch import write_launcher
+from physx_core.remote.serving import LOG
 from physx_core.remote.starting import serve
 from physx_core.transport.handshake import TOKEN_VARIABLE
 
@@ -69,9 +70,10 @@ def run(words: Sequence[str]) -> None:
     if chosen.write_launcher is not None:
         _write_launcher(chosen)
         return
-    logging.basicConfig(level=logging.INFO, format="physx serve: %(message)s")
-    signal.signal(signal.SIGTERM, lambda *args: sys.exit(128 + signal.SIGTERM))
     with contextlib.ExitStack() as stack:
+        stack.enter_context(_log_on_screen())
+        before = signal.signal(signal.SIGTERM, lambda *args: sys.exit(128 + signal.SIGTERM))
+        stack.callback(signal.signal, signal.SIGTERM, before)
         options = dict(chosen.options)
         if chosen.protocol == _WITH_TOKEN:
             options["token_file"] = stack.enter_context(_token_file(chosen.token_file))
@@ -92,6 +94,21 @@ def run(words: Sequence[str]) -> None:
         _say(chosen, service, options.get("token_file"))
         while service.poll(None):  # Ctrl-C passes: the command tells it by its status
             continue
+
+
+@contextlib.contextmanager
+def _log_on_screen() -> Iterator[None]:
+    """Show what services say."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("physx serve: %(message)s"))
+    before = LOG.level
+    LOG.addHandler(handler)
+    LOG.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        LOG.removeHandler(handler)
+        LOG.setLevel(before)
 
 
 def _say(chosen: Serve, service: Service, token_file: str | None) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium
 import numpy as np
 
-from physx_core.errors import ConfigError, EpisodeError, SimulationError, UnknownOptionError
+from physx_core.errors import ConfigError, EpisodeError, SimulationError
 from physx_core.gym import inheritance
 from physx_core.gym.actions import Actions
 from physx_core.gym.buffers import ObservationChecks, copied, copier, fill, neutral
@@ -37,9 +37,12 @@ class Episodes(PipelineEnv):
     `refresh_observation` (before a command of the same moment); then once `_refresh_buffers`,
     `refresh_observation`, `has_terminated`, `compute_reward`. Methods are those of the top of the
     pipeline. An exception stops the episode.
+
+    What it remembers has names with two underscores, so that subclasses may call theirs as they
+    like.
     """
 
-    _left_out: ClassVar[frozenset[str]] = frozenset({"_derived", "_renderer"})
+    _left_out: ClassVar[frozenset[str]] = frozenset({"_Episodes__derived", "_own_renderer"})
 
     def __init__(
         self,
@@ -68,28 +71,24 @@ class Episodes(PipelineEnv):
         if not isinstance(simulator, Simulator):
             simulator, kwargs = simulator_of(simulator, kwargs), {}
         inheritance.construct_next(Episodes, self, kwargs)
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise UnknownOptionError(
-                "render_mode", [str(render_mode)], self.metadata["render_modes"]
-            )
+        inheritance.check_mode(render_mode, self.metadata["render_modes"])
         self.simulator, self.render_mode, self.debug = simulator, render_mode, bool(debug)
         self.step_dt = numbers.positive("step_dt", step_dt)
         self.metadata = inheritance.metadata_of(type(self), self.step_dt)
-        option = "simulation_duration_max"
-        self.simulation_duration_max = numbers.positive(option, simulation_duration_max)
+        self.simulation_duration_max = simulation_duration_max
         self.num_steps = np.full((), -1, np.int64)
         self.reset_options: dict[str, Any] = {}
         self.viewer_kwargs: dict[str, Any] = {}
         self.recording = Recording()
         self.control_dt = self.observe_dt = -1.0
-        self._derived: weakref.ref[PipelineEnv] | None = None
-        self._renderer: Any = None
-        self._quantities: Any = None
-        self._training, self._ready, self._why = True, False, "Call reset() before step()."
-        self._builds, self._count, self._is_sound = -1, -1, False
+        self.__derived: weakref.ref[PipelineEnv] | None = None
+        self._own_renderer: Any = None
+        self.__quantities: Any = None
+        self.__training, self.__ready, self.__why = True, False, "Call reset() before step()."
+        self.__builds, self.__count, self.__is_sound = -1, -1, False
         self._flat_observation: Any = None
-        self._set_periods()
-        self._initialize_spaces()
+        self.__set_periods()
+        self.__initialize_spaces()
 
     # Overridden by RobotEnv --------------------------------------------------------------------
 
@@ -111,31 +110,31 @@ class Episodes(PipelineEnv):
     @property
     def derived(self) -> PipelineEnv:
         """The topmost layer of the pipeline on this environment; itself, if there is none."""
-        found = None if self._derived is None else self._derived()
+        found = None if self.__derived is None else self.__derived()
         return self if found is None else found
 
     def _update_pipeline(self, derived: PipelineEnv | None) -> None:
         """Make a layer the top of the pipeline; None: this environment alone."""
         top = self if derived is None else derived
-        self._derived = None if top is self else weakref.ref(top)
-        if self._ready:
-            self._ready, self._why = False, "The pipeline has changed: call reset()."
+        self.__derived = None if top is self else weakref.ref(top)
+        if self.__ready:
+            self.__ready, self.__why = False, "The pipeline has changed: call reset()."
 
     @property
     def quantities(self) -> Any:
         """Values that rewards and terminations share, computed at most once a step."""
-        if self._quantities is None:
+        if self.__quantities is None:
             from physx_core.gym.quantities import Quantities
 
-            self._quantities = Quantities(self)
-        return self._quantities
+            self.__quantities = Quantities(self)
+        return self.__quantities
 
     # Settings --------------------------------------------------------------------------------
 
     @property
     def training(self) -> bool:
         """Whether this is for training; otherwise for evaluation, where episodes are recorded."""
-        return self._training
+        return self.__training
 
     def train(self, mode: bool = True) -> None:
         """Switch between training and evaluation.
@@ -143,15 +142,15 @@ class Episodes(PipelineEnv):
         Raises:
             EpisodeError: An episode runs.
         """
-        if bool(mode) is not self._training and self.is_simulation_running:
+        if bool(mode) is not self.__training and self.is_simulation_running:
             raise EpisodeError("An episode runs: call stop() before train() or eval().")
-        self._training = bool(mode)
+        self.__training = bool(mode)
 
     def eval(self) -> None:
         """Switch to evaluation; see `train`."""
         self.train(False)
 
-    def _set_periods(self) -> None:
+    def __set_periods(self) -> None:
         """Work out what is due when in a step."""
         simulator = self.simulator
         self.periods = Periods(self.step_dt, self.simulation_duration_max, simulator)
@@ -162,7 +161,7 @@ class Episodes(PipelineEnv):
     def _is_held(self) -> bool:
         """Return whether commands and observations within a step change nothing."""
 
-    def _initialize_spaces(self) -> None:
+    def __initialize_spaces(self) -> None:
         self.simulator.prepare()
         simulator = self.simulator
         self.robot, self.robot_state = simulator.robot, simulator.robot_state
@@ -172,8 +171,8 @@ class Episodes(PipelineEnv):
         self._initialize_observation_space()
         inheritance.check_spaces(self)
         self._make_buffers()
-        self._own_checks = ObservationChecks(self.observation_space, self._flat_observation)
-        self._builds = simulator.builds
+        self.__own_checks = ObservationChecks(self.observation_space, self._flat_observation)
+        self.__builds = simulator.builds
 
     def _initialize_seed(self, seed: int | None = None) -> None:
         """Draw everything anew from a seed: states, errors of sensors, samples of spaces.
@@ -185,13 +184,13 @@ class Episodes(PipelineEnv):
             self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random()
         else:
             gymnasium.Env.reset(self, seed=seed)
-        self._seed_sensors()
+        self.__seed_sensors()
         for i, layer in enumerate(self.derived.layers):
             for k, space in enumerate((layer.action_space, layer.observation_space)):
                 drawn = np.random.SeedSequence(self.np_random_seed, spawn_key=(2, i, k))
                 space.seed(int(drawn.generate_state(1)[0]))
 
-    def _seed_sensors(self) -> None:
+    def __seed_sensors(self) -> None:
         known = self.np_random_seed
         entropy = known if known >= 0 else int(self.np_random.integers(2**63))
         self.simulator.seed(np.random.SeedSequence(entropy, spawn_key=(1,)))
@@ -212,49 +211,49 @@ class Episodes(PipelineEnv):
         self.reset_options = dict(options or {})
         simulator.remove_all_forces()
         self._setup()
-        self._set_periods()
+        self.__set_periods()
         simulator.prepare()
-        if simulator.builds != self._builds:
-            self._initialize_spaces()
+        if simulator.builds != self.__builds:
+            self.__initialize_spaces()
             for layer in top.layers[1:]:
                 layer._initialize_action_space()
                 layer._initialize_observation_space()
         layers = top.layers
         for layer in layers:
             fill(layer.action, neutral(layer.action_space))
-        self.num_steps[...] = self._count = 0
+        self.num_steps[...] = self.__count = 0
         for layer in layers[1:]:
             layer._setup()
         positions, velocities = inheritance.pair_of(self, "_sample_state", self._sample_state())
-        if self._quantities is not None:
-            self._quantities.reset()
+        if self.__quantities is not None:
+            self.__quantities.reset()
         try:
             simulator.start(positions, velocities)
-            info = self._begin(top)
+            info = self.__begin(top)
         except BaseException:
             self.stop()
             raise
-        self._ready = True
+        self.__ready = True
         if self.render_mode == "human":
             self.render()
-        return self._copied(top.observation), info
+        return self.__copied(top.observation), info
 
-    def _begin(self, top: PipelineEnv) -> Info:
+    def __begin(self, top: PipelineEnv) -> Info:
         """Bring everything to the first state."""
         top._initialize_buffers()
         top._refresh_buffers()
-        if self._quantities is not None:
-            self._quantities.clear()
+        if self.__quantities is not None:
+            self.__quantities.clear()
         if top.refresh_observation(self.measurements) is not None:
             raise inheritance.not_written(top, "refresh_observation", "self.observation")
-        self._attend(top)
-        self._checks.check_form(top.observation)
-        self._checks.check_finite(top.observation)
+        self.__attend(top)
+        self.__checks.check_form(top.observation)
+        self.__checks.check_finite(top.observation)
         info: Info = {}
-        self._records = self.recording.begin(self, top, info)
-        held = top is self and not self._records and self._is_held()
-        self._last_step = self.periods.last
-        self._schedule = self.periods.schedule(held, self._records and self.debug)
+        self.__records = self.recording.begin(self, top, info)
+        held = top is self and not self.__records and self._is_held()
+        self.__last_step = self.periods.last
+        self.__schedule = self.periods.schedule(held, self.__records and self.debug)
         terminated, truncated = inheritance.pair_of(top, "has_terminated", top.has_terminated(info))
         if terminated or truncated:
             word = "terminated" if terminated else "truncated"
@@ -264,27 +263,27 @@ class Episodes(PipelineEnv):
             )
         return info
 
-    def _attend(self, top: PipelineEnv) -> None:
+    def __attend(self, top: PipelineEnv) -> None:
         """Take actions from, and check observations of, the top of the pipeline."""
-        self._actions = Actions(top.action_space, top.action)
+        self.__actions = Actions(top.action_space, top.action)
         alone = top is self
-        self._checks = self._own_checks if alone else ObservationChecks(top.observation_space)
-        self._copied = copier(top.observation_space)
+        self.__checks = self.__own_checks if alone else ObservationChecks(top.observation_space)
+        self.__copied = copier(top.observation_space)
 
     def run_step(self, top: PipelineEnv, action: Any) -> Step:
         """Simulate a step under an action of the top; see `step`."""
-        if not self._ready or top is not self.derived:
-            raise self._refusal(top)
-        self._actions.take(action)
+        if not self.__ready or top is not self.derived:
+            raise self.__refusal(top)
+        self.__actions.take(action)
         try:
-            self._run(top)
+            self.__run(top)
             top.refresh_observation(self.measurements)
             info: Info = {}
-            self._is_sound = False
+            self.__is_sound = False
             terminated, truncated = top.has_terminated(info)
-            if not self._is_sound or top is not self:
-                self._checks.check_finite(top.observation)
-            if self.stepper_state.iter >= self._last_step:
+            if not self.__is_sound or top is not self:
+                self.__checks.check_finite(top.observation)
+            if self.stepper_state.iter >= self.__last_step:
                 truncated = True
             reward = top.compute_reward(terminated, info)
             if type(reward) is not float:
@@ -296,38 +295,38 @@ class Episodes(PipelineEnv):
             raise
         if terminated or truncated:
             word = "terminated" if terminated else "was truncated"
-            self._ready, self._why = False, f"The episode {word}: call reset()."
+            self.__ready, self.__why = False, f"The episode {word}: call reset()."
         if self.render_mode == "human":
             self.render()
-        return self._copied(top.observation), reward, bool(terminated), bool(truncated), info
+        return self.__copied(top.observation), reward, bool(terminated), bool(truncated), info
 
-    def _run(self, top: PipelineEnv) -> None:
+    def __run(self, top: PipelineEnv) -> None:
         """Control and simulate for a step, up to its last observation."""
-        simulator, quantities = self.simulator, self._quantities
+        simulator, quantities = self.simulator, self.__quantities
         measurements, command = self.measurements, self.robot_state.command
-        for observe, control, steps in self._schedule:
+        for observe, control, steps in self.__schedule:
             if observe:
                 top.refresh_observation(measurements)
             if control:
                 if top.compute_command(top.action, command) is not None:
                     raise inheritance.not_written(top, "compute_command", "command")
                 simulator.apply_command()
-            if self._records:
+            if self.__records:
                 self.recording.row(self)
             simulator.step(steps)
-        self._count += 1
-        self.num_steps[()] = self._count
+        self.__count += 1
+        self.num_steps[()] = self.__count
         top._refresh_buffers()
         if quantities is not None:
             quantities.clear()
 
     def resume(self, top: PipelineEnv) -> None:
         """Make a layer the top of the pipeline without ending its episode."""
-        self._derived = None if top is self else weakref.ref(top)
+        self.__derived = None if top is self else weakref.ref(top)
 
-    def _refusal(self, top: PipelineEnv) -> EpisodeError:
-        if not self._ready:
-            return EpisodeError(self._why)
+    def __refusal(self, top: PipelineEnv) -> EpisodeError:
+        if not self.__ready:
+            return EpisodeError(self.__why)
         return EpisodeError(
             f"The episode belongs to {type(self.derived).__name__}, the top of the pipeline, but "
             f"step is of {type(top).__name__}: call step there, or reset here."
@@ -335,8 +334,8 @@ class Episodes(PipelineEnv):
 
     def is_inside(self) -> bool:
         """Return whether `observation` is within its space."""
-        inside = self._own_checks.inside(self.observation)
-        self._is_sound = inside and self._own_checks.tells_nan
+        inside = self.__own_checks.inside(self.observation)
+        self.__is_sound = inside and self.__own_checks.tells_nan
         return inside
 
     def stop(self) -> None:
@@ -344,14 +343,14 @@ class Episodes(PipelineEnv):
         if self.is_simulation_running:
             self.recording.end(self)
             self.simulator.stop()
-            self._ready, self._why = False, "The episode was stopped: call reset()."
+            self.__ready, self.__why = False, "The episode was stopped: call reset()."
 
     def close(self) -> None:
         """Stop, and free engine and viewer; `reset` brings them back."""
         self.stop()
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        if self._own_renderer is not None:
+            self._own_renderer.close()
+            self._own_renderer = None
         self.recording.close()
         self.simulator.close()
 
@@ -364,19 +363,24 @@ class Episodes(PipelineEnv):
         if not isinstance(state, dict) or state.get("layers") != names or "own" not in state:
             given = state.get("layers") if isinstance(state, dict) else state
             raise SimulationError(f"The snapshot is of {given}, not of {names}.")
+        runs = state["own"][0]["simulator"]["running"]
+        if not runs:
+            self.stop()
         if self.num_steps < 0 or self.derived is not top or not self.is_simulation_running:
             self.run_reset(top, None, state["own"][0]["options"])
         for layer, own in zip(layers, state["own"], strict=True):
             layer._restore_own(own)
+        if not runs:
+            self.recording.discard()
 
     def _snapshot_own(self) -> dict[str, Any]:
-        quantities = self._quantities
+        quantities = self.__quantities
         return super()._snapshot_own() | {
             "simulator": self.simulator.snapshot(),
             "random": copied(self.np_random.bit_generator.state),
             "seed": self.np_random_seed,
             "num_steps": int(self.num_steps),
-            "ready": (self._ready, self._why),
+            "ready": (self.__ready, self.__why),
             "options": dict(self.reset_options),
             "quantities": None if quantities is None else quantities.snapshot(),
         }
@@ -385,15 +389,15 @@ class Episodes(PipelineEnv):
         self.simulator.restore(own["simulator"])
         self.np_random.bit_generator.state = own["random"]
         self._np_random_seed = own["seed"]
-        self.num_steps[...] = self._count = own["num_steps"]
-        self._ready, self._why = own["ready"]
+        self.num_steps[...] = self.__count = own["num_steps"]
+        self.__ready, self.__why = own["ready"]
         self.reset_options = dict(own["options"])
         self.recording.rewind(self.stepper_state.t)
-        if own["quantities"] is not None:
-            self.quantities.restore(own["quantities"])
+        if own["quantities"] is not None or self.__quantities is not None:
+            self.quantities.restore(own["quantities"] or [])
         super()._restore_own(own)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take up a pickled or copied environment."""
         super().__setstate__(state)
-        self._derived = self._renderer = None
+        self.__derived = self._own_renderer = None

@@ -70,6 +70,7 @@ class Equipment:
         size: Number of values that the sensors measure.
         most: Highest torques of the motors' shafts, shape (motors,), in N m or N.
         command: Lets the motors take over their command, shape (motors,).
+        torques: Writes the torques on the motors' joints, shape (motors,), in N m or N.
     """
 
     def __init__(
@@ -90,8 +91,9 @@ class Equipment:
         self._drive = _Drive(simulation, motors)
         self._lookup = _lookup(simulation.layout, self.sensor_list)
         self.command: Callable[[Vector], None] = self._drive
+        self.torques: Callable[[Vector], None] = self._drive.torques
         if self.motors is not None and not self._steady:
-            self.command = self.motors.set_commands
+            self.command, self.torques = self.motors.set_commands, self._read_torques
         self._every = [
             1 if sensor.period is None else round(sensor.period / simulation.period)
             for sensor in sensors
@@ -137,11 +139,8 @@ class Equipment:
             self._simulation.remove_hook(sensors)
         self._hooked = wanted
 
-    def torques(self, out: Vector) -> None:
-        """Write the torques on the motors' joints, shape (motors,), in N m or N."""
-        if self._steady:
-            self._drive.torques(out)
-        elif self.motors is not None:
+    def _read_torques(self, out: Vector) -> None:
+        if self.motors is not None:
             out[:] = self.motors.torques_view
 
     def measure(self, state: Vector, out: Vector) -> None:
@@ -228,7 +227,7 @@ class _Drive:
 
     def torques(self, out: Vector) -> None:
         """Write the torques on the joints, shape (motors,), as the joints' limits cut them."""
-        out[:] = self._simulation.commands()[self._places]
+        self._simulation.commands().take(self._places, None, out, "clip")
 
 
 def _lookup(layout: Layout, sensors: Sequence[Sensor]) -> Any:

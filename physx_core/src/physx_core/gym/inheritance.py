@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -51,6 +51,16 @@ _PAIRS = {
     "_sample_state": "positions and velocities",
     "has_terminated": "whether the episode terminated, and whether it is truncated",
 }
+
+
+def check_mode(mode: Any, modes: Sequence[str]) -> None:
+    """Check a mode of rendering; None: whatever is possible.
+
+    Raises:
+        UnknownOptionError: There is no such mode.
+    """
+    if mode is not None and mode not in modes:
+        raise UnknownOptionError("render_mode", [str(mode)], modes)
 
 
 def metadata_of(kind: type[Any], step_dt: float) -> dict[str, Any]:

@@ -45,7 +45,8 @@ class SharedArrays:
         return {name: _closed(value) for name, value in kept.items()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take up the attributes."""
+        """Take up the attributes; those that were not written are None."""
+        self.__dict__.update(dict.fromkeys(self._left_out))
         self.__dict__.update({name: _opened(value) for name, value in state.items()})
 
 

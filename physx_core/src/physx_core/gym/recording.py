@@ -100,6 +100,11 @@ class Recording:
         if self._telemetry is not None:
             self._telemetry.rewind(time)
 
+    def discard(self) -> None:
+        """End the episode without a file, if one is recorded."""
+        if self._telemetry is not None and self._telemetry.is_recording:
+            self._telemetry.discard()
+
     def end(self, env: Episodes) -> None:
         """Record the last state, and write the file, if there was a step."""
         telemetry = self._telemetry

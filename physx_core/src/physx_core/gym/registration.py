@@ -30,7 +30,7 @@ def register() -> None:
         gymnasium.register(
             identity,
             entry_point=f"physx_core.gym.environments.{home}",
-            vector_entry_point=partial(make_vector, identity),  # type: ignore[arg-type]
+            vector_entry_point=partial(make_vector, identity),
             reward_threshold=_SOLVED.get(name),
         )
 

@@ -46,7 +46,7 @@ class RobotEnv(Episodes):
         default = observation_space_of(self.simulator, self.periods.longest)
         self._flat_observation = None
         if self.observation_space == default:
-            self._observed, self._flat_observation, self.observation = observed(self.simulator)
+            self.__observed, self._flat_observation, self.observation = observed(self.simulator)
         else:
             self.observation = neutral(self.observation_space)
             if type(self).refresh_observation is RobotEnv.refresh_observation:
@@ -82,7 +82,7 @@ class RobotEnv(Episodes):
             measurement: What was measured: ``t``, ``states``, ``measurements``.
         """
         if self._flat_observation is not None:
-            self.simulator.values.take(self._observed, None, self._flat_observation, "clip")
+            self.simulator.values.take(self.__observed, None, self._flat_observation, "clip")
 
     def compute_command(self, action: Any, command: Vector) -> None:
         """Write the torques of the motors, in place: by default the action.
@@ -196,11 +196,11 @@ class RobotEnv(Episodes):
             PluginNotFoundError: The viewer is not installed; the message says how to install it.
             VisualizerError: It cannot draw; the message says what is missing.
         """
-        if self._renderer is None:
+        if self._own_renderer is None:
             from physx_core.gym.rendering import Renderer
 
-            self._renderer = Renderer(self)
-        return self._renderer.frame()
+            self._own_renderer = Renderer(self)
+        return self._own_renderer.frame()
 
     def plot(self, enable_block_states: bool = False, **kwargs: Any) -> Any:
         """Plot the running episode, or the last one; see `physx_core.gym.plotting.plot`.

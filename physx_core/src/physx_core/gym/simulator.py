@@ -236,6 +236,7 @@ class Simulator(EquippedWorld):
         """Stop, and free the engine; it is built again when it is next needed."""
         self.stop()
         if self._engine is not None:
+            self.robot_state.disconnect()
             self._drop()
             self._stale = True
 

@@ -41,17 +41,24 @@ class RobotState(SharedArrays):
 
     def __init__(self, q: Vector, v: Vector, motors: int, stepper: StepperState) -> None:
         self.q, self.v = q, v
-        self.command, self._torques = np.zeros(motors), np.zeros(motors)
-        self._a = np.zeros(len(v))
+        # Side by side, as they are recorded.
+        self._a, self.command, self._torques = np.split(
+            np.zeros(len(v) + 2 * motors), [len(v), len(v) + motors]
+        )
         self._stepper, self._when = stepper, -1
         self._simulation: Simulation | None = None
         self._equipment: Equipment | None = None
-        self._part = slice(0, len(v))
+        self._part, self._accelerates = slice(0, len(v)), False
 
     def connect(self, simulation: Simulation, equipment: Equipment, part: Part) -> None:
         """Read accelerations and torques from a simulation from now on."""
+        self._accelerates = "accelerations" in simulation.features
         self._simulation, self._equipment, self._part = simulation, equipment, part.velocities
         self._when = -1
+
+    def disconnect(self) -> None:
+        """Keep what was read last from now on."""
+        self._simulation = self._equipment = None
 
     @property
     def a(self) -> Vector:
@@ -67,12 +74,13 @@ class RobotState(SharedArrays):
 
     def refresh(self) -> None:
         """Bring `a` and `torques` to the present."""
-        if self._when == self._stepper.iter or self._simulation is None or self._equipment is None:
+        simulation, equipment, frame = self._simulation, self._equipment, self._stepper.iter
+        if self._when == frame or simulation is None or equipment is None:
             return
-        self._when = self._stepper.iter
-        if "accelerations" in self._simulation.features:
-            self._a[:] = self._simulation.accelerations()[self._part]
-        self._equipment.torques(self._torques)
+        self._when = frame
+        if self._accelerates:
+            self._a[:] = simulation.accelerations()[self._part]
+        equipment.torques(self._torques)
 
     def expire(self) -> None:
         """Note that the simulation is in another state without having gone on."""

@@ -17,7 +17,7 @@ from physx_core.errors import ActionError, ConfigError, UsageError
 from physx_core.fields import Array, Batch, Sample
 from physx_core.gym.making import make_env
 from physx_core.gym.space_fields import SpaceFields
-from physx_core.gym.vector_worker import COMMAND, FORBIDDEN, VectorWorker, packed
+from physx_core.gym.vector_worker import COMMAND, FORBIDDEN, INFOS, VectorWorker, packed, unpacked
 from physx_core.scene import Event
 from physx_core.sources.clients import ClientSource
 
@@ -162,7 +162,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             ActionError: The actions are not of the space's shape.
             PhysxError: An environment raised, or a process failed.
         """
-        self._open().apply(self._shares_of(actions))
+        self._open().apply(self._shares_of(actions), at_once=False)
         rows = self._answer()
         over = rows["terminated"] | rows["truncated"]
         finals: dict[int, Any] = {}
@@ -199,10 +199,14 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
     def _answer(self) -> Batch:
         """Return what became of the last actions or commands, by field: (num_envs, *shape)."""
         rows = self._open().batch(self._clients)
+        for number, row in enumerate(rows[INFOS], 1):
+            said = unpacked(row)
+            if said is not None:
+                self._notes.save_parameters(number, said)
         return {
             name: array.reshape(-1, *array.shape[2:])[: self.num_envs]
             for name, array in rows.items()
-            if array.ndim > 1
+            if array.ndim > 1 and name != INFOS
         }
 
     def _batch(self, rows: Batch) -> Any:
@@ -270,7 +274,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _command(self, name: str, arguments: Sequence[Any]) -> None:
         """Have each client obey a command in the place of actions."""
-        self._open().apply({COMMAND: packed(name, arguments)})
+        self._open().apply({COMMAND: packed(name, arguments)}, at_once=False)
 
     def _shared(self, values: Sequence[Any]) -> list[list[Any]]:
         """Return the values of each client's environments."""

@@ -18,16 +18,21 @@ from physx_core.transport.values import decode, encode
 
 COMMAND = "command"
 """Entry of a prediction that is no action but says what else to do."""
+INFOS = "infos"
+"""Field of the infos as bytes, after their length."""
 FORBIDDEN = ("reset", "step", "close")
 """Methods that `call` does not call."""
 _LENGTH = 8
+_INFO_BYTES = 512
+"""Bytes of a row for the infos of each environment; longer ones go by another way."""
 
 
 class VectorWorker(Environment):
     """Steps some of a vector environment's environments; a row holds one step of all of them.
 
     An action, or a command, comes as the prediction; the next row is what became of it. What has no
-    fixed shape, infos and returned values, goes by `save_parameters` before the row.
+    fixed shape, infos and returned values, goes by `save_parameters` before the row; infos that
+    are short go as bytes within the row, without waiting for an answer.
     """
 
     def __init__(
@@ -80,6 +85,7 @@ class VectorWorker(Environment):
                 for field in self._observations.fields
             ]
         wide = [Field(f.name, (self._share, *(f.shape or ())), f.dtype) for f in fields]
+        wide.append(Field(INFOS, (_LENGTH + self._share * _INFO_BYTES,), "uint8"))
         self._row = {f.name: np.zeros(f.shape or (), f.dtype) for f in wide}
         self.define_training_fields(wide)
 
@@ -90,6 +96,7 @@ class VectorWorker(Environment):
     def step(self) -> None:
         """Do what the last prediction asked for."""
         command, self._command = self._command, None
+        self._row[INFOS][:_LENGTH] = 0
         if command is not None and COMMAND in command:
             self._obey(unpacked(command[COMMAND]))
         elif command is not None:
@@ -164,10 +171,19 @@ class VectorWorker(Environment):
         """Send the infos, if there is anything in them; what cannot travel is named instead."""
         if not any(infos):
             return
-        left_out: set[str] = set()
-        self.save_parameters(
-            infos=[_plain(info, left_out) for info in infos], left_out=sorted(left_out)
-        )
+        named = [{str(name): value for name, value in info.items()} for info in infos]
+        said: dict[str, Any] = {"infos": named, "left_out": []}
+        try:
+            text = encode(said, "infos")
+        except UsageError:
+            left_out: set[str] = set()
+            said["infos"] = [_plain(info, left_out) for info in infos]
+            said["left_out"] = sorted(left_out)
+            text = encode(said, "infos")
+        if _LENGTH + len(text) <= self._row[INFOS].size:
+            _put_text(self._row[INFOS], text)
+        else:
+            self.save_parameters(**said)
 
 
 def _called(
@@ -200,13 +216,17 @@ def packed(name: str, arguments: Sequence[Any]) -> Array:
     texts = [encode({"name": name, "arguments": each}, name) for each in arguments]
     rows = np.zeros((len(texts), _LENGTH + max(map(len, texts))), np.uint8)
     for row, text in zip(rows, texts, strict=True):
-        whole = len(text).to_bytes(_LENGTH, "little") + text
-        row[: len(whole)] = np.frombuffer(whole, np.uint8)
+        _put_text(row, text)
     return rows
 
 
+def _put_text(row: Array, text: bytes) -> None:
+    """Write bytes to the begin of a row, after their length."""
+    whole = len(text).to_bytes(_LENGTH, "little") + text
+    row[: len(whole)] = np.frombuffer(whole, np.uint8)
+
+
 def unpacked(row: Array) -> Any:
-    """Return the command of one client."""
-    data = np.asarray(row, np.uint8).tobytes()
-    length = int.from_bytes(data[:_LENGTH], "little")
-    return decode(data[_LENGTH : _LENGTH + length])
+    """Return the command of one client, or what a client says in a row; None: nothing."""
+    length = int.from_bytes(row[:_LENGTH].tobytes(), "little")
+    return decode(row[_LENGTH : _LENGTH + length].tobytes()) if length else None

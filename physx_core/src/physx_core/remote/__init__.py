@@ -31,6 +31,7 @@ _HOMES = {
     "Worlds": "worlds",
     "connect": "starting",
     "connect_vector": "starting",
+    "fill": "messages",
     "open_worlds": "worlds",
     "serve": "starting",
     "write_launcher": "protocols.godot_rl_launch",

@@ -8,6 +8,7 @@ from physx_core.errors import ConfigError, RequestError, UsageError
 from physx_core.remote.connections import Connection
 from physx_core.remote.framing import MAX_REQUEST, FrameReader, Reader, framed
 from physx_core.remote.messages import ERROR, encoded_extension
+from physx_core.remote.protocol import check_place
 from physx_core.remote.requests import JsonReader, parse_request
 from physx_core.remote.serving import LOG, SocketService, Work
 from physx_core.remote.timer import Signal
@@ -73,10 +74,10 @@ class Communication(SocketService):
                 known = ", ".join(f'"{kind}"' for kind in get_args(kinds))
                 raise ConfigError(f"{name} is {value!r} but must be one of {known}.")
         for name, number in (("max_request", max_request), ("max_clients", max_clients)):
-            if number < 1:
-                raise ConfigError(f"{name} is {number} but must be at least 1.")
-        if patience is not None and not patience > 0:
-            raise ConfigError(f"patience is {patience} but must be more than 0 s.")
+            if type(number) is not int or number < 1:
+                raise ConfigError(f"{name} is {number!r} but must be a whole number, at least 1.")
+        if patience is not None and (type(patience) not in (int, float) or not patience > 0):
+            raise ConfigError(f"patience is {patience!r} but must be a number of s above 0.")
         self.got_connection = Signal()
         self._clients, self._reply, self._errors = clients, reply, errors
         self._framing, self._max_request, self._patience = request_framing, max_request, patience
@@ -114,11 +115,15 @@ class Communication(SocketService):
                 to say who he is.
 
         Raises:
-            UsageError: It listens already.
+            UsageError: It listens already, or is closed.
+            ConfigError: Port or address is none.
             RemoteError: It cannot listen there.
         """
+        check_place(address, port)
         if self.is_listening:
             raise UsageError(f"The server listens already, at {self.address}.")
+        if self._over:
+            raise UsageError("What was closed does not serve again: make another environment.")
         self.listen(address, port)
         LOG.info("Listening at %s:%s", *self.address)
         if self._patience is not None:

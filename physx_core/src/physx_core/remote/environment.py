@@ -15,7 +15,7 @@ from physx_core.interfaces.backend import Simulation
 from physx_core.remote.agent import RLAgent
 from physx_core.remote.communication import Communication
 from physx_core.remote.messages import DESCRIPTION, Messages, encoded_extension
-from physx_core.remote.requests import as_frames, as_object, as_seed, as_speed
+from physx_core.remote.requests import as_count, as_object, as_seed, as_speed
 from physx_core.remote.spaces import describe_space
 from physx_core.remote.timer import PhysicsFramesTimer
 from physx_core.remote.world import RLEnvWorld
@@ -100,8 +100,8 @@ class RLEnvironment:
 
     @repeat_action.setter
     def repeat_action(self, frames: int) -> None:
-        self._repeat_action = frames
-        self.physics_frames_timer.set_limit(frames)
+        self._repeat_action = as_count(self.REPEAT_ACTION_KEY, frames)
+        self.physics_frames_timer.set_limit(self._repeat_action)
 
     @property
     def frame_steps(self) -> int:
@@ -114,7 +114,7 @@ class RLEnvironment:
 
     @frame_steps.setter
     def frame_steps(self, steps: int) -> None:
-        self._frame_steps = steps
+        self._frame_steps = as_count("frame_steps", steps, 1)
 
     @property
     def frame_time(self) -> float:
@@ -129,7 +129,7 @@ class RLEnvironment:
         if not self._is_ready:
             self._enter_tree()
             self._ready()
-            self._is_ready = True
+            self._is_ready, self.time_speed = True, as_speed(self.time_speed)
             self.messages = None if self.messages is None else Messages(self.messages)
 
     def run(self) -> None:
@@ -291,7 +291,7 @@ class RLEnvironment:
         values = as_object(f"{self.CONFIG_KEY}.{self.ENVIRONMENT_KEY}", own)
         repeat, speed = self._repeat_action, self.time_speed
         if self.REPEAT_ACTION_KEY in values:
-            repeat = as_frames(values[self.REPEAT_ACTION_KEY])
+            repeat = as_count(self.REPEAT_ACTION_KEY, values[self.REPEAT_ACTION_KEY])
         if self.TIME_SPEED_KEY in values:
             speed = as_speed(values[self.TIME_SPEED_KEY])
         if self.AGENT_KEY in configuration_request:

@@ -299,6 +299,8 @@ def _is_repeated(field: Any) -> bool:
 
 def _by_name(fields: Iterable[MessageField]) -> dict[str, Field | type]:
     found: dict[str, Field | type] = {}
+    if isinstance(fields, str):
+        raise ConfigError(f'Fields are a list, such as ["{fields}"], not a text.')
     for item in fields:
         field: Field | type
         if isinstance(item, tuple) and len(item) == 2 and item[1] in (str, bytes):

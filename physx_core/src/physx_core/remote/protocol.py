@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import import_module
+from inspect import Parameter, isabstract, signature
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
@@ -24,6 +25,8 @@ PROTOCOLS: Mapping[str, str] = {
     "physx": "physx_core.remote.protocols.physx:Physx",
 }
 """Names of the protocols that physx brings."""
+
+_LAST_PORT = 0xFFFF
 
 
 class Service(ABC):
@@ -143,9 +146,28 @@ def find_protocol(reference: str | type[Protocol]) -> type[Protocol]:
         found = getattr(import_module(module), name)
     else:
         found = resolve("environment", reference)
-    if not (isinstance(found, type) and issubclass(found, Protocol)):
-        raise ConfigError(f"{reference} is no protocol: it must be a subclass of {Protocol}.")
+    if not (isinstance(found, type) and issubclass(found, Protocol)) or isabstract(found):
+        raise ConfigError(
+            f"{reference} is no protocol: it must be a subclass of physx_core.remote.Protocol that "
+            "implements service()."
+        )
     return found
+
+
+def check_options(owner: str, options: Mapping[str, Any], maker: Callable[..., Any]) -> None:
+    """Check that all options are among those that a function or class takes by name only.
+
+    Raises:
+        UnknownOptionError: One is not.
+    """
+    known = [
+        each.name
+        for each in signature(maker).parameters.values()
+        if each.kind is Parameter.KEYWORD_ONLY
+    ]
+    unknown = [name for name in options if name not in known]
+    if unknown:
+        raise UnknownOptionError(owner, unknown, known)
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -154,7 +176,19 @@ def parse_address(text: str) -> tuple[str, int]:
     Raises:
         ConfigError: The text has not this form.
     """
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdecimal() or int(port) > 0xFFFF:
-        raise ConfigError(f'"{text}" is no address: give "host:port", such as "127.0.0.1:9090".')
+    host, _, port = text.rpartition(":") if isinstance(text, str) else ("", "", "")
+    if not host or not port.isdecimal() or int(port) > _LAST_PORT:
+        raise ConfigError(f'{text!r} is no address: give "host:port", such as "127.0.0.1:9090".')
     return host.strip("[]"), int(port)
+
+
+def check_place(address: str, port: int) -> None:
+    """Check that something may be an address and a port.
+
+    Raises:
+        ConfigError: It is not.
+    """
+    if not isinstance(address, str) or not address:
+        raise ConfigError(f'address is {address!r} but must be a text such as "127.0.0.1".')
+    if type(port) is not int or not 0 <= port <= _LAST_PORT:
+        raise ConfigError(f"port is {port!r} but must be a whole number from 0 to {_LAST_PORT}.")

@@ -49,14 +49,14 @@ def as_object(key: str, value: Any) -> dict[str, Any]:
     return value
 
 
-def as_frames(value: Any) -> int:
-    """Return a number of physics frames.
+def as_count(key: str, value: Any, least: int = 0) -> int:
+    """Return how many physics frames or steps are meant.
 
     Raises:
-        RequestError: It is no whole number of at least 0.
+        RequestError: It is no whole number, or too small.
     """
-    if not _is_number(value) or value != int(value) or value < 0:
-        raise RequestError(f"repeat_action is a whole number of at least 0, not {value!r:.60}.")
+    if not _is_number(value) or value != int(value) or value < least:
+        raise RequestError(f"{key} is a whole number of at least {least}, not {value!r:.60}.")
     return int(value)
 
 

@@ -33,8 +33,8 @@ def describe_space(space: Space) -> dict[str, Any]:
             start, count = int(space.start), int(space.n)
             return {"kind": kind, "n": count, "start": start, "dtype": space.dtype.str}
         case spaces.MultiBinary():
-            count = space.n  # a number is another space than a shape of one number
-            return {"kind": kind, "n": count if isinstance(count, int) else [*space.shape]}
+            bits = space.n  # a number is another space than a shape of one number
+            return {"kind": kind, "n": bits if isinstance(bits, int) else [*space.shape]}
         case spaces.MultiDiscrete():
             counts, starts = space.nvec.tolist(), space.start.tolist()
             return {"kind": kind, "nvec": counts, "start": starts, "dtype": space.dtype.str}

@@ -6,10 +6,16 @@ import inspect
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from physx_core.errors import UsageError
+from physx_core.errors import ConfigError, UsageError
 from physx_core.plugins import resolve
-from physx_core.remote.protocol import Protocol, Service, find_protocol, parse_address
-from physx_core.remote.worlds import GYMNASIUM, open_worlds
+from physx_core.remote.protocol import (
+    Protocol,
+    Service,
+    check_place,
+    find_protocol,
+    parse_address,
+)
+from physx_core.remote.worlds import GYMNASIUM, called, open_worlds
 
 if TYPE_CHECKING:
     import gymnasium
@@ -43,6 +49,9 @@ def serve(
     Raises:
         PhysxError: There is no such environment or protocol, or it cannot listen there.
     """
+    check_place(address, port)
+    if env_kwargs is not None and not isinstance(env_kwargs, Mapping):
+        raise ConfigError(f"env_kwargs is {env_kwargs!r} but must be a dictionary.")
     kind = find_protocol(protocol)(**options)
     scene = _scene(environment, env_kwargs or {})
     if scene is None:
@@ -89,5 +98,13 @@ def _scene(environment: Any, arguments: Mapping[str, Any]) -> RLEnvironment | No
             return None
         environment = resolve("environment", environment)
     if inspect.isclass(environment) and issubclass(environment, RLEnvironment):
-        return environment(**arguments)
-    return environment if isinstance(environment, RLEnvironment) else None
+        environment = called(environment, arguments)
+    elif arguments and isinstance(environment, RLEnvironment):
+        raise UsageError(
+            f"{type(environment).__name__} is made already and takes no env_kwargs: give the class."
+        )
+    if not isinstance(environment, RLEnvironment):
+        return None
+    if not hasattr(environment, "communication"):
+        raise UsageError(f"{type(environment).__name__}.__init__ must call super().__init__().")
+    return environment

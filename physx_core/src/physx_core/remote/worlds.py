@@ -17,6 +17,12 @@ from physx_core.remote.samples import SampleEnv
 GYMNASIUM = "gym/"
 """Beginning of a reference whose rest is an id of gymnasium."""
 
+_SERVED = (
+    "What can be served: an RLEnvironment or its class, an environment of Gymnasium or a function "
+    'that makes one, an environment of physx, or a reference such as "gym/CartPole-v1" or '
+    '"script.py:Class".'
+)
+
 _OWN, _OWN_MODULE = "physx/", "physx_core.gym"  # who imports the module registers the ids
 
 Served: TypeAlias = str | gymnasium.Env[Any, Any] | Callable[..., Any]
@@ -184,8 +190,8 @@ def open_worlds(
         UsageError: One environment shall be several worlds, or what was made is no environment.
         PhysxError: The reference leads nowhere: see `physx_core.plugins.resolve`.
     """
-    if num_worlds < 1:
-        raise ConfigError(f"num_worlds is {num_worlds} but must be at least 1.")
+    if type(num_worlds) is not int or num_worlds < 1:
+        raise ConfigError(f"num_worlds is {num_worlds!r} but must be a whole number, at least 1.")
     arguments = dict(env_kwargs or {})
     if isinstance(environment, gymnasium.Env):
         if num_worlds > 1 or arguments:
@@ -216,15 +222,26 @@ def _world(
         environment = resolve("environment", environment)
     if isinstance(environment, type) and issubclass(environment, Environment):
         return SampleEnv(environment, **arguments, instance_id=number + 1, instance_nb=num_worlds)
+    if not callable(environment):
+        raise UsageError(f"{environment!r} is no environment. {_SERVED}")
+    made = called(environment, arguments)
+    if isinstance(made, gymnasium.Env):
+        return made
+    raise UsageError(f"{environment!r} made {made!r:.80}, which is no gymnasium environment.")
+
+
+def called(maker: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+    """Return what a function or class makes of the arguments.
+
+    Raises:
+        ConfigError: It does not take them.
+    """
     try:
-        made = environment(**arguments)
+        return maker(**arguments)
     except TypeError as error:
         if error.__traceback__ is not None and error.__traceback__.tb_next is not None:
             raise  # not the call failed, but what was called
-        raise ConfigError(f"{environment!r} does not take these arguments: {error}.") from error
-    if isinstance(made, gymnasium.Env):
-        return made
-    raise UsageError(f"{environment!r} made {made!r}, which is no gymnasium environment.")
+        raise ConfigError(f"{maker!r} does not take these arguments: {error}.") from error
 
 
 def _of_gymnasium(name: str, arguments: dict[str, Any]) -> gymnasium.Env[Any, Any]:

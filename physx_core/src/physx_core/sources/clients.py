@@ -106,7 +106,7 @@ class ClientSource(Source):
         self._first, self._asked = self._asked, self._asked + size
         try:
             if stored is not None:
-                self._send_shares(Kind.STORED, stored, "a stored row")
+                self._send_shares(Kind.STORED, stored, "a stored row", at_once=True)
             self._grant()
             if not self._table:
                 self._group.wait(self._without_table)
@@ -123,17 +123,22 @@ class ClientSource(Source):
             raise
         return {name: array[:size] for name, array in self._out.items()}
 
-    def apply(self, prediction: Batch) -> None:
+    def apply(self, prediction: Batch, *, at_once: bool = True) -> None:
         """Give predictions to the instances: see `Source.apply`.
 
         An error that an environment raises here is raised by the next call of `batch` or `close`.
+
+        Args:
+            prediction: See `Source.apply`.
+            at_once: Whether the instances get them now; otherwise with the next call of `batch`,
+                which costs less.
 
         Raises:
             UsageError: The clients run ahead, so they are no longer at the rows of the last batch.
         """
         if self._run_ahead != 0:
             raise UsageError("apply() needs ClientSource(run_ahead=0).")
-        self._send_shares(Kind.APPLY, prediction, "the prediction")
+        self._send_shares(Kind.APPLY, prediction, "the prediction", at_once)
 
     def take_refused(self) -> Batch:
         """Return what was refused: see `Source.take_refused`."""
@@ -167,7 +172,7 @@ class ClientSource(Source):
         self._failed = self._failed or kind is not None
         super().__exit__(kind, error, trace)
 
-    def _send_shares(self, kind: Kind, batch: Batch, what: str) -> None:
+    def _send_shares(self, kind: Kind, batch: Batch, what: str, at_once: bool) -> None:
         """Send each instance those rows that are for its rows of the last batch."""
         size = self._asked - self._first
         for number in range(1, self.instance_nb + 1):
@@ -179,7 +184,11 @@ class ClientSource(Source):
             }
             count = len(range(start, size, self.instance_nb))
             if count:
-                self._group.peer(number).send(pack(kind, encode(rows, what), count))
+                peer, message = self._group.peer(number), pack(kind, encode(rows, what), count)
+                if at_once:
+                    peer.send(message)
+                else:
+                    peer.send_with_next(message)
 
     def _end_of_refused(self, number: int) -> int | None:
         """Return the step before which an instance's refused rows belong to the last batch.

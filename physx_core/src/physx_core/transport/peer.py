@@ -125,6 +125,13 @@ class Peer:
         if self._next_order is None or not is_order:
             self.send_once(message)
 
+    def send_with_next(self, message: bytes) -> None:
+        """Send a message together with the next one, so that the client wakes up once for both."""
+        if self.journal is None and self._next_order is None and not self.gone:
+            self._outgoing += message
+        else:
+            self.send(message)
+
     def send_once(self, message: bytes) -> None:
         """Send what no other client needs to know."""
         if self.gone:

@@ -41,7 +41,7 @@ class AcrobotEnv(RobotEnv):
             options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
         self.continuous = continuous
-        world = World([Robot("acrobot", collisions="none")], period=1e-2)
+        world = World([Robot("acrobot", collisions="none")], period=1.25e-2)
         motors = [Motor(joint="elbow", max_torque=TORQUE)]
         options = {"simulation_duration_max": 100.0, **options}
         simulator = Simulator(world, backend=backend, motors=motors, sensors=())

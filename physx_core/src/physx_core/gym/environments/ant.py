@@ -40,7 +40,7 @@ class AntEnv(RobotEnv):
             backend: Reference of the engine.
             options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
-        world = World([Robot("ant", fixed_base=False)], period=5e-3, ground=Ground())
+        world = World([Robot("ant", fixed_base=False)], period=6.25e-3, ground=Ground())
         options = {"simulation_duration_max": 50.0, **options}
         super().__init__(Simulator(world, backend=backend, sensors=()), 0.05, **options)
 

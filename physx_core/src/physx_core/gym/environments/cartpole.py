@@ -44,7 +44,7 @@ class CartpoleEnv(RobotEnv):
             options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
         self.continuous = continuous
-        world = World([Robot("cartpole", collisions="none")], period=5e-3)
+        world = World([Robot("cartpole", collisions="none")], period=1e-2)
         motors = [Motor(joint="slider", max_torque=FORCE)]
         options = {"simulation_duration_max": 10.0, **options}
         simulator = Simulator(world, backend=backend, motors=motors, sensors=())

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from physx_core.errors import RemoteError, RemoteProtocolError
+from physx_core.errors import ConfigError, RemoteError, RemoteProtocolError, RequestError
 from physx_core.fields import Field
 from physx_core.remote.clients.link import Link
 from physx_core.remote.framing import MAX_ANSWER
@@ -62,12 +62,14 @@ class GodotGymClient:
         """Send a request and return its answer.
 
         Args:
-            request: Any of the keys ``reset``, ``action``, ``config`` and ``observation``.
+            request: Any of the keys ``reset``, ``action``, ``config`` and ``observation``, with
+                data of JSON or arrays.
 
         Raises:
+            RequestError: The request holds what JSON has nothing for.
             RemoteError: The server reports an error, is gone, or does not answer in time.
         """
-        return self.request_bytes(json.dumps(request).encode())
+        return self.request_bytes(json.dumps(request, default=_listed).encode())
 
     def request_bytes(self, request: bytes) -> Parts:
         """Send a request that is JSON already; see `request`."""
@@ -195,8 +197,17 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
             max_answer: Longest answer in bytes that is taken.
 
         Raises:
+            ConfigError: An argument cannot be what it is for.
             RemoteError: Nothing answers, or the server does not say what was not given.
         """
+        for option, space in (("observation", observation_space), ("action", action_space)):
+            if space is not None and not isinstance(space, gymnasium.Space):
+                raise ConfigError(f"{option}_space is {space!r:.80}, which is no gymnasium.Space.")
+        if not isinstance(requested_observation, Mapping | None):
+            raise ConfigError(
+                f"requested_observation is {requested_observation!r:.80} but must be a dictionary "
+                'such as {"agent": ["position"], "world": []}.'
+            )
         self.client = GodotGymClient(
             messages, address, timeout=timeout, connect_timeout=connect_timeout,
             max_answer=max_answer,
@@ -320,6 +331,13 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
             key: [field.name for field in fields[name].message_type.fields]
             for key, name in parts.items()
         }
+
+
+def _listed(value: Any) -> Any:
+    """Return an array or number of numpy as JSON has it."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    raise RequestError(f"A request is data of JSON or arrays, and {value!r:.80} is neither.")
 
 
 def _unbounded(field: Field) -> Space:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import socket
 import time
+from typing import Any
 
-from physx_core.errors import RemoteClosedError, RemoteError, RemoteTimeoutError
+from physx_core.errors import ConfigError, RemoteClosedError, RemoteError, RemoteTimeoutError
 from physx_core.remote.framing import MAX_ANSWER, FrameReader, framed
 
 _PIECE = 1 << 16
 _RETRY = 0.1
+_LONGEST = 1e9
 
 
 class Link:
@@ -35,9 +37,15 @@ class Link:
             max_answer: Longest answer in bytes that is taken.
 
         Raises:
+            ConfigError: A time or size is none.
             RemoteTimeoutError: Nothing listens at the address in time.
             RemoteError: The address does not exist.
         """
+        if timeout is not None:
+            _check_time("timeout", timeout)
+        _check_time("connect_timeout", connect_timeout)
+        if type(max_answer) is not int or max_answer < 1:
+            raise ConfigError(f"max_answer is {max_answer!r} but must be a whole number of bytes.")
         self.name = "{}:{}".format(*address)
         self._timeout = timeout
         self._reader = FrameReader(max_answer)
@@ -116,3 +124,8 @@ class Link:
         """
         self._why_closed = self._why_closed or why
         self._socket.close()
+
+
+def _check_time(name: str, seconds: Any) -> None:
+    if type(seconds) not in (int, float) or not 0 < seconds < _LONGEST:
+        raise ConfigError(f"{name} is {seconds!r} but must be a number of s above 0.")

@@ -21,12 +21,11 @@ from physx_core.remote.protocols.physx_wire import (
     TRUNCATED,
     WORLDS,
     Leaves,
-    decoded_infos,
+    infos_of,
 )
 from physx_core.remote.spaces import build_space
-from physx_core.transport.failures import decode_error
 from physx_core.transport.frames import Kind
-from physx_core.transport.values import decode, pack_value
+from physx_core.transport.values import pack_value
 
 LOG = logging.getLogger("physx.remote")
 
@@ -94,8 +93,18 @@ class PhysxClient:
         except BaseException:
             self._link.close()
             raise
+        self._names = {REWARD, *self.observations.names, TERMINATED, TRUNCATED}
         self._number = 0
         self._left_out: set[str] = set()
+
+    @property
+    def timeout(self) -> float | None:
+        """How long an answer may take from now on, in s; None: for ever."""
+        return self._link.timeout
+
+    @timeout.setter
+    def timeout(self, seconds: float | None) -> None:
+        self._link.timeout = seconds
 
     # Worlds ---------------------------------------------------------------------------------
 
@@ -219,11 +228,13 @@ class PhysxClient:
             PhysxError: The request failed.
         """
         notes, arrays = self._answer(self._number - back)
-        if not isinstance(arrays, dict) or any(len(a) != count for a in arrays.values()):
+        if not isinstance(arrays, dict) or arrays.keys() != self._names:
+            raise self._nonsense("an answer that is not about worlds")
+        if any(np.shape(array)[:1] != (count,) for array in arrays.values()):
             raise self._nonsense("an answer that is not about the worlds that were asked for")
-        if not notes:
-            return Rows(arrays, [{}] * count)
-        infos, left_out = decoded_infos(notes, count)
+        if notes is None:
+            return Rows(arrays, [{} for _ in range(count)])
+        infos, left_out = infos_of(notes, count)
         new = set(left_out) - self._left_out
         if new:
             self._left_out |= new
@@ -243,22 +254,21 @@ class PhysxClient:
         self._number += 1
         self._link.send(pack_value(Kind.REQUEST, request, "request", self._number))
 
-    def _answer(self, number: int) -> tuple[bytes | bytearray, Any]:
-        notes: bytes | bytearray = b""
+    def _answer(self, number: int) -> tuple[Any, Any]:
+        """Return what came with an answer, None for nothing, and the answer."""
+        notes = None
         while True:
             frame = self._link.receive()
             if frame.number != number:
                 raise self._nonsense(f"an answer to request {frame.number} instead of {number}")
-            if frame.kind is Kind.ANSWER:
-                return notes, decode(frame.payload)
-            if frame.kind is Kind.REFUSAL:
-                raise decode_error(frame.payload)
+            if frame.kind in (Kind.ANSWER, Kind.REFUSAL):
+                return notes, self._link.decoded(frame)
             if frame.kind is not Kind.NOTES:
                 raise self._nonsense(f"a message {frame.kind.name}")
-            notes = frame.payload
+            notes = self._link.decoded(frame)
 
     def _nonsense(self, what: str) -> PhysxError:
-        self.close(f"it sent {what}")
+        self._link.close(f"it sent {what}")
         return RemoteProtocolError(f"{self._link.name} sent {what}. The connection is closed.")
 
 

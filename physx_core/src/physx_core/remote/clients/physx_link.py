@@ -35,6 +35,7 @@ class PhysxLink:
 
     Attributes:
         name: The service as ``host:port``.
+        timeout: How long an answer may take, in s; None: for ever.
         introduction: What the service says about itself.
     """
 
@@ -66,7 +67,7 @@ class PhysxLink:
             RemoteError: Nothing answers, or it does not take this client.
         """
         self.name = "{}:{}".format(*address)
-        self._timeout = timeout
+        self.timeout = timeout
         self._why_closed = ""
         found = checked_token(token, "token") if token is not None else given_token(token_file)
         if found is None:
@@ -128,7 +129,7 @@ class PhysxLink:
             error = decode_error(frame.payload)
             self.close(str(error))
             raise error
-        told = decode(frame.payload) if frame.kind is Kind.SETUP else None
+        told = self.decoded(frame) if frame.kind is Kind.SETUP else None
         if not isinstance(told, dict) or told.get("service") != SERVICE:
             raise RemoteError(
                 f"What listens at {self.name} serves no environments; it may be the server of a "
@@ -172,7 +173,7 @@ class PhysxLink:
         poll.register(self._socket, select.POLLOUT)
         try:
             while rest:
-                if not poll.poll(_milliseconds(self._timeout)):
+                if not poll.poll(_milliseconds(self.timeout)):
                     raise self._late()
                 rest = rest[self._socket.send(rest) :]
         except OSError as error:
@@ -189,7 +190,7 @@ class PhysxLink:
             RemoteClosedError: The connection has ended, or is closed already.
             RemoteProtocolError: It is none, or too long.
         """
-        frame = self.look(self._timeout if patience is None else patience)
+        frame = self.look(self.timeout if patience is None else patience)
         if frame is None:
             raise self._late()
         return frame
@@ -228,6 +229,22 @@ class PhysxLink:
             self.close(f"{type(error).__name__} {error}".rstrip())
             raise
 
+    def decoded(self, frame: Frame) -> Any:
+        """Return the value in a message.
+
+        Raises:
+            RemoteProtocolError: It is damaged; the connection is closed.
+            PhysxError: It is an error of the service, which is raised here.
+        """
+        try:
+            if frame.kind is not Kind.REFUSAL:
+                return decode(frame.payload)
+            refusal = decode_error(frame.payload)
+        except ConnectionRefusedByPeerError as error:
+            self.close(str(error))
+            raise RemoteProtocolError(f"{self.name}: {error}") from error
+        raise refusal
+
     def close(self, why: str = "it was closed here") -> None:
         """End the connection; calling it again does nothing.
 
@@ -238,9 +255,9 @@ class PhysxLink:
         self._socket.close()
 
     def _late(self) -> RemoteTimeoutError:
-        self.close(f"an answer took longer than {self._timeout} s")
+        self.close(f"an answer took longer than {self.timeout} s")
         return RemoteTimeoutError(
-            f"{self.name} did not answer in time ({self._timeout} s). The connection is closed; "
+            f"{self.name} did not answer in time ({self.timeout} s). The connection is closed; "
             "give a longer timeout if its steps take that long."
         )
 

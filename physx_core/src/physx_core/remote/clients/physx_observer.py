@@ -21,11 +21,10 @@ from physx_core.remote.protocols.physx_wire import (
     TERMINATED,
     TRUNCATED,
     WORLDS,
-    decoded_infos,
+    infos_of,
 )
-from physx_core.transport.failures import decode_error
 from physx_core.transport.frames import Frame, Kind
-from physx_core.transport.values import decode, pack_value
+from physx_core.transport.values import pack_value
 
 
 @dataclass(frozen=True)
@@ -122,10 +121,8 @@ class PhysxObserver:
         self._link.send(pack_value(Kind.REQUEST, {"do": "last"}, "request", self._asked))
         while True:
             frame = self._link.receive()
-            if frame.kind is Kind.ANSWER:
+            if frame.kind in (Kind.ANSWER, Kind.REFUSAL):
                 return self._seen(frame)
-            if frame.kind is Kind.REFUSAL:
-                raise decode_error(frame.payload)
             self._notes = frame if frame.kind is Kind.NOTES else None
 
     def close(self) -> None:
@@ -146,13 +143,13 @@ class PhysxObserver:
         self.close()
 
     def _seen(self, frame: Frame) -> Seen:
-        arrays: Mapping[str, Any] = decode(frame.payload)
+        arrays: Mapping[str, Any] = self._link.decoded(frame)
         notes, self._notes = self._notes, None
         try:
             worlds = arrays[WORLDS]
             infos: list[dict[str, Any]] = [{} for _ in worlds]
             if notes is not None and notes.number == frame.number:
-                infos, _ = decoded_infos(notes.payload, len(worlds))
+                infos, _ = infos_of(self._link.decoded(notes), len(worlds))
             names = self._actions.names
             has_actions = bool(names) and names[0] in arrays
             return Seen(

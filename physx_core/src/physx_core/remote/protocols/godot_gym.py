@@ -15,7 +15,7 @@ from physx_core.remote.communication import Communication
 from physx_core.remote.environment import RLEnvironment, Stepping
 from physx_core.remote.messages import Messages, fill
 from physx_core.remote.plain import plain
-from physx_core.remote.protocol import Protocol, Service
+from physx_core.remote.protocol import Protocol, Service, check_options
 from physx_core.remote.spaces import Space, from_json, leaves
 from physx_core.remote.world import RLEnvWorld
 from physx_core.remote.worlds import Worlds
@@ -51,10 +51,14 @@ class GodotGym(Protocol):
         """Return a service that listens; see `Protocol.service`.
 
         Raises:
-            UsageError: There are several worlds.
+            UsageError: There are several worlds, or the environment is served already.
             RemoteError: It cannot listen there.
         """
         environment = worlds if isinstance(worlds, RLEnvironment) else GymnasiumScene(worlds)
+        if environment.communication.is_listening:
+            raise UsageError(
+                f"This {type(environment).__name__} is or was served already: make another one."
+            )
         if self._options:
             environment.communication.close()
             environment.communication = Communication(**self._options)
@@ -73,6 +77,7 @@ class GodotGym(Protocol):
         """Return a client; the options are those of `GodotGymEnv`."""
         from physx_core.remote.clients.godot_gym import GodotGymEnv
 
+        check_options("A client of godot-gym", options, GodotGymEnv)
         return GodotGymEnv((host, port), **options)
 
 

@@ -25,7 +25,7 @@ from physx_core.errors import (
 )
 from physx_core.remote.connections import Connection
 from physx_core.remote.framing import MAX_REQUEST, FrameReader, framed
-from physx_core.remote.protocol import Protocol, Service
+from physx_core.remote.protocol import Protocol, Service, check_options
 from physx_core.remote.protocols.godot_rl_agents import Agents, Answer
 from physx_core.remote.serving import LOG, SocketService, Work
 from physx_core.remote.worlds import Worlds
@@ -110,8 +110,9 @@ class GodotRL(Protocol):
     @classmethod
     def connect(cls, host: str, port: int, **options: Any) -> gymnasium.Env[Any, Any]:
         """Wait for an application with one agent: see `GodotRLEnv`."""
-        from physx_core.remote.clients.godot_rl import GodotRLEnv
+        from physx_core.remote.clients.godot_rl import GodotRLEnv, GodotRLVectorEnv
 
+        check_options("A client of godot-rl", options, GodotRLVectorEnv)
         return GodotRLEnv((host, port or PORT), **options)
 
     @classmethod
@@ -119,6 +120,7 @@ class GodotRL(Protocol):
         """Wait for an application with any number of agents: see `GodotRLVectorEnv`."""
         from physx_core.remote.clients.godot_rl import GodotRLVectorEnv
 
+        check_options("A client of godot-rl", options, GodotRLVectorEnv)
         return GodotRLVectorEnv((host, port or PORT), **options)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Self
@@ -77,7 +77,7 @@ class Requests:
         rows = self._actions.rows(arrays, len(worlds))
         return Outcome(worlds, False, self._stepped(worlds, rows), arrays)
 
-    def _stepped(self, worlds: Sequence[int], actions: Sequence[Any]) -> Iterator[float]:
+    def _stepped(self, worlds: Sequence[int], actions: Iterable[Any]) -> Iterator[float]:
         step, put, begin = self._worlds.step, self.board.put, time.monotonic()
         with _Place("step") as place:
             for world, action in zip(worlds, actions, strict=True):
@@ -195,13 +195,14 @@ class Requests:
         if isinstance(given, np.ndarray) and given.ndim == 1 and given.dtype.kind in "iu":
             given = given.tolist()
         count = len(self._all)
-        if isinstance(given, list) and given:
-            if all(type(world) is int and 0 <= world < count for world in given):
-                if len(given) == 1 or len(set(given)) == len(given):
-                    return given
-        raise RequestError(
-            f"Worlds are a list of different numbers from 0 to {count - 1}, not {given!r:.100}."
-        )
+        is_list = isinstance(given, list) and len(given) > 0
+        if not is_list or not all(type(n) is int and 0 <= n < count for n in given):
+            is_list = False
+        if not is_list or len(set(given)) < len(given):
+            raise RequestError(
+                f"Worlds are a list of different numbers from 0 to {count - 1}, not {given!r:.100}."
+            )
+        return list(given)
 
 
 def reported(error: Exception, place: str = "") -> RequestError:

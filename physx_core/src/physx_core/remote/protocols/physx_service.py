@@ -262,7 +262,7 @@ class PhysxService(SocketService):
         self._seen += 1
         if not self._observers:
             return
-        shown = {
+        shown: dict[str, Array | np.generic] = {
             WORLDS: np.array(outcome.worlds, np.int64),
             IS_RESET: np.bool_(outcome.is_reset),
             **rows,
@@ -282,7 +282,7 @@ class PhysxService(SocketService):
         rows = board.rows(worlds.tolist())
         infos = [board.infos[world] for world in worlds]
         notes = encoded_infos(infos) if any(infos) else b""
-        shown = {
+        shown: dict[str, Array | np.generic] = {
             WORLDS: worlds.astype(np.int64),
             IS_RESET: np.bool_(False),
             COUNT: np.int64(self._seen),

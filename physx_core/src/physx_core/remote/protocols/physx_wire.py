@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from physx_core.remote.framing import Reader
 from physx_core.remote.spaces import Space, join, leaves
 from physx_core.transport.frames import HEADER, Kind
 from physx_core.transport.handshake import HANDSHAKE_LIMIT
-from physx_core.transport.values import decode, encode
+from physx_core.transport.values import encode
 
 VERSION = 1
 """Version of what is said after the handshake."""
@@ -134,7 +134,7 @@ class Leaves:
                     f"and {(count, *shape)}: {count} worlds with actions of {self.space}."
                 )
 
-    def rows(self, arrays: Mapping[str, Array], count: int) -> Sequence[Any]:
+    def rows(self, arrays: Mapping[str, Array], count: int) -> Iterable[Any]:
         """Return the value of each world."""
         if self._is_single:
             array = arrays[self.names[0]]
@@ -243,13 +243,16 @@ def _plain(info: Mapping[str, Any], left_out: set[str]) -> dict[str, Any]:
     return found
 
 
-def decoded_infos(payload: bytes | bytearray, count: int) -> tuple[list[dict[str, Any]], list[str]]:
+def infos_of(value: Any, count: int) -> tuple[list[dict[str, Any]], list[str]]:
     """Return what `encoded_infos` was given, and the names of what was left out.
+
+    Args:
+        value: What it encoded.
+        count: Of how many worlds.
 
     Raises:
         RemoteProtocolError: These are no infos of so many worlds.
     """
-    value = decode(payload)
     if isinstance(value, dict):
         infos, left_out = value.get("infos"), value.get("left_out")
         if isinstance(infos, list) and isinstance(left_out, list) and len(infos) == count:
