@@ -13,18 +13,21 @@ from physx_core.remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
 from physx_core.remote.messages import fill
 from physx_core.world import Ground, JointSettings, Robot, World
 
-PERIOD = 1 / 240
-FRAME_STEPS = 4
+FRAME = 1 / 60
 WHEELS = ("left_wheel_joint", "right_wheel_joint")
 VALUES = 16
 ACTION = [2.0, 3.0]
 
 
-def build() -> Simulation:
-    """Return the robot of examples/apple_seeker on the ground, on DART."""
+def build(frame_steps: int) -> Simulation:
+    """Return the robot of examples/apple_seeker on the ground, on DART.
+
+    Args:
+        frame_steps: How many physics steps a frame of 1/60 s has.
+    """
     joints = dict.fromkeys(WHEELS, JointSettings(mode="servo"))
     robot = Robot("wheeled_base", fixed_base=False, position=(0.0, 0.0, 0.15), joints=joints)
-    world = World([robot], ground=Ground(), period=PERIOD)
+    world = World([robot], ground=Ground(), period=FRAME / frame_steps)
     simulation: Simulation = plugins.resolve("backend", "dart").build(world)
     return simulation
 
@@ -63,8 +66,12 @@ class Room(RLEnvWorld):
 class Small(RLEnvironment):
     """The small scene."""
 
+    def __init__(self, steps: int = 1) -> None:
+        super().__init__()
+        self.frame_steps = steps
+
     def _ready(self) -> None:
-        self.simulation = build()
+        self.simulation = build(self.frame_steps)
         self.begin = self.simulation.snapshot()
         self.agent, self.world = Wheels(self.simulation), Room()
         self.messages = messages()
@@ -83,7 +90,7 @@ def messages() -> Messages:
 def main() -> None:
     """Answer each request of so many bytes with so many bytes, after one frame of physics."""
     request, answer, steps = (int(word) for word in sys.argv[1:])
-    simulation, reply = build(), bytes(answer)
+    simulation, reply = build(steps or 1), bytes(answer)
     Wheels(simulation).set_action(ACTION)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         print(listener.getsockname()[1], flush=True)

@@ -5,8 +5,8 @@
     python examples/train_ppo.py --backend pinocchio
     python examples/train_ppo.py --env physx/Acrobot-v0
 
-Stops as soon as the mean reward of 20 evaluation episodes reaches the environment's threshold, prints
-it, and exits with 1 if that does not happen within `--steps` steps.
+Stops as soon as the mean reward of 20 evaluation episodes reaches the environment's threshold,
+prints it, and exits with 1 if that does not happen within `--steps` steps.
 """
 
 import argparse
@@ -35,7 +35,7 @@ OTHERS = {"n_steps": 256, "batch_size": 512, "n_epochs": 10, "learning_rate": 3e
 
 
 def mean_reward(model, env, episodes, seed=10_000):
-    """Return the mean total reward of deterministic episodes with seeds that were not trained on."""
+    """Return the mean total reward of deterministic episodes with seeds of their own."""
     totals = []
     for episode in range(episodes):
         observation, _ = env.reset(seed=seed + episode)

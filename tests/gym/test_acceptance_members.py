@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 from physx_core.errors import EpisodeError, VisualizerError
 from physx_core.gym import Layer, RobotEnv
-from physx_core.gym.quantities import BodyPositions
+from physx_core.gym.quantities import BodyPositions, Delta, JointPositions
 from physx_core.motors import Motor
 from physx_core.sensors import Encoder
 
@@ -94,6 +94,25 @@ def test_a_seed_reaches_states_sensors_and_spaces():
     assert all(one != two for one, two in zip(first, other, strict=True))
     env._initialize_seed(5)
     assert drawn() == first
+
+
+def test_samples_repeat_where_spaces_are_made_anew():
+    class Varied(RobotEnv):
+        def _setup(self):
+            torque = float(self.np_random.uniform(1.0, 20.0))
+            self.simulator.set_options({"motors": {"slider": {"max_torque": torque}}})
+
+    def drawn(env):
+        found = []
+        for seed in (5, None, None):
+            env.reset(seed=seed)
+            found.append((env.action_space.high[0], env.action_space.sample()[0]))
+        return found
+
+    env = cart(Varied)
+    first = drawn(env)
+    assert len(set(first)) == 3
+    assert drawn(env) == drawn(cart(Varied)) == first
 
 
 def test_the_pipeline_changes_at_the_base():
@@ -257,6 +276,41 @@ def test_a_log_goes_on_where_a_snapshot_was_restored():
     variables = env.log_data["variables"]
     np.testing.assert_allclose(variables["time"], 0.005 * np.arange(9), atol=1e-12)
     assert variables["motor.command.slider"].tolist() == [5.0] * 4 + [0.0] * 5
+
+
+def test_a_snapshot_of_what_was_stopped_ends_the_recording():
+    env = cart()
+    env.eval()
+    env.reset(seed=0)
+    env.step([1.0])
+    env.stop()
+    state = env.snapshot()
+    for _ in range(2):
+        _, info = env.reset()
+        env.step([1.0])
+        env.restore(state)
+        assert not env.is_simulation_running
+        assert env.num_steps == 1
+        assert Path(info["log_path"]).exists()
+        env.restore(state)
+    env.close()
+
+
+def test_a_snapshot_without_quantities_has_no_memories():
+    env = cart()
+    env.reset(seed=0)
+    env.step([1.0])
+    state = env.snapshot()
+    moved = Delta(JointPositions(), 3)
+    env.quantities.add("moved", moved)
+    for _ in range(3):
+        env.step([20.0])
+    assert env.quantities["moved"].any()
+    env.restore(state)
+    assert not env.quantities["moved"].any()
+    before = env.robot_state.q.copy()
+    env.step([20.0])
+    np.testing.assert_allclose(env.quantities["moved"], (env.robot_state.q - before)[:1])
 
 
 @pytest.mark.slow

@@ -154,15 +154,20 @@ def test_own_constructors_are_copied_and_restored():
 def test_after_close():
     env = cart()
     env.reset()
+    env.step([9.0])
+    accelerations = env.robot_state.a.copy()
     env.close()
     env.close()
+    np.testing.assert_array_equal(env.robot_state.a, accelerations)
     with pytest.raises(EpisodeError, match="call reset"):
         env.step([0.0])
     assert env.log_data == {}
     other = pickle.loads(pickle.dumps(env))  # noqa: S301 - our own
+    np.testing.assert_array_equal(other.robot_state.a, accelerations)
     for each in (env, other):
         each.reset()
         each.step([0.0])
+        assert each.robot_state.torques == [0.0]
     never = cart()
     never.close()
     never.reset()

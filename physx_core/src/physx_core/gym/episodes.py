@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 
 from physx_core.errors import ConfigError, EpisodeError, SimulationError
-from physx_core.gym import inheritance
+from physx_core.gym import inheritance, seeding
 from physx_core.gym.actions import Actions
 from physx_core.gym.buffers import ObservationChecks, copied, copier, fill, neutral
 from physx_core.gym.periods import Periods
@@ -85,7 +85,7 @@ class Episodes(PipelineEnv):
         self._own_renderer: Any = None
         self.__quantities: Any = None
         self.__training, self.__ready, self.__why = True, False, "Call reset() before step()."
-        self.__builds, self.__count, self.__is_sound = -1, -1, False
+        self.__builds, self.__count, self.__episode, self.__is_sound = -1, -1, 0, False
         self._flat_observation: Any = None
         self.__set_periods()
         self.__initialize_spaces()
@@ -184,16 +184,9 @@ class Episodes(PipelineEnv):
             self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random()
         else:
             gymnasium.Env.reset(self, seed=seed)
-        self.__seed_sensors()
-        for i, layer in enumerate(self.derived.layers):
-            for k, space in enumerate((layer.action_space, layer.observation_space)):
-                drawn = np.random.SeedSequence(self.np_random_seed, spawn_key=(2, i, k))
-                space.seed(int(drawn.generate_state(1)[0]))
-
-    def __seed_sensors(self) -> None:
-        known = self.np_random_seed
-        entropy = known if known >= 0 else int(self.np_random.integers(2**63))
-        self.simulator.seed(np.random.SeedSequence(entropy, spawn_key=(1,)))
+        self.__episode = 0
+        self.simulator.seed(seeding.sensors_of(self.np_random_seed))
+        seeding.seed_spaces(self.derived.layers, self.np_random_seed, 0)
 
     # An episode ------------------------------------------------------------------------------
 
@@ -213,12 +206,14 @@ class Episodes(PipelineEnv):
         self._setup()
         self.__set_periods()
         simulator.prepare()
+        layers = top.layers
         if simulator.builds != self.__builds:
             self.__initialize_spaces()
-            for layer in top.layers[1:]:
+            for layer in layers[1:]:
                 layer._initialize_action_space()
                 layer._initialize_observation_space()
-        layers = top.layers
+            seeding.seed_spaces(layers, self.np_random_seed, self.__episode)
+        self.__episode += 1
         for layer in layers:
             fill(layer.action, neutral(layer.action_space))
         self.num_steps[...] = self.__count = 0
@@ -364,9 +359,7 @@ class Episodes(PipelineEnv):
             given = state.get("layers") if isinstance(state, dict) else state
             raise SimulationError(f"The snapshot is of {given}, not of {names}.")
         runs = state["own"][0]["simulator"]["running"]
-        if not runs:
-            self.stop()
-        if self.num_steps < 0 or self.derived is not top or not self.is_simulation_running:
+        if not runs or self.derived is not top or not self.is_simulation_running:
             self.run_reset(top, None, state["own"][0]["options"])
         for layer, own in zip(layers, state["own"], strict=True):
             layer._restore_own(own)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from physx_core.errors import RemoteError
 from physx_core.remote.framing import Reader
 
-MOMENT = 50e-6
+MOMENT = 100e-6
 """How long to look for the next message of a client that is quick, in s."""
 
 _QUICK = 2 * MOMENT

@@ -14,7 +14,6 @@ import numpy as np
 from physx_core.devices import as_slice, places_of
 from physx_core.errors import ConfigError, FeatureNotSupportedError
 from physx_core.interfaces.backend import Simulation, Vector
-from physx_core.interfaces.layout import Part
 from physx_core.sensors.description import (
     ContactSensor,
     EffortSensor,
