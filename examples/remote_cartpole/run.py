@@ -1,6 +1,6 @@
 """A cartpole in another process, over the protocol physx: authenticated, with seeds and snapshots.
 
-python examples/remote_cartpole/run.py
+Prints for how long a simple rule keeps the pole up: ``python examples/remote_cartpole/run.py``.
 """
 
 import os
