@@ -34,6 +34,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/backends.py
 	$(BIN)/python benchmarks/differentiable.py
 	$(BIN)/python benchmarks/gym.py
+	$(BIN)/python benchmarks/remote.py
 
 clean:
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

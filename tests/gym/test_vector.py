@@ -10,7 +10,13 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from physx_core.errors import ActionError, ConfigError, EnvironmentFailedError, UsageError
+from physx_core.errors import (
+    ActionError,
+    ConfigError,
+    EnvironmentFailedError,
+    UnknownOptionError,
+    UsageError,
+)
 from physx_core.gym.vector import ParallelVectorEnv
 
 HERE = f"{__file__}:"
@@ -162,6 +168,10 @@ def test_mistakes_and_failures_are_named(nothing_stays_behind):
         ParallelVectorEnv(HERE + "Unstorable", 2)
     with pytest.raises(ConfigError, match="at least 1"):
         ParallelVectorEnv("CartPole-v1", 0)
+    with pytest.raises(ConfigError, match="env_kwargs is 3"):
+        ParallelVectorEnv("CartPole-v1", 1, env_kwargs=3)
+    with pytest.raises(UnknownOptionError, match="NextStep"):
+        ParallelVectorEnv("CartPole-v1", 1, autoreset_mode="NextStop")
     env = ParallelVectorEnv(HERE + "Counter", 2, env_kwargs={"fails_at": 2}, processes=2)
     with contextlib.closing(env):
         env.reset()
@@ -171,6 +181,8 @@ def test_mistakes_and_failures_are_named(nothing_stays_behind):
             env.step([1, 2])
         with pytest.raises(ConfigError, match="3 seeds"):
             env.reset(seed=[1, 2, 3])
+        with pytest.raises(ConfigError, match="whole numbers"):
+            env.reset(seed="ab")
         actions = {"kind": np.zeros(2, int), "size": np.zeros((2, 1), np.float32)}
         env.step(actions)
         with pytest.raises(EnvironmentFailedError, match="the counter is stuck"):

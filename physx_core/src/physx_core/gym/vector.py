@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import operator
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from physx_core.config import EnvironmentConfig, reference_of
-from physx_core.errors import ActionError, ConfigError, UsageError
+from physx_core.errors import ActionError, ConfigError, UnknownOptionError, UsageError
 from physx_core.fields import Array, Batch, Sample
 from physx_core.gym.making import make_env
 from physx_core.gym.space_fields import SpaceFields
@@ -64,6 +65,11 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         """
         if num_envs < 1 or (processes is not None and processes < 1):
             raise ConfigError("num_envs and processes must be at least 1.")
+        if not isinstance(env_kwargs or {}, Mapping):
+            raise ConfigError(f"env_kwargs is {env_kwargs!r} but must be a dictionary.")
+        modes = {each.value: each for each in AutoresetMode}
+        if not isinstance(autoreset_mode, AutoresetMode) and autoreset_mode not in modes:
+            raise UnknownOptionError("autoreset_mode", [str(autoreset_mode)], modes)
         name, options = reference_of(env), dict(env_kwargs or {})
         mode = AutoresetMode(autoreset_mode)
         self.num_envs = num_envs
@@ -124,8 +130,13 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             ConfigError: The number of seeds, or the mask, does not fit.
         """
         count = self.num_envs
-        seeds = [seed + i for i in range(count)] if isinstance(seed, int) else seed
-        seeds = [None] * count if seeds is None else [None if s is None else int(s) for s in seeds]
+        seeds: list[int | None] = [None] * count
+        try:
+            if seed is not None:
+                each = range(seed, seed + count) if isinstance(seed, int) else seed
+                seeds = [None if one is None else operator.index(one) for one in each]
+        except TypeError as error:
+            raise ConfigError(f"The seeds are {seed!r} but must be whole numbers.") from error
         options = dict(options or {})
         mask = np.ones(count, np.bool_)
         if "reset_mask" in options:
