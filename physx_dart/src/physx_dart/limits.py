@@ -109,7 +109,7 @@ class JointConstraints:
         return np.minimum(bounds, _FASTEST_RETURN)
 
     def acting(self, bounds: Vector, velocities: Vector, reach: float) -> NDArray[np.bool_]:
-        """Return which rows act, shape (rows,): all of friction and motors, and some limits.
+        """Return which rows act, shape (rows,): motors, friction that moves, and some limits.
 
         Those of joints that are outside do always, as other joints may push them further.
 
@@ -122,6 +122,8 @@ class JointConstraints:
         limits = acts[: bounds.size].reshape(bounds.shape)
         np.less(self._signs * velocities, bounds + reach, out=limits)
         limits |= bounds > 0
+        if len(self._rubs):  # what rests without friction stays at rest, as in DART
+            acts[bounds.size : bounds.size + len(self._rubs)] = velocities[self._rubs] != 0
         return acts
 
     def aims(self, bounds: Vector) -> Vector:
