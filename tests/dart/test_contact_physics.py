@@ -5,7 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physx_core import Box, Ground, HeightField, Robot, Sphere, Stairs, World, Wrench, plugins
+from physx_core import (
+    Box,
+    Cylinder,
+    Ground,
+    HeightField,
+    Robot,
+    Sphere,
+    Stairs,
+    World,
+    Wrench,
+    plugins,
+)
 
 DETECTORS = [("dart", name, None) for name in ("dart", "fcl", "bullet", "ode")]
 ENGINES = [*DETECTORS, ("pinocchio", None, "pgs"), ("pinocchio", None, "admm")]
@@ -249,3 +260,19 @@ def test_legs_at_their_limits_carry_without_chatter(pinocchio):
             np.testing.assert_allclose(force, [0, 0, weight], atol=1e-3 * weight)
             assert np.abs(simulation.velocities()).max() < 1e-3
         assert np.abs(simulation.positions() - begin).max() < 1e-3
+
+
+def test_a_tilted_cylinder_lands_on_the_deepest_point_of_its_rim():
+    turn = np.array([0.5, -0.2, 0.7, 0.9])
+    radius, length = 0.2, 0.3
+    turn /= np.linalg.norm(turn)
+    x, y, z, w = turn
+    axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+    low = 0.5 * length * abs(axis[2]) + radius * np.hypot(axis[0], axis[1])
+    can = Cylinder(
+        name="can", radius=radius, length=length, position=(0, 0, low + 0.02), orientation=turn
+    )
+    with build(BOTH[1], can) as simulation:
+        while not len(simulation.contacts()):
+            simulation.step()
+        assert abs(simulation.positions()[2] - low) < 2e-3

@@ -139,7 +139,7 @@ def test_an_arm_holds_its_pose_and_goes_where_it_is_told(backend):
         first = env.step(np.zeros(7, np.float32))[0]
     for _ in range(5):
         held, reward, *_, info = env.step(np.zeros(7, np.float32))
-    np.testing.assert_allclose(held[:7], first[:7], atol=1e-2)
+    np.testing.assert_allclose(held[:7], first[:7], atol=1e-4)
     assert reward == pytest.approx(-np.linalg.norm(held[17:]))
     assert info["is_success"] == (np.linalg.norm(held[17:]) < 0.05)
     for _ in range(10):

@@ -150,8 +150,10 @@ def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vect
     """
     matrix = response.copy()
     matrix.flat[:: len(change) + 1] *= 1 + _REGULARIZATION
-    # -1: at its least, 1: at its most, 0: between; at first as if no row knew of the others.
     alone = change / matrix.diagonal()
+    if len(change) == 1:
+        return np.clip(alone, least, most)
+    # -1: at its least, 1: at its most, 0: between; at first as if no row knew of the others.
     side = (alone > most).astype(np.int8) - (alone < least)
     best, blocks = len(change) + 1, 3
     impulses = np.zeros(len(change))

@@ -53,7 +53,8 @@ class ImpulseSolver:
             pinocchio.ADMMSolverResult,
             _accurate(pinocchio.ADMMSolverSettings()),
         )
-        self._solvers = (gauss_seidel, admm) if name == "pgs" else (admm, gauss_seidel)
+        self._solvers = {"pgs": gauss_seidel, "admm": admm}
+        self._order = sorted(SOLVERS, key=lambda each: each != name)
         self._points: dict[float, Any] = {}
         self._limits: dict[int, Any] = {}
         self._chains: dict[int, Any] = {}
@@ -79,19 +80,19 @@ class ImpulseSolver:
         problem = ContactProblem(response, free, friction, least, most)
         best, least_error = problem.newton(np.zeros(len(free)), _NEWTON_STEPS)
         good = problem.accuracy
-        for solver in self._solvers:
+        for name in self._order:
             if least_error < good:
                 break
             good = _GOOD * problem.accuracy
-            begin = self._iterated(problem, solver)
+            begin = self.iterated(problem, name)
             if np.isfinite(begin).all():
                 found, error = problem.newton(begin, _NEWTON_STEPS)
                 if error < least_error:
                     best, least_error = found, error
         return best
 
-    def _iterated(self, problem: ContactProblem, solver: tuple[Any, Any, Any]) -> Vector:
-        """Return what one of Pinocchio's solvers finds."""
+    def iterated(self, problem: ContactProblem, name: str) -> Vector:
+        """Return what one of Pinocchio's solvers finds, ``"pgs"`` or ``"admm"``."""
         models = pinocchio.StdVec_ConstraintModel()
         for coefficient in problem.friction:
             models.append(self._point(float(coefficient)))
@@ -108,7 +109,7 @@ class ImpulseSolver:
         signs = np.ones(len(problem.free))
         signs[size:][np.isinf(least) & np.isfinite(most)] = -1.0
         delassus = pinocchio.DelassusOperatorDense(problem.matrix * np.outer(signs, signs))
-        kind, result_of, settings = solver
+        kind, result_of, settings = self._solvers[name]
         result = result_of()
         kind().solve(delassus, signs * problem.free, models, data, settings, result)
         return signs * result.retrieveConstraintImpulses()

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 
+from physx_core.closing import Closing
 from physx_core.interfaces.dynamics import Dynamics
 from physx_core.interfaces.features import FEATURES
 from physx_core.interfaces.layout import (
@@ -65,7 +64,7 @@ class Backend(ABC):
         return ()
 
 
-class Simulation(Dynamics):
+class Simulation(Dynamics, Closing):
     """One running world. A context manager; after `close` every call raises `SimulationError`.
 
     A method whose feature is not in `features` raises `FeatureNotSupportedError`.
@@ -309,19 +308,6 @@ class Simulation(Dynamics):
     @abstractmethod
     def close(self) -> None:
         """Free the world; calling it again does nothing."""
-
-    def __enter__(self) -> Self:
-        """Return the simulation itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the simulation."""
-        self.close()
 
 
 Hook = Callable[[Simulation], None]

@@ -6,9 +6,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from inspect import Parameter, isabstract, signature
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar
 
+from physx_core.closing import Closing
 from physx_core.errors import ConfigError, RemoteError, UnknownOptionError, listed, nearest
 from physx_core.plugins import resolve
 
@@ -29,7 +29,7 @@ PROTOCOLS: Mapping[str, str] = {
 _LAST_PORT = 0xFFFF
 
 
-class Service(ABC):
+class Service(Closing):
     """Environments at work for others; a context manager. Nothing happens but in calls of `poll`.
 
     Attributes:
@@ -60,19 +60,6 @@ class Service(ABC):
     @abstractmethod
     def close(self) -> None:
         """End all connections; calling it again does nothing."""
-
-    def __enter__(self) -> Self:
-        """Return the service itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the service."""
-        self.close()
 
 
 class Protocol(ABC):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from types import TracebackType
-from typing import Any, Self, TypeAlias
+from typing import Any, TypeAlias
 
 import gymnasium
 
+from physx_core.closing import Closing
 from physx_core.errors import ComponentNotFoundError, ConfigError, PhysxError, UsageError
 from physx_core.interfaces.environment import Environment
 from physx_core.plugins import resolve
@@ -31,7 +31,7 @@ Transition: TypeAlias = tuple[Any, float, bool, bool, dict[str, Any]]
 """Observation, reward, terminated, truncated, info."""
 
 
-class Worlds:
+class Worlds(Closing):
     """One or several gymnasium environments with the same spaces. A context manager.
 
     What an environment raises passes through: whoever serves the worlds reports it and lives on.
@@ -156,19 +156,6 @@ class Worlds:
         with contextlib.ExitStack() as stack:
             for environment in self.environments:
                 stack.callback(environment.close)
-
-    def __enter__(self) -> Self:
-        """Return the worlds themselves."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the environments."""
-        self.close()
 
 
 def open_worlds(

@@ -44,10 +44,13 @@ class ArmReachEnv(RobotEnv):
             options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
         fingers = JointSettings(stiffness=1e3, damping=50.0)
+        # Damping by the engine, at every physics step: the wrist is too light for the controller's.
+        pairs = zip(_ARM, DAMPING.tolist(), strict=True)
+        damped = {joint: JointSettings(damping=damping) for joint, damping in pairs}
         robot = Robot(
             "panda/panda_collision",
             collisions="none",
-            joints={"panda_finger_joint1": fingers, "panda_finger_joint2": fingers},
+            joints={"panda_finger_joint1": fingers, "panda_finger_joint2": fingers, **damped},
         )
         self.goal = np.zeros(3)
         simulator = Simulator(
@@ -106,7 +109,7 @@ class ArmReachEnv(RobotEnv):
         weight = simulation.inverse_dynamics(state.q, self._still, self._still)[:7]
         np.subtract(self._target, state.q[:7], out=command)
         command *= STIFFNESS
-        command += DAMPING * (SPEED * action - state.v[:7])
+        command += SPEED * DAMPING * action
         command += weight
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from types import TracebackType
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from physx_core.closing import Closing
 from physx_core.errors import ConfigError, RemoteError, RemoteProtocolError, RequestError
 from physx_core.fields import Field
 from physx_core.remote.clients.link import Link
@@ -23,7 +23,7 @@ Parts = dict[str, dict[str, Any] | None]
 """The parts ``agent`` and ``world`` of an answer; None for one that is not there."""
 
 
-class GodotGymClient:
+class GodotGymClient(Closing):
     """Sends requests to a server of godot-gym and waits for the answers. A context manager.
 
     Attributes:
@@ -136,19 +136,6 @@ class GodotGymClient:
     def close(self) -> None:
         """End the connection; calling it again does nothing."""
         self._link.close()
-
-    def __enter__(self) -> Self:
-        """Return the client itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the client."""
-        self.close()
 
 
 class GodotGymEnv(gymnasium.Env[Any, Any]):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 
+from physx_core.closing import Closing
 from physx_core.errors import ConfigError, PhysxError, RemoteProtocolError
 from physx_core.fields import Array
 from physx_core.remote.clients.physx_link import PhysxLink
@@ -42,7 +42,7 @@ class Rows(NamedTuple):
     infos: Sequence[dict[str, Any]]
 
 
-class PhysxClient:
+class PhysxClient(Closing):
     """Drives the worlds of a service, any of them with one request. A context manager.
 
     Attributes:
@@ -178,19 +178,6 @@ class PhysxClient:
     def close(self) -> None:
         """End the connection; calling it again does nothing."""
         self._link.close()
-
-    def __enter__(self) -> Self:
-        """Return the client itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the client."""
-        self.close()
 
     # Requests and their answers apart, for several at a time ---------------------------------
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
+from physx_core.closing import Closing
 from physx_core.errors import RemoteProtocolError
 from physx_core.fields import Array
 from physx_core.remote.clients.physx import introduced_leaves
@@ -54,7 +54,7 @@ class Seen:
     infos: list[dict[str, Any]]
 
 
-class PhysxObserver:
+class PhysxObserver(Closing):
     """Gets what the acting client's requests give. A context manager.
 
     Who does not keep up loses what came in between and goes on with the present state of all
@@ -128,19 +128,6 @@ class PhysxObserver:
     def close(self) -> None:
         """End the connection; calling it again does nothing."""
         self._link.close()
-
-    def __enter__(self) -> Self:
-        """Return the observer itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the observer."""
-        self.close()
 
     def _seen(self, frame: Frame) -> Seen:
         arrays: Mapping[str, Any] = self._link.decoded(frame)
