@@ -83,3 +83,14 @@ def test_what_is_no_number_is_an_error():
         ImpulseSolver("pgs").solve(
             np.eye(3), np.full(3, np.nan), np.ones(1), np.zeros(0), np.zeros(0)
         )
+
+
+def test_what_cannot_move_gets_no_impulse():
+    """A cart on a rail, in the ground: its contacts can only be moved along the rail."""
+    response, free = np.zeros((3, 3)), np.array([0.5, 0.0, -2.0])
+    response[0, 0] = 1.0
+    with np.errstate(all="raise"):
+        problem = ContactProblem(response, free, np.array([1.0]), np.zeros(0), np.zeros(0))
+        impulses, error = problem.newton(np.zeros(3), 10)
+    np.testing.assert_array_equal(impulses, 0.0)
+    assert error <= problem.accuracy

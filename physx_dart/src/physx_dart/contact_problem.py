@@ -10,6 +10,8 @@ from physx_core.interfaces.backend import Vector
 
 _REGULARIZATION = 1e-9
 """Share that is added to the diagonal, as DART's solver does."""
+_STUCK = 1e-14
+"""Share of the largest response below which a direction counts as one that nothing can move in."""
 _ACCURACY = 1e-11
 """Of velocities, in m/s, for free velocities of 1 m/s or less."""
 
@@ -38,9 +40,16 @@ class ContactProblem:
     def __init__(
         self, response: Vector, free: Vector, friction: Vector, least: Vector, most: Vector
     ) -> None:
-        """Keep the problem, with a diagonal that is a little larger than that of `response`."""
-        self.matrix, self.free = response.copy(), free
-        self.matrix.flat[:: len(free) + 1] *= 1 + _REGULARIZATION
+        """Keep the problem, with a diagonal that is a little larger than that of `response`.
+
+        A direction in which nothing can move, as across a rail, gets no impulse: any would do.
+        """
+        diagonal = (1 + _REGULARIZATION) * response.diagonal()
+        largest = float(diagonal.max(initial=0.0)) or 1.0
+        stuck = diagonal <= _STUCK * largest
+        self.matrix = response.copy()
+        self.matrix.flat[:: len(free) + 1] = np.where(stuck, largest, diagonal)
+        self.free = np.where(stuck, 0.0, free)
         self.friction, self.least, self.most = friction, least, most
         steps = 1 / self.matrix.diagonal()
         self._size = 3 * len(friction)
