@@ -74,10 +74,6 @@ class SpaceFields:
         """Return the value of a batch of the space, from arrays with a leading axis."""
         return self._built({path: arrays[name] for name, path, _ in self._leaves}, scalars=False)
 
-    def zeros(self) -> dict[str, Array]:
-        """Return an array of zeros for each field."""
-        return {field.name: np.zeros(field.shape or (), field.dtype) for field in self.fields}
-
     def _built(self, leaves: Mapping[Path, Any], *, scalars: bool) -> Any:
         def build(space: gymnasium.Space[Any], path: Path) -> Any:
             if isinstance(space, spaces.Dict):
