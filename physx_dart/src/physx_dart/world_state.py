@@ -177,13 +177,17 @@ class WorldState(Simulation):
         self, positions: Vector, velocities: Vector, torques: Vector
     ) -> Vector:
         """Return `forward_dynamics` of many states, shape (n, nv), by Pinocchio's algorithms."""
-        return self._batches.forward(*self._many_states(positions, velocities, torques))
+        q, others = self._many_states(positions, velocities=velocities, torques=torques)
+        return self._batches.forward(q, *others)
 
-    def forward_dynamics_derivatives_batch(
-        self, positions: Vector, velocities: Vector, torques: Vector
-    ) -> tuple[Vector, Vector]:
-        """Return accelerations of many states (n, nv), and their derivatives (3, n, nv, nv)."""
-        return self._batches.derivatives(*self._many_states(positions, velocities, torques))
+    def forward_dynamics_gradients_batch(
+        self, positions: Vector, velocities: Vector, accelerations: Vector, weights: Vector
+    ) -> Vector:
+        """Return gradients of weighted sums of `forward_dynamics`, shape (3, n, nv)."""
+        q, others = self._many_states(
+            positions, velocities=velocities, accelerations=accelerations, weights=weights
+        )
+        return self._batches.gradients(q, *others)
 
     @property
     def _batches(self) -> Batches:
@@ -256,16 +260,16 @@ class WorldState(Simulation):
                 q[base] /= length
         return q
 
-    def _many_states(
-        self, positions: Any, velocities: Any, torques: Any
-    ) -> tuple[Vector, Vector, Vector]:
+    def _many_states(self, positions: Any, **others: Any) -> tuple[Vector, list[Vector]]:
+        """Return positions (n, nq) with unit quaternions, and others (n, nv) by their names."""
         self._check_open()
         q, nv = finite_rows("positions", positions, self.layout.nq), self.layout.nv
-        v, tau = finite_rows("velocities", velocities, nv), finite_rows("torques", torques, nv)
-        if not len(q) == len(v) == len(tau):
+        rows = [finite_rows(name, values, nv) for name, values in others.items()]
+        if any(len(each) != len(q) for each in rows):
+            counts = (f"{len(each)} {name}" for name, each in zip(others, rows, strict=True))
             raise SimulationError(
-                f"There are {len(q)} positions, {len(v)} velocities and {len(tau)} torques; each "
-                "state needs one row of each."
+                f"There are {len(q)} positions, {', '.join(counts)}; each state needs one row of "
+                "each."
             )
         for place in self.layout.parts.values():
             if place.floating:
@@ -277,4 +281,4 @@ class WorldState(Simulation):
                         f"{lengths[np.argmax(np.abs(lengths - 1.0))].item():g}, not 1."
                     )
                 quaternions /= lengths
-        return q, v, tau
+        return q, rows

@@ -92,25 +92,20 @@ class _Function(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, simulation: Simulation, *rows: Tensor) -> Tensor:
         arrays = [row.detach().numpy() for row in rows]
-        accelerations, derivatives = simulation.forward_dynamics_derivatives_batch(*arrays)
-        ctx.layout, ctx.derivatives = simulation.layout, derivatives
-        ctx.save_for_backward(rows[0])
-        return torch.from_numpy(accelerations)
+        accelerations = torch.from_numpy(simulation.forward_dynamics_batch(*arrays))
+        ctx.simulation = simulation
+        ctx.save_for_backward(*rows[:2], accelerations)
+        return accelerations
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, given: Tensor) -> tuple[Tensor | None, ...]:
-        by_accelerations = given.numpy()[:, None]
-        found: list[Tensor | None] = [None]
-        for number, matrices in enumerate(ctx.derivatives):
-            if not ctx.needs_input_grad[number + 1]:
-                found.append(None)
-                continue
-            gradients = (by_accelerations @ matrices)[:, 0]
-            if number == 0:
-                gradients = _by_positions(ctx.layout, ctx.saved_tensors[0].numpy(), gradients)
-            found.append(torch.from_numpy(gradients))
-        return tuple(found)
+        arrays = [tensor.detach().numpy() for tensor in (*ctx.saved_tensors, given)]
+        gradients = list(ctx.simulation.forward_dynamics_gradients_batch(*arrays))
+        if ctx.needs_input_grad[1]:
+            gradients[0] = _by_positions(ctx.simulation.layout, arrays[0], gradients[0])
+        needed = zip(gradients, ctx.needs_input_grad[1:], strict=True)
+        return None, *(torch.from_numpy(each) if needs else None for each, needs in needed)
 
 
 def _by_positions(layout: Layout, positions: Vector, by_motion: Vector) -> Vector:

@@ -87,25 +87,33 @@ class Dynamics(ABC):
         found = [self.forward_dynamics(*state) for state in states]
         return np.array(found, np.float64).reshape(-1, self.layout.nv)
 
-    def forward_dynamics_derivatives_batch(
-        self, positions: Vector, velocities: Vector, torques: Vector
-    ) -> tuple[Vector, Vector]:
-        """Return accelerations of many states, and their derivatives.
+    def forward_dynamics_gradients_batch(
+        self, positions: Vector, velocities: Vector, accelerations: Vector, weights: Vector
+    ) -> Vector:
+        """Return gradients of weighted sums of `forward_dynamics` of many states.
+
+        Row i is of ``weights[i] @ forward_dynamics(...)`` in a state where the torques, whatever
+        they are, cause ``accelerations[i]``.
 
         Args:
             positions: Shape (n, nq); each row is a state.
             velocities: Shape (n, nv).
-            torques: Shape (n, nv).
+            accelerations: Shape (n, nv), as `forward_dynamics_batch` returned them.
+            weights: Shape (n, nv).
 
         Returns:
-            Accelerations, shape (n, nv), and the derivatives of `forward_dynamics_derivatives` by
-            positions, velocities and torques, shape (3, n, nv, nv).
+            Gradients by positions, velocities and torques, shape (3, n, nv); those by the positions
+            are by small motions, as in `forward_dynamics_derivatives`.
         """
-        states = zip(positions, velocities, torques, strict=True)
-        found = [self.forward_dynamics_derivatives(*state) for state in states]
-        shape = (len(found), 3, self.layout.nv, self.layout.nv)
-        derivatives = np.array(found, np.float64).reshape(shape).swapaxes(0, 1)
-        return self.forward_dynamics_batch(positions, velocities, torques), derivatives
+        found = np.empty((3, len(weights), self.layout.nv))
+        rows = zip(positions, velocities, accelerations, weights, strict=True)
+        for number, (q, v, a, weight) in enumerate(rows):
+            torques = self.inverse_dynamics(q, v, a)
+            for out, matrix in zip(
+                found, self.forward_dynamics_derivatives(q, v, torques), strict=True
+            ):
+                out[number] = weight @ matrix
+        return found
 
     def _lacks(self, feature: str) -> FeatureNotSupportedError:
         return FeatureNotSupportedError(self.engine or type(self).__name__, feature, self.features)
