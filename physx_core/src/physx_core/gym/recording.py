@@ -87,7 +87,8 @@ class Recording:
         env.robot_state.refresh()
         if self._action is not None:
             np.copyto(self._action[1], self._action[0])
-        self.telemetry.record(env.stepper_state.t)
+        if self._telemetry is not None:
+            self._telemetry.record(env.stepper_state.t)
 
     def data(self, env: Episodes) -> dict[str, Any]:
         """Return what was recorded, the present state included; see `Telemetry.log_data`."""

@@ -79,7 +79,8 @@ class RobotState(SharedArrays):
             return
         self._when = frame
         if self._accelerates:
-            self._a[:] = simulation.accelerations()[self._part]
+            found = simulation.accelerations()
+            self._a[:] = found if len(found) == len(self._a) else found[self._part]
         equipment.torques(self._torques)
 
     def expire(self) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import bisect
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -30,8 +31,7 @@ class Telemetry:
         self._new: set[str] = set()
         self._constants: Mapping[str, Any] = {}
         self._path: Path | None = None
-        self._now, self._time = np.zeros(1), -1.0
-        self._table = _Table((), self._now)
+        self._table = _Table(())
         self.is_recording = False
 
     def __getstate__(self) -> dict[str, Any]:
@@ -142,8 +142,7 @@ class Telemetry:
         self.end()
         self._path, self._constants = path, dict(constants or {})
         chosen = [each for each in self._variables.values() if not (training and each.is_eval_only)]
-        self._table = _Table(chosen, self._now)
-        self._new, self._time = set(), -1.0
+        self._table, self._new = _Table(chosen), set()
         self.is_recording = bool(chosen)
 
     def record(self, time: float) -> None:
@@ -155,9 +154,7 @@ class Telemetry:
             time: Time since the episode's begin, in s.
         """
         if self.is_recording:
-            again = time == self._time
-            self._time = self._now[0] = time
-            self._table.record(again)
+            self._table.record(time)
 
     def rewind(self, time: float) -> None:
         """Forget the rows of a time and later.
@@ -167,7 +164,6 @@ class Telemetry:
         """
         if self.is_recording:
             self._table.rewind(time)
-            self._time = -1.0
 
     def end(self) -> None:
         """End the episode and write its file; nothing happens if none is being recorded.
@@ -214,10 +210,10 @@ class Telemetry:
 class _Table:
     """Rows of numbers, copied as words of 8 bytes."""
 
-    def __init__(self, variables: Sequence[Variable], now: NDArray[np.float64]) -> None:
-        """Gather the memory of the variables; the first column is the time."""
+    def __init__(self, variables: Sequence[Variable]) -> None:
+        """Gather the memory of the variables."""
         self.units = {TIME: "s"}
-        self._columns = [(TIME, now.dtype)]
+        self._columns: list[tuple[str, np.dtype[Any]]] = []
         for variable in variables:
             pairs = zip(variable.arrays, variable.columns, strict=True)
             own = [(name, array.dtype) for array, names in pairs for name in names]
@@ -225,31 +221,37 @@ class _Table:
             self.units |= {name: unit for (name, _), unit in known if unit}
             self._columns += own
         arrays = [array for variable in variables for array in variable.arrays]
-        self._words = words_of([now, *arrays])
+        self._words = words_of(arrays) or [np.empty(0, WORD)]
+        self._times: list[float] = []
         self._blocks: list[NDArray[np.int64]] = []
-        self._free = 0  # rows of the last block without values
+        self._last = np.empty(0, WORD)  # row of the last time
+        self._free: Iterator[NDArray[np.int64]] = iter(())  # rows of the last block behind it
 
     @property
     def rows(self) -> int:
-        return len(self._blocks) * _BLOCK - self._free
+        return len(self._times)
 
-    def record(self, again: bool) -> None:
-        """Copy everything into the next row, or into the last one again."""
-        if again:
-            self._free += 1
-        elif not self._free:
-            self._blocks.append(np.empty((_BLOCK, len(self._columns)), WORD))
-            self._free = _BLOCK
-        np.concatenate(self._words, out=self._blocks[-1][-self._free])
-        self._free -= 1
+    def record(self, time: float) -> None:
+        """Copy everything into the next row, or into the last one if it is of the same time."""
+        times = self._times
+        if not times or times[-1] != time:
+            row = next(self._free, None)
+            if row is None:
+                self._blocks.append(np.empty((_BLOCK, len(self._columns)), WORD))
+                self._free = iter(self._blocks[-1])
+                row = next(self._free)
+            self._last = row
+            times.append(time)
+        np.concatenate(self._words, out=self._last)
 
     def rewind(self, time: float) -> None:
         """Forget the rows of a time and later."""
-        times = self.columns()[TIME]
-        kept = int(np.searchsorted(times, time))
-        blocks = -(-kept // _BLOCK)
-        del self._blocks[blocks:]
-        self._free = blocks * _BLOCK - kept
+        kept = bisect.bisect_left(self._times, time)
+        del self._times[kept:], self._blocks[-(-kept // _BLOCK) :]
+        self._free = iter(())
+        if kept:
+            begin = kept - (len(self._blocks) - 1) * _BLOCK
+            self._last, self._free = self._blocks[-1][begin - 1], iter(self._blocks[-1][begin:])
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return copies of the columns by name, each of shape (rows,)."""
@@ -260,4 +262,6 @@ class _Table:
             values[:, begin : begin + len(part)] = part.T
             begin += len(part)
         pairs = zip(self._columns, values, strict=True)
-        return {name: column.view(dtype) for (name, dtype), column in pairs}
+        return {TIME: np.array(self._times, np.float64)} | {
+            name: column.view(dtype) for (name, dtype), column in pairs
+        }

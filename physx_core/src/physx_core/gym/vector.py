@@ -18,6 +18,7 @@ from physx_core.errors import ActionError, ConfigError, UnknownOptionError, Usag
 from physx_core.fields import Array, Batch, Sample
 from physx_core.gym.making import make_env
 from physx_core.gym.space_fields import SpaceFields
+from physx_core.gym.vector_infos import joined, rows_of
 from physx_core.gym.vector_worker import COMMAND, FORBIDDEN, INFOS, VectorWorker, packed, unpacked
 from physx_core.scene import Event
 from physx_core.sources.clients import ClientSource
@@ -227,6 +228,9 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         )
 
     def _infos(self, finals: Mapping[int, Any]) -> dict[str, Any]:
+        alike = None if finals else self._notes.take_columns(self._clients, self.num_envs)
+        if alike is not None:
+            return alike
         infos: dict[str, Any] = {}
         by_env = self._notes.take("infos", self._share)
         for i in range(self.num_envs):
@@ -302,8 +306,19 @@ class _Notes:
         self._said: dict[int, dict[str, Any]] = {}
         self._left_out: set[str] = set()
 
+    def take_columns(self, clients: int, envs: int) -> dict[str, Any] | None:
+        """Return infos of all environments as `joined` does, and forget them; None: not alike."""
+        columns = [said["columns"] for _, said in sorted(self._said.items()) if "columns" in said]
+        whole = joined(columns, envs) if len(columns) == clients else None
+        if whole is not None:
+            self._said = {}
+        return whole
+
     def take(self, what: str, share: int) -> dict[int, Any]:
         """Return infos or results by environment, and forget them."""
+        for said in self._said.values():
+            if "columns" in said:
+                said["infos"] = rows_of(said["columns"])
         found = {
             (number - 1) * share + place: value
             for number, said in self._said.items()

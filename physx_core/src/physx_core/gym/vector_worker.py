@@ -13,6 +13,7 @@ from physx_core.errors import UsageError
 from physx_core.fields import Array, Field, Sample
 from physx_core.gym.making import make_env
 from physx_core.gym.space_fields import SpaceFields
+from physx_core.gym.vector_infos import columns_of
 from physx_core.interfaces.environment import Environment
 from physx_core.transport.values import decode, encode
 
@@ -172,12 +173,13 @@ class VectorWorker(Environment):
         if not any(infos):
             return
         named = [{str(name): value for name, value in info.items()} for info in infos]
-        said: dict[str, Any] = {"infos": named, "left_out": []}
+        columns = columns_of(named)
+        said: dict[str, Any] = {"columns": columns} if columns else {"infos": named}
         try:
             text = encode(said, "infos")
         except UsageError:
             left_out: set[str] = set()
-            said["infos"] = [_plain(info, left_out) for info in infos]
+            said = {"infos": [_plain(info, left_out) for info in infos]}
             said["left_out"] = sorted(left_out)
             text = encode(said, "infos")
         if _LENGTH + len(text) <= self._row[INFOS].size:
