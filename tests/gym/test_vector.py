@@ -62,6 +62,34 @@ class Counter(gymnasium.Env):
         return np.full((2, 2, 3), self.count, np.uint8)
 
 
+class Talker(Counter):
+    """Its infos change their names and types from step to step."""
+
+    TALK = (
+        lambda n: {"speed": 0.5 * n, "reward": {"alive": True, "effort": np.float32(n)}},
+        lambda n: {"speed": -0.5 * n, "reward": {"alive": False, "effort": np.float32(-n)}},
+        lambda n: {"speed": n, "reward": {"alive": True, "effort": np.float32(n)}},
+        lambda n: {"speed": n} if n % 2 else {"other": np.int16(n)},
+        lambda n: {"speed": 0.5 if n > 10 else 1, "nothing": {}},
+        lambda n: {"speed": np.arange(3.0), "word": "yes"},
+        lambda n: {"speed": 3},
+        lambda n: {"speed": n},
+        lambda n: {},
+        lambda n: {"final_obs": 3.0},
+    )
+
+    def __init__(self):
+        super().__init__(length=99)
+
+    def reset(self, *, seed=None, options=None):
+        self.start = seed
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        found = self.TALK[self.count % len(self.TALK)](self.start + self.count)
+        return *super().step(action)[:4], found
+
+
 class Unstorable(Counter):
     def __init__(self):
         super().__init__()
@@ -107,6 +135,19 @@ def test_it_gives_what_gymnasium_gives(mode, nothing_stays_behind):
             actions = theirs.action_space.sample()
             same(ours.step(actions), theirs.step(actions))
         same(ours.reset(seed=3), theirs.reset(seed=3))
+
+
+@pytest.mark.parametrize("count", [4, 5])
+def test_infos_whose_layout_changes(count, nothing_stays_behind):
+    ours, theirs = (
+        ParallelVectorEnv(HERE + "Talker", count, processes=2),
+        SyncVectorEnv([Talker] * count),
+    )
+    actions = {"kind": np.zeros(count, int), "size": np.zeros((count, 1), np.float32)}
+    with contextlib.closing(ours):
+        same(ours.reset(seed=8), theirs.reset(seed=8))
+        for _ in range(2 * len(Talker.TALK)):
+            same(ours.step(actions)[4], theirs.step(actions)[4])
 
 
 def test_nested_spaces_infos_calls_and_attributes(caplog, nothing_stays_behind):

@@ -18,7 +18,7 @@ from physx_core.errors import ActionError, ConfigError, UnknownOptionError, Usag
 from physx_core.fields import Array, Batch, Sample
 from physx_core.gym.making import make_env
 from physx_core.gym.space_fields import SpaceFields
-from physx_core.gym.vector_infos import joined, rows_of
+from physx_core.gym.vector_infos import joined, rows_of, with_numbers
 from physx_core.gym.vector_worker import COMMAND, FORBIDDEN, INFOS, VectorWorker, packed, unpacked
 from physx_core.scene import Event
 from physx_core.sources.clients import ClientSource
@@ -213,7 +213,9 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         rows = self._open().batch(self._clients)
         for number, row in enumerate(rows[INFOS], 1):
             said = unpacked(row)
-            if said is not None:
+            if isinstance(said, bytes):
+                self._notes.save_numbers(number, said)
+            elif said is not None:
                 self._notes.save_parameters(number, said)
         return {
             name: array.reshape(-1, *array.shape[2:])[: self.num_envs]
@@ -304,6 +306,7 @@ class _Notes:
 
     def __init__(self) -> None:
         self._said: dict[int, dict[str, Any]] = {}
+        self._columns: dict[int, dict[str, Any]] = {}
         self._left_out: set[str] = set()
 
     def take_columns(self, clients: int, envs: int) -> dict[str, Any] | None:
@@ -330,6 +333,8 @@ class _Notes:
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
         """Keep what a client says before its row."""
         self._said[instance_id] = values
+        if "columns" in values:
+            self._columns[instance_id] = values["columns"]
         new = set(values.get("left_out", [])) - self._left_out
         if new:
             self._left_out |= new
@@ -338,6 +343,10 @@ class _Notes:
                 "arrays: %s.",
                 ", ".join(sorted(new)),
             )
+
+    def save_numbers(self, instance_id: int, numbers: bytes) -> None:
+        """Keep infos of a client that have the layout of its last ones."""
+        self._said[instance_id] = {"columns": with_numbers(self._columns[instance_id], numbers)}
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
         """Return nothing: workers do not ask."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,49 @@ def _column(values: list[Any]) -> Any:
         return np.array(values, type(values[0]))
     except OverflowError:
         return None
+
+
+def numbers_of(columns: Mapping[str, Any]) -> bytes:
+    """Return the numbers of columns alone, for one who knows columns of the same layout."""
+    return b"".join(array.tobytes() for array in _arrays(columns))
+
+
+def layout_of(columns: Mapping[str, Any]) -> list[Any]:
+    """Return what makes columns of the same names and types equal, whatever their numbers are."""
+    return [
+        (name, layout_of(column) if isinstance(column, dict) else column.dtype)
+        for name, column in columns.items()
+    ]
+
+
+def with_numbers(columns: Mapping[str, Any], numbers: bytes) -> dict[str, Any]:
+    """Return columns with the layout of others and with the numbers of `numbers_of`.
+
+    Raises:
+        ValueError: There are more or fewer numbers.
+    """
+    if sum(array.nbytes for array in _arrays(columns)) != len(numbers):
+        raise ValueError(f"{len(numbers)} bytes are not the numbers of {list(columns)}")
+    return _filled(columns, numbers, [0])
+
+
+def _filled(columns: Mapping[str, Any], numbers: bytes, read: list[int]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, column in columns.items():
+        if isinstance(column, dict):
+            found[name] = _filled(column, numbers, read)
+        else:
+            found[name] = np.frombuffer(numbers, column.dtype, column.size, read[0])
+            read[0] += column.nbytes
+    return found
+
+
+def _arrays(columns: Mapping[str, Any]) -> Iterator[Any]:
+    for column in columns.values():
+        if isinstance(column, dict):
+            yield from _arrays(column)
+        else:
+            yield column
 
 
 def rows_of(columns: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -13,7 +13,7 @@ from physx_core.errors import UsageError
 from physx_core.fields import Array, Field, Sample
 from physx_core.gym.making import make_env
 from physx_core.gym.space_fields import SpaceFields
-from physx_core.gym.vector_infos import columns_of
+from physx_core.gym.vector_infos import columns_of, layout_of, numbers_of
 from physx_core.interfaces.environment import Environment
 from physx_core.transport.values import decode, encode
 
@@ -64,6 +64,7 @@ class VectorWorker(Environment):
         self._mode = AutoresetMode(autoreset)
         self._envs: list[gymnasium.Env[Any, Any]] = []
         self._command: Mapping[str, Any] | None = None
+        self._layout: list[Any] = []  # of the infos that were sent last
 
     def create(self) -> None:
         """Make the environments."""
@@ -174,6 +175,8 @@ class VectorWorker(Environment):
             return
         named = [{str(name): value for name, value in info.items()} for info in infos]
         columns = columns_of(named)
+        if columns is not None and self._tell_numbers(columns):
+            return
         said: dict[str, Any] = {"columns": columns} if columns else {"infos": named}
         try:
             text = encode(said, "infos")
@@ -186,6 +189,15 @@ class VectorWorker(Environment):
             _put_text(self._row[INFOS], text)
         else:
             self.save_parameters(**said)
+
+    def _tell_numbers(self, columns: dict[str, Any]) -> bool:
+        """Send the numbers alone, if they are of the layout that was sent last."""
+        known, self._layout = self._layout, layout_of(columns)
+        numbers = numbers_of(columns)
+        if known != self._layout or _LENGTH + len(numbers) > self._row[INFOS].size:
+            return False
+        _put_text(self._row[INFOS], numbers, are_numbers=True)
+        return True
 
 
 def _called(
@@ -222,13 +234,18 @@ def packed(name: str, arguments: Sequence[Any]) -> Array:
     return rows
 
 
-def _put_text(row: Array, text: bytes) -> None:
-    """Write bytes to the begin of a row, after their length."""
-    whole = len(text).to_bytes(_LENGTH, "little") + text
+def _put_text(row: Array, text: bytes, *, are_numbers: bool = False) -> None:
+    """Write bytes to the begin of a row, after their length, which is negative for numbers."""
+    length = -len(text) if are_numbers else len(text)
+    whole = length.to_bytes(_LENGTH, "little", signed=True) + text
     row[: len(whole)] = np.frombuffer(whole, np.uint8)
 
 
 def unpacked(row: Array) -> Any:
-    """Return the command of one client, or what a client says in a row; None: nothing."""
-    length = int.from_bytes(row[:_LENGTH].tobytes(), "little")
-    return decode(row[_LENGTH : _LENGTH + length].tobytes()) if length else None
+    """Return the command of one client, or what a client says in a row; None: nothing.
+
+    Numbers of `numbers_of` are returned as they are, as bytes.
+    """
+    length = int.from_bytes(row[:_LENGTH].tobytes(), "little", signed=True)
+    text = row[_LENGTH : _LENGTH + abs(length)].tobytes()
+    return decode(text) if length > 0 else text if length < 0 else None

@@ -24,6 +24,8 @@ def main() -> int:
     faulthandler.register(signal.SIGTERM, all_threads=False, chain=True)  # a hang, where
     token = os.environ.pop(TOKEN_VARIABLE, "")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server decides when a run ends
+    if hasattr(os, "SCHED_BATCH"):  # a client that is woken lets the server wake the others first
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     try:
         return run_client(options.connect, token, options.instance)
     except PhysxError as error:
