@@ -7,6 +7,11 @@ import uuid
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# How long an example takes says nothing on a busy machine.
+settings.register_profile("physx", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("physx")
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, and every process that
 # they start inherits that; some tests press it.
@@ -19,7 +24,7 @@ def nothing_stays_behind(monkeypatch):
     mark = uuid.uuid4().hex
     monkeypatch.setenv("PHYSX_TEST_MARK", mark)
     yield
-    deadline = time.monotonic() + 20  # a process that is killed takes a moment to go
+    deadline = time.monotonic() + 60  # a process that is killed takes a moment to go
     while (left := marked(mark.encode())) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not left

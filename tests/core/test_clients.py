@@ -88,7 +88,7 @@ def test_clients_make_no_more_than_they_may(clients, services):
         settings = {"num_clients": 2, "visualizer": "any"}
         with clients("Drawing", run_ahead=ahead, total=total, **settings) as source:
             source.batch(6)
-            deadline = time.monotonic() + 30
+            deadline = time.monotonic() + 60
             while len(steps()) < most and time.monotonic() < deadline:
                 source._group.server.pump(0.01)
             time.sleep(0.1)  # for what they must not make

@@ -71,7 +71,7 @@ def lied_to(clients, monkeypatch, port, folder):
                     frame = reader.read(connection)
                     granted = frame.number if frame.kind is Kind.CREDIT else granted
                 connection.sendall(message)
-            until.wait(20)
+            until.wait(60)
             while connection.recv(1 << 16):
                 pass
 
@@ -104,10 +104,10 @@ def lied_to(clients, monkeypatch, port, folder):
 
 def connected(port):
     """Connect to a server that will listen soon."""
-    until = time.monotonic() + 10
+    until = time.monotonic() + 60
     while True:
         try:
-            return socket.create_connection(("127.0.0.1", port), timeout=10)
+            return socket.create_connection(("127.0.0.1", port), timeout=60)
         except OSError:
             assert time.monotonic() < until
             time.sleep(0.01)

@@ -83,14 +83,15 @@ def read_beside_a_writer(tmp_path, seconds):
     try:
         wait_for(lambda: (tmp_path / "told").stat().st_size)
         with Dataset.open(folder) as beside:
-            deadline, opened, seen = time.monotonic() + seconds, 0, 0
-            while time.monotonic() < deadline:
+            begin, opened, seen, enough = time.monotonic(), 0, 0, False
+            while (spent := time.monotonic() - begin) < seconds or not (enough or spent > 60):
                 with Dataset.open(folder) as dataset:
                     seen = check_new_rows(dataset, seen)
                 beside.refresh()
                 assert beside.num_samples("training") >= seen
                 check_new_rows(beside, seen)
                 opened += 1 + open_in_h5py(folder)
+                enough = opened > 10 and beside.describe()[0]["partitions"] > 4
         assert process.poll() is None
     finally:
         process.kill()
@@ -102,7 +103,7 @@ def read_beside_a_writer(tmp_path, seconds):
 
 
 def wait_for(condition):
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.01)

@@ -175,7 +175,7 @@ def test_after_kill_9_all_fields_have_the_same_rows_and_more_can_be_added():
         time.sleep(0.01)
     time.sleep(0.1)
     process.send_signal(signal.SIGKILL)
-    process.wait(10)
+    process.wait(60)
     before = rows_of("sessions/run")
     DataGeneration(
         SPRING, session_name="run", new_session=False, batch_nb=1, batch_size=5

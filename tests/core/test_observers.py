@@ -78,12 +78,12 @@ def test_a_killed_run_keeps_its_numbers(tmp_path):
         "         epoch_nb=10**6, batch_nb=10, batch_size=10).execute()\n"
     )
     process = subprocess.Popen([sys.executable, str(script)], stderr=subprocess.DEVNULL)
-    session, deadline = tmp_path / "sessions" / "training", time.monotonic() + 30
+    session, deadline = tmp_path / "sessions" / "training", time.monotonic() + 60
     path = session / "stats" / "scalars.csv"
     while not (path.exists() and path.stat().st_size > 20_000) and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
-    process.wait(timeout=20)
+    process.wait(timeout=60)
     epochs = read_scalars(session)["epoch", "loss/training"]
     assert list(epochs) == list(range(1, len(epochs) + 1)) and len(epochs) > 5
     batches = read_scalars(session)["batch", "loss/batch"]

@@ -59,7 +59,7 @@ def test_rounding_errors_count_as_constant():
     assert statistics_of(rows).normalization().std == 1
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     first=st.lists(st.floats(-1e6, 1e6), max_size=20),
     second=st.lists(st.floats(-1e6, 1e6), max_size=20),

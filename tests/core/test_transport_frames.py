@@ -24,7 +24,7 @@ from physx_core.transport.link import Link
 # Frames -----------------------------------------------------------------------------------------
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     st.lists(st.tuples(st.sampled_from(Kind), st.binary(max_size=300), st.integers(0, 2**64 - 1))),
     st.lists(st.integers(1, 200), min_size=1),
@@ -63,7 +63,7 @@ def test_large_frames_arrive_between_small_ones():
         assert not reader.may_have_more
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.lists(st.sampled_from([0, 5, 16_000, 16_384, 16_385, 70_000, 200_000, 2_500_000])),
     st.sampled_from([7, 1000, 16_000, 100_000, 1_000_000]),

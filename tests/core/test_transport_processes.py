@@ -104,7 +104,7 @@ def test_clients_started_by_hand_join_with_the_token(by_hand, port):
     with hands(2, port) as processes:
         with by_hand(num_clients=2) as source:
             batch = source.batch(6)
-        assert [process.wait(10) for process in processes] == [0, 0]
+        assert [process.wait(60) for process in processes] == [0, 0]
     assert list(batch["env_id"]) == [1, 2] * 3
     assert list(batch["step"]) == [0, 0, 1, 1, 2, 2]
 
@@ -185,9 +185,9 @@ def test_ctrl_c_ends_server_and_clients(process_ids):
     clients = process_ids(server.pid).values()
     assert len(clients) == 2
     os.killpg(server.pid, signal.SIGINT)
-    error = server.communicate(timeout=10)[1].decode()
+    error = server.communicate(timeout=60)[1].decode()
     assert error.strip().endswith("KeyboardInterrupt")
-    assert gone_after(clients, 0.1)
+    assert gone_after(clients, 5.0)
 
 
 @pytest.mark.parametrize("name", ["Walk", "Trouble"])

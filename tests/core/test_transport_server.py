@@ -51,7 +51,7 @@ def test_strangers_do_not_disturb_a_run(clients, port):
         thread.start()
     try:
         with clients(num_clients=2, port=port) as source:
-            deadline = time.monotonic() + 30
+            deadline = time.monotonic() + 60
             row = 0
             while len(talked) <= 8 and time.monotonic() < deadline:
                 assert list(source.batch(2)["x"][:, 1]) == [row, row]
@@ -66,7 +66,7 @@ def test_strangers_do_not_disturb_a_run(clients, port):
 def test_a_silent_stranger_is_dropped_after_a_while(clients, port, monkeypatch):
     monkeypatch.setattr("physx_core.transport.server._HANDSHAKE_TIME", 0.2)
     with clients(port=port) as source, socket.create_connection(("127.0.0.1", port)) as stranger:
-        stranger.settimeout(2)
+        stranger.settimeout(30)
         stranger.sendall(b"\0")
         for _ in range(30):
             source.batch(1)
@@ -78,7 +78,7 @@ def test_many_silent_strangers_do_not_keep_clients_out(clients, port):
     with clients(port=port, num_clients=1) as source:
         crowd = []
         for _ in range(200):
-            crowd.append(socket.create_connection(("127.0.0.1", port), timeout=2))
+            crowd.append(socket.create_connection(("127.0.0.1", port), timeout=30))
             source.batch(1)
             time.sleep(0.011)
         dropped = 0

@@ -83,13 +83,13 @@ def same(a, b):
     return a == b
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(VALUES)
 def test_values_come_back_with_type_and_bits(value):
     assert same(decode(encode(value)), value)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(FLAT, st.sampled_from(Kind), st.integers(0, 2**64 - 1))
 def test_flat_dictionaries_come_back_however_often_they_travel(value, kind, number):
     for _ in range(2):
@@ -199,13 +199,13 @@ def refused_or_taken(data):
         decode(data)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.binary(max_size=60) | damaged())
 def test_damaged_bytes_never_raise_anything_else(data):
     refused_or_taken(data)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(TREES, st.binary(max_size=20))
 def test_trees_of_any_tags_never_raise_anything_else(tree, data):
     text = json.dumps(tree, separators=(",", ":")).encode()

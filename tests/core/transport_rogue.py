@@ -189,7 +189,7 @@ def attack(address, instance, rng, most):
     """Send frames in one connection; return how many were sent, at most `most`."""
     frames = (Insider(rng, instance).frames() if instance else stranger(rng))[:most]
     sent = 0
-    with socket.create_connection(address, timeout=20) as connection:
+    with socket.create_connection(address, timeout=60) as connection:
         # No connection of the many is kept by the operating system once it is closed.
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         reader = introduce(connection, os.environ["PHYSX_TOKEN"], instance) if instance else None

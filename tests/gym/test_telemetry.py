@@ -89,7 +89,7 @@ def test_variables_are_read_when_a_row_is_recorded():
     assert found["counts.0"].dtype == np.int64
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.data())
 def test_any_arrangement_of_memory_is_recorded_in_order(data):
     base = np.arange(120.0).reshape(4, 5, 6)

@@ -86,7 +86,7 @@ def test_kill_9_loses_no_committed_row(where, script, run, tmp_path, processes):
             with h5py.File(files[0]) as partition:
                 committed = int(partition["rows"][()])
     process.send_signal(signal.SIGKILL)
-    process.wait(10)
+    process.wait(60)
     rows = rows_of(tmp_path / "sessions/run")
     assert len(rows["x"]) >= committed >= 3000
     first = rows["env_id"] == 1
@@ -94,7 +94,7 @@ def test_kill_9_loses_no_committed_row(where, script, run, tmp_path, processes):
     assert np.array_equal(x[1:], (x + dx)[:-1])
     text = run("-m", "physx_core", "info", tmp_path / "sessions/run").stdout
     assert f"{len(rows['x']):,}" in text
-    deadline = time.monotonic() + 5
+    deadline = time.monotonic() + 60
     while processes(f"PHYSX_TEST_MARK={tmp_path}") and time.monotonic() < deadline:
         time.sleep(0.1)
     assert processes(f"PHYSX_TEST_MARK={tmp_path}") == []

@@ -65,7 +65,7 @@ def test_agent_and_world_are_given_and_the_server_started_in_ready(scene_class, 
     peer = peer_class(environment.communication.address)
     assert peer.ask(LIVES) == ALIVE
     environment.close()
-    thread.join(30)
+    thread.join(60)
     assert not thread.is_alive()
     peer.leave()
 

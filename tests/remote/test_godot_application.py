@@ -188,4 +188,4 @@ def test_agents_of_a_godot_application_that_comes_to_its_trainer(start):
         assert np.allclose(seen[:, :2], place[:, np.newaxis] * np.sign(direction), atol=1e-4)
     assert vector.call("mass") == (1.0, 1.0)
     vector.close()
-    assert process.wait(30) == 0
+    assert process.wait(60) == 0

@@ -84,7 +84,7 @@ class Stub:
             for answer in self.answers:
                 connection.recv(65536)
                 if answer is None:
-                    self.wait.wait(30)
+                    self.wait.wait(60)
                 else:
                     connection.sendall(answer)
 
@@ -93,7 +93,7 @@ class Stub:
 
     def __exit__(self, *error):
         self.wait.set()
-        self.thread.join(30)
+        self.thread.join(60)
         self.listener.close()
 
 

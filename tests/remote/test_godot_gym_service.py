@@ -128,7 +128,7 @@ def test_an_environment_that_listens_by_itself(scene_class, peer_class):
         with pytest.raises(UsageError, match="listens already"):
             environment.communication.start_server(0)
         environment.close()
-        thread.join(30)
+        thread.join(60)
         assert peer.answer() is None
     with pytest.raises(UsageError, match="start_server"):
         scene_class().run()

@@ -42,7 +42,7 @@ def test_a_live_viewer_gets_everything(opened, receiver):
     visualizer = opened(mode="connect", address=viewer.address)
     run_steps(visualizer, 350)
     visualizer.close()
-    deadline = time.monotonic() + 30  # the receiver writes its file behind what it has taken
+    deadline = time.monotonic() + 60  # the receiver writes its file behind what it has taken
     while time.monotonic() < deadline and not (path.exists() and len(steps_of(path)) == 350):
         time.sleep(0.05)
     assert steps_of(path) == steps_of(visualizer.file) == list(range(350))
@@ -141,7 +141,7 @@ ENDLESS = """
 def test_a_killed_run_leaves_a_readable_file(python, tmp_path):
     path = tmp_path / "run.rrd"
     with subprocess.Popen([python, "-c", textwrap.dedent(ENDLESS), str(tmp_path)]) as run:
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 60
         while not path.exists() or len(steps_of(path)) < 500:
             assert run.poll() is None and time.monotonic() < deadline
             time.sleep(0.2)

@@ -89,7 +89,7 @@ def test_a_viewer_of_its_own_outlives_the_run(monkeypatch, opened):
         visualizer.scalars({"loss/training": 1.0}, 0, "batch")
         visualizer.close()
         client = ViewerClient.connect(f"rerun+http://{visualizer.viewer.address}/proxy")
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 60
         while {view.name for view in client.get_state().views} != {"environment", "loss"}:
             assert time.monotonic() < deadline, client.get_state()
             time.sleep(0.1)

@@ -44,7 +44,7 @@ class Trainer:
 
     def take(self, size):
         taken = b""
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 60
         while len(taken) < size:
             if not select.select([self.socket], [], [], 0)[0]:
                 assert time.monotonic() < deadline, "no answer"
@@ -62,7 +62,7 @@ class Trainer:
         return not select.select([self.socket], [], [], 0)[0]
 
     def service_ends(self):
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 60
         while self.service.poll(0.05):
             if time.monotonic() > deadline:
                 return False

@@ -45,7 +45,7 @@ def beside():
 
     yield run
     for thread in threads:
-        thread.join(30)
+        thread.join(60)
         assert not thread.is_alive()
 
 
@@ -158,7 +158,7 @@ STEP = {"type": "step", "obs": [{"obs": [1]}] * 2, "reward": [1, 2], "done": [Tr
 
 def application(port, *answers):
     """Answer a trainer with what is given, and leave."""
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 60
     while True:
         try:
             trainer = socket.create_connection(("127.0.0.1", port))
