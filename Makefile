@@ -30,6 +30,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/training.py
 	$(BIN)/python benchmarks/prediction.py
 	$(BIN)/python benchmarks/transport.py
+	$(BIN)/python benchmarks/faults.py
 	$(BIN)/python benchmarks/dataset.py
 	$(BIN)/python benchmarks/backends.py
 	$(BIN)/python benchmarks/differentiable.py

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cores import on_core, two_cores
 from measure import claim, finish, rates, report
 from remote_servers import ACTION, messages
 
@@ -61,20 +62,6 @@ def process(*words: str, core: int | None = None) -> Iterator[str]:
 def served(*words: str, core: int | None = None) -> contextlib.AbstractContextManager[str]:
     """Run ``physx serve`` in another process; yield the line that says where it listens."""
     return process("-m", "physx_core.cli", "serve", *words, "--port", "0", core=core)
-
-
-@contextlib.contextmanager
-def on_core(core: int | None) -> Iterator[None]:
-    """Have this process use one processor core only; None: any."""
-    if core is None:
-        yield
-        return
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {core})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
 
 
 def place_of(line: str) -> tuple[str, int]:
@@ -169,8 +156,7 @@ def all_godot_gym() -> bool:
     there a round trip takes 16 us, about as long as Python takes to read one request of JSON, fill
     one message and read it. With few physics steps a frame that is most of what is measured.
     """
-    cores = sorted(os.sched_getaffinity(0))[:2] if hasattr(os, "sched_getaffinity") else []
-    cores = cores if len(cores) > 1 else []
+    cores = two_cores()
     for steps, where in ((FEW_STEPS, cores), (STEPS_OF_1_MS, [])):
         ratio = godot_gym(steps, where)
         print(f"  {ratio:.2f} times as long as raw and physics there, without a target\n")

@@ -29,6 +29,12 @@ class UNet(TorchNetwork):
     convolves. Convolutions have kernels of 3 points, and are followed by a normalization and an
     activation.
 
+    Normalization ``"none"``: the layers begin with weights that keep the size of what goes through
+    them (He et al., 2015). ``"batch"``: by the mean and deviation of the batch, and of all batches
+    for predictions: it learns quickly at first, but batches differ, which limits how exact fields
+    become, the more the smaller they are. ``"group"``: by those of each sample alone, in up to 8
+    groups of channels.
+
     A sample's field has the shape ``(*grid, channels)``, ``grid`` where there is one channel, or
     ``(points, channels)`` with the points of the grid in row-major order. Several `net_fields` are
     put behind one another as channels; the output's channels are dealt out to `pred_fields`.
@@ -68,8 +74,7 @@ class UNet(TorchNetwork):
             nb_dims: 2 or 3 axes of the grid.
             nb_input_channels: Values at each point that the network reads, of all fields.
             nb_output_channels: Values at each point that it predicts, of all fields.
-            nb_first_layer_channels: Channels of the finest level; each further one has twice as
-                many.
+            nb_first_layer_channels: Channels of the finest level; each further one has twice that.
             nb_steps: How often the grid is halved.
             two_sublayers: Two convolutions in each level, instead of one.
             border_mode: ``"valid"``: convolutions take away the outermost points, so that no value
@@ -78,11 +83,7 @@ class UNet(TorchNetwork):
             skip_merge: Whether what was kept on the way down is left out on the way up: an
                 encoder and decoder of convolutions.
             data_scale: What targets are multiplied by for the loss, and predictions divided by.
-            normalization: ``"none"``: the layers begin with weights that keep the size of what goes
-                through them (He et al., 2015). ``"batch"``: by the mean and deviation of the batch,
-                and of all batches for predictions: it learns quickly at first, but batches differ,
-                which limits how exact fields become, the more the smaller they are. ``"group"``: by
-                those of each sample alone, in up to 8 groups of channels.
+            normalization: ``"none"``, ``"batch"`` or ``"group"``, as said above.
             activation: Class, or name in `torch.nn` such as ``"SiLU"``.
             positions: Whether the network also reads where each point is, as one more channel for
                 each axis from -1 to 1: for bodies that are held at some place.
@@ -93,35 +94,20 @@ class UNet(TorchNetwork):
             ConfigError: An option is not what the network takes.
         """
         super().__init__(**fields)
-        numbers = {
-            "nb_input_channels": nb_input_channels,
-            "nb_output_channels": nb_output_channels,
-            "nb_first_layer_channels": nb_first_layer_channels,
-            "nb_steps": nb_steps,
-        }
-        for name, value in numbers.items():
-            _check(name, value, _positive(value), "a positive integer")
-        _check("nb_dims", nb_dims, nb_dims in (2, 3), "2 or 3")
-        _check(
-            "normalization",
-            normalization,
-            normalization in NORMALIZATIONS,
-            '"none", "batch" or "group"',
-        )
-        _check("border_mode", border_mode, border_mode in ("valid", "same"), '"valid" or "same"')
-        _check("data_scale", data_scale, data_scale > 0, "positive")
+        channels = (nb_input_channels, nb_output_channels)
+        _check_numbers(*channels, nb_first_layer_channels, nb_steps)
+        _check_options(nb_dims, normalization, border_mode, data_scale)
         _check("input_size", input_size, _is_size(input_size, nb_dims), f"{nb_dims} integers")
         self.data_scale = float(data_scale)
         self.size: tuple[int, ...] = ()
         self.borders: list[Border] = []
         self.layouts: dict[str, Layout] = {}
-        self._channels = (nb_input_channels, nb_output_channels)
+        self._channels = channels
         self._given_size = None if input_size is None else tuple(input_size)
         self._dims, self._steps, self._same = nb_dims, nb_steps, border_mode == "same"
         self._sublayers = 2 if two_sublayers else 1
-        self._merges = not skip_merge
+        self._merges, self._positions = not skip_merge, positions
         self._normalization, self._activation = normalization, activation
-        self._positions = positions
         self._make_layers(nb_first_layer_channels)
 
     def _make_layers(self, first: int) -> None:
@@ -267,6 +253,21 @@ def _is_size(given: Any, nb_dims: int) -> bool:
     if given is None:
         return True
     return isinstance(given, (list, tuple)) and len(given) == nb_dims and all(map(_positive, given))
+
+
+def _check_numbers(inputs: Any, outputs: Any, first_layer: Any, steps: Any) -> None:
+    channels = {"input": inputs, "output": outputs, "first_layer": first_layer}
+    numbers = {f"nb_{name}_channels": value for name, value in channels.items()}
+    for name, value in {**numbers, "nb_steps": steps}.items():
+        _check(name, value, _positive(value), "a positive integer")
+
+
+def _check_options(nb_dims: Any, normalization: Any, border_mode: Any, data_scale: Any) -> None:
+    _check("nb_dims", nb_dims, nb_dims in (2, 3), "2 or 3")
+    known = normalization in NORMALIZATIONS
+    _check("normalization", normalization, known, '"none", "batch" or "group"')
+    _check("border_mode", border_mode, border_mode in ("valid", "same"), '"valid" or "same"')
+    _check("data_scale", data_scale, data_scale > 0, "positive")
 
 
 def _check(option: str, value: Any, right: bool, wanted: str) -> None:

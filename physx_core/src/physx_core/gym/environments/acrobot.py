@@ -6,22 +6,17 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 
 from physx_core.gym.environments import limits
+from physx_core.gym.environments.one_motor import OneMotorEnv
 from physx_core.gym.layer import Info
-from physx_core.gym.robot_env import RobotEnv
-from physx_core.gym.simulator import Simulator
 from physx_core.interfaces.backend import Vector
-from physx_core.motors import Motor
-from physx_core.world import Robot, World
 
 TORQUE = 1.0
 HEIGHT = 1.0
-_KEYS = {"Left": 0, "Right": 2}
 
 
-class AcrobotEnv(RobotEnv):
+class AcrobotEnv(OneMotorEnv):
     """Swing two links of 1 m above a bar 1 m over the shoulder: ``physx/Acrobot-v0``.
 
     Only the elbow is driven. Action: a torque of -1, 0 or 1 N m; or, if `continuous`, a number
@@ -40,15 +35,11 @@ class AcrobotEnv(RobotEnv):
             continuous: Whether the torque is a number rather than a choice.
             options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
-        self.continuous = continuous
-        world = World([Robot("acrobot", collisions="none")], period=1.25e-2)
-        motors = [Motor(joint="elbow", max_torque=TORQUE)]
         options = {"simulation_duration_max": 100.0, **options}
-        simulator = Simulator(world, backend=backend, motors=motors, sensors=())
-        super().__init__(simulator, 0.2, **options)
-
-    def _initialize_action_space(self) -> None:
-        self.action_space = spaces.Box(-1.0, 1.0, (1,)) if self.continuous else spaces.Discrete(3)
+        super().__init__(
+            "acrobot", "elbow", TORQUE, 1.25e-2, 0.2, backend=backend, continuous=continuous,
+            **options,
+        )  # fmt: skip
 
     def _initialize_observation_space(self) -> None:
         self.observation_space = limits.box(np.ones(4), limits.joint_velocities(self.simulator))
@@ -64,10 +55,6 @@ class AcrobotEnv(RobotEnv):
         np.sin(state["q"], out=self.observation[1:4:2])
         self.observation[4:] = state["v"]
 
-    def compute_command(self, action: Any, command: Vector) -> None:
-        """Drive the elbow."""
-        command[0] = TORQUE * action[0] if self.continuous else TORQUE * (int(action) - 1)
-
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
         """Return whether the end is above the bar."""
         cos, sin, elbow_cos, elbow_sin, *_ = self.observation.tolist()
@@ -77,9 +64,3 @@ class AcrobotEnv(RobotEnv):
     def compute_reward(self, terminated: bool, info: Info) -> float:
         """Return -1, but 0 for the last step."""
         return 0.0 if terminated else -1.0
-
-    def _key_to_action(
-        self, key: str | None, obs: Any, reward: float | None, **kwargs: Any
-    ) -> Any | None:
-        choice = _KEYS.get(key or "", 1)
-        return np.array([choice - 1.0], np.float32) if self.continuous else choice

@@ -6,24 +6,17 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from gymnasium import spaces
-
 from physx_core.gym.environments import limits
+from physx_core.gym.environments.one_motor import OneMotorEnv
 from physx_core.gym.layer import Info
-from physx_core.gym.robot_env import RobotEnv
-from physx_core.gym.simulator import Simulator
 from physx_core.interfaces.backend import Vector
-from physx_core.motors import Motor
-from physx_core.world import Robot, World
 
 FORCE = 10.0
 FARTHEST = 2.2
 STEEPEST = math.radians(12.0)
-_KEYS = {"Left": 0, "Right": 2}
 
 
-class CartpoleEnv(RobotEnv):
+class CartpoleEnv(OneMotorEnv):
     """Keep a pole upright by pushing the cart on which it stands: ``physx/Cartpole-v0``.
 
     Action: push to the left, not at all, or to the right, with 10 N; or, if `continuous`, the push
@@ -43,15 +36,11 @@ class CartpoleEnv(RobotEnv):
             continuous: Whether the push is a number rather than a choice.
             options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
-        self.continuous = continuous
-        world = World([Robot("cartpole", collisions="none")], period=1e-2)
-        motors = [Motor(joint="slider", max_torque=FORCE)]
         options = {"simulation_duration_max": 10.0, **options}
-        simulator = Simulator(world, backend=backend, motors=motors, sensors=())
-        super().__init__(simulator, 0.02, **options)
-
-    def _initialize_action_space(self) -> None:
-        self.action_space = spaces.Box(-1.0, 1.0, (1,)) if self.continuous else spaces.Discrete(3)
+        super().__init__(
+            "cartpole", "slider", FORCE, 1e-2, 0.02, backend=backend, continuous=continuous,
+            **options,
+        )  # fmt: skip
 
     def _initialize_observation_space(self) -> None:
         fastest = limits.joint_velocities(self.simulator)
@@ -66,10 +55,6 @@ class CartpoleEnv(RobotEnv):
         state = measurement["states"]["agent"]
         self.observation[:2], self.observation[2:] = state["q"], state["v"]
 
-    def compute_command(self, action: Any, command: Vector) -> None:
-        """Push the cart."""
-        command[0] = FORCE * action[0] if self.continuous else FORCE * (int(action) - 1)
-
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
         """Return whether the pole fell or the cart left."""
         place, angle, _, _ = self.observation.tolist()
@@ -78,9 +63,3 @@ class CartpoleEnv(RobotEnv):
     def compute_reward(self, terminated: bool, info: Info) -> float:
         """Return 1 for every step."""
         return 1.0
-
-    def _key_to_action(
-        self, key: str | None, obs: Any, reward: float | None, **kwargs: Any
-    ) -> Any | None:
-        choice = _KEYS.get(key or "", 1)
-        return np.array([choice - 1.0], np.float32) if self.continuous else choice

@@ -187,14 +187,7 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
             ConfigError: An argument cannot be what it is for.
             RemoteError: Nothing answers, or the server does not say what was not given.
         """
-        for option, space in (("observation", observation_space), ("action", action_space)):
-            if space is not None and not isinstance(space, gymnasium.Space):
-                raise ConfigError(f"{option}_space is {space!r:.80}, which is no gymnasium.Space.")
-        if not isinstance(requested_observation, Mapping | None):
-            raise ConfigError(
-                f"requested_observation is {requested_observation!r:.80} but must be a dictionary "
-                'such as {"agent": ["position"], "world": []}.'
-            )
+        _check_given(observation_space, action_space, requested_observation)
         self.client = GodotGymClient(
             messages, address, timeout=timeout, connect_timeout=connect_timeout,
             max_answer=max_answer,
@@ -348,3 +341,19 @@ def _fitted(leaf: Space, value: Any) -> Any:
             f"A part of the observation has {array.size} values, and {leaf} has the shape "
             f"{leaf.shape}."
         ) from None
+
+
+def _check_given(observation_space: Any, action_space: Any, requested: Any) -> None:
+    """Check the spaces and the request; each may be None.
+
+    Raises:
+        ConfigError: One is not what it is for.
+    """
+    for option, space in (("observation", observation_space), ("action", action_space)):
+        if space is not None and not isinstance(space, gymnasium.Space):
+            raise ConfigError(f"{option}_space is {space!r:.80}, which is no gymnasium.Space.")
+    if not isinstance(requested, Mapping | None):
+        raise ConfigError(
+            f"requested_observation is {requested!r:.80} but must be a dictionary "
+            'such as {"agent": ["position"], "world": []}.'
+        )

@@ -6,15 +6,15 @@ import socket
 import time
 from typing import Any
 
-from physx_core.errors import ConfigError, RemoteClosedError, RemoteError, RemoteTimeoutError
+from physx_core.errors import ConfigError, RemoteClosedError, RemoteTimeoutError
+from physx_core.remote.clients.connection import Connection
 from physx_core.remote.framing import MAX_ANSWER, FrameReader, framed
 
 _PIECE = 1 << 16
-_RETRY = 0.1
 _LONGEST = 1e9
 
 
-class Link:
+class Link(Connection):
     """A connection on which one message is answered by one message.
 
     After any failure it is closed: a late answer must not be taken for that of another message.
@@ -46,29 +46,15 @@ class Link:
         _check_time("connect_timeout", connect_timeout)
         if type(max_answer) is not int or max_answer < 1:
             raise ConfigError(f"max_answer is {max_answer!r} but must be a whole number of bytes.")
-        self.name = "{}:{}".format(*address)
+        super().__init__(address)
         self._timeout = timeout
         self._reader = FrameReader(max_answer)
-        self._why_closed = ""
         self._socket = self._connected(address, connect_timeout)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.settimeout(timeout)
 
     def _connected(self, address: tuple[str, int], patience: float) -> socket.socket:
-        until = time.monotonic() + patience
-        while True:
-            left = max(until - time.monotonic(), 0.001)
-            try:
-                return socket.create_connection(address, left)
-            except (ConnectionRefusedError, TimeoutError) as error:
-                if time.monotonic() + _RETRY > until:
-                    raise RemoteTimeoutError(
-                        f"Nothing answers at {self.name} within {patience:g} s: {error}. Start the "
-                        "server first, or give a longer connect_timeout."
-                    ) from error
-                time.sleep(_RETRY)
-            except OSError as error:
-                raise RemoteError(f"{self.name} cannot be reached: {error}.") from error
+        return self._reached(lambda left: socket.create_connection(address, left), patience)
 
     def exchange(self, body: bytes) -> bytes:
         """Send a message and return the answer to it.
@@ -78,8 +64,7 @@ class Link:
             RemoteClosedError: The other side ended the connection, or it is closed already.
             RemoteProtocolError: The answer is too long.
         """
-        if self._why_closed:
-            raise RemoteClosedError(f"The connection to {self.name} is closed: {self._why_closed}.")
+        self._check_open()
         try:
             self._socket.sendall(framed(body))
             return self._answer()
@@ -115,15 +100,6 @@ class Link:
         if until is not None:
             self._socket.settimeout(self._timeout)
         return body
-
-    def close(self, why: str = "it was closed here") -> None:
-        """End the connection; calling it again does nothing.
-
-        Args:
-            why: What later calls say.
-        """
-        self._why_closed = self._why_closed or why
-        self._socket.close()
 
 
 def _check_time(name: str, seconds: Any) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import select
 import socket
 import time
-from typing import Any
+from typing import Any, ClassVar
 
 from physx_core.errors import (
     ConfigError,
@@ -16,6 +16,7 @@ from physx_core.errors import (
     RemoteTimeoutError,
     UnansweredError,
 )
+from physx_core.remote.clients.connection import Connection
 from physx_core.remote.framing import MAX_ANSWER
 from physx_core.remote.protocols.physx_wire import OBSERVE, SERVICE, VERSION
 from physx_core.transport.failures import decode_error
@@ -24,11 +25,10 @@ from physx_core.transport.handshake import TOKEN_VARIABLE, introduce
 from physx_core.transport.tokens import checked_token, given_token
 from physx_core.transport.values import decode
 
-_RETRY = 0.1
 _BACKLOG = 1 << 16
 
 
-class PhysxLink:
+class PhysxLink(Connection):
     """A connection to a service of the protocol physx.
 
     After any failure it is closed: a late answer must not be taken for that of another request.
@@ -38,6 +38,8 @@ class PhysxLink:
         timeout: How long an answer may take, in s; None: for ever.
         introduction: What the service says about itself.
     """
+
+    _server: ClassVar[str] = "service"
 
     def __init__(
         self,
@@ -66,9 +68,8 @@ class PhysxLink:
             ConfigError: There is no token.
             RemoteError: Nothing answers, or it does not take this client.
         """
-        self.name = "{}:{}".format(*address)
+        super().__init__(address)
         self.timeout = timeout
-        self._why_closed = ""
         found = checked_token(token, "token") if token is not None else given_token(token_file)
         if found is None:
             raise ConfigError(
@@ -76,7 +77,7 @@ class PhysxLink:
                 "give token_file=, the file that holds it, or token=."
             )
         until = time.monotonic() + connect_timeout
-        self._socket = self._connected(address, role, until, connect_timeout)
+        self._socket = self._reached(lambda left: _opened(address, role, left), connect_timeout)
         try:
             self._reader = self._introduced(found, role, max(until - time.monotonic(), 1.0))
             self._reader.limit = max_answer
@@ -87,22 +88,6 @@ class PhysxLink:
         except BaseException:
             self._socket.close()
             raise
-
-    def _connected(
-        self, address: tuple[str, int], role: int, until: float, patience: float
-    ) -> socket.socket:
-        while True:
-            try:
-                return _opened(address, role, max(until - time.monotonic(), 0.001))
-            except (ConnectionRefusedError, TimeoutError) as error:
-                if time.monotonic() + _RETRY > until:
-                    raise RemoteTimeoutError(
-                        f"Nothing answers at {self.name} within {patience:g} s: {error}. Start the "
-                        "service first, or give a longer connect_timeout."
-                    ) from error
-                time.sleep(_RETRY)
-            except OSError as error:
-                raise RemoteError(f"{self.name} cannot be reached: {error}.") from error
 
     def _introduced(self, token: str, role: int, patience: float) -> FrameReader:
         """Prove that both sides know the token."""
@@ -157,8 +142,7 @@ class PhysxLink:
             RemoteTimeoutError: The service does not take it in time.
             RemoteClosedError: The connection has ended, or is closed already.
         """
-        if self._why_closed:
-            raise RemoteClosedError(f"The connection to {self.name} is closed: {self._why_closed}.")
+        self._check_open()
         try:
             sent = self._socket.send(message)
             if sent < len(message):
@@ -205,8 +189,7 @@ class PhysxLink:
             RemoteClosedError: The connection has ended, or is closed already.
             RemoteProtocolError: It is none, or too long.
         """
-        if self._why_closed:
-            raise RemoteClosedError(f"The connection to {self.name} is closed: {self._why_closed}.")
+        self._check_open()
         until, left = None, patience
         try:
             while True:
@@ -244,15 +227,6 @@ class PhysxLink:
             self.close(str(error))
             raise RemoteProtocolError(f"{self.name}: {error}") from error
         raise refusal
-
-    def close(self, why: str = "it was closed here") -> None:
-        """End the connection; calling it again does nothing.
-
-        Args:
-            why: What later calls say.
-        """
-        self._why_closed = self._why_closed or why
-        self._socket.close()
 
     def _late(self) -> RemoteTimeoutError:
         self.close(f"an answer took longer than {self.timeout} s")

@@ -1,0 +1,72 @@
+"""Connection: what links of clients have in common, whatever they send."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from typing import ClassVar
+
+from physx_core.errors import RemoteClosedError, RemoteError, RemoteTimeoutError
+
+_RETRY = 0.1
+
+
+class Connection:
+    """A connection to a server, which stays closed once it is.
+
+    Attributes:
+        name: The server as ``host:port``.
+    """
+
+    _server: ClassVar[str] = "server"
+    """What the other side is called."""
+    _socket: socket.socket
+
+    def __init__(self, address: tuple[str, int]) -> None:
+        """Keep the address."""
+        self.name = "{}:{}".format(*address)
+        self._why_closed = ""
+
+    def _reached(self, connect: Callable[[float], socket.socket], patience: float) -> socket.socket:
+        """Return a connected socket; as long as nobody listens it is tried again.
+
+        Args:
+            connect: Connects within a time in s.
+            patience: How long to try, in s.
+
+        Raises:
+            RemoteTimeoutError: Nothing listens at the address in time.
+            RemoteError: The address does not exist.
+        """
+        until = time.monotonic() + patience
+        while True:
+            try:
+                return connect(max(until - time.monotonic(), 0.001))
+            except (ConnectionRefusedError, TimeoutError) as error:
+                if time.monotonic() + _RETRY > until:
+                    raise RemoteTimeoutError(
+                        f"Nothing answers at {self.name} within {patience:g} s: {error}. Start the "
+                        f"{self._server} first, or give a longer connect_timeout."
+                    ) from error
+                time.sleep(_RETRY)
+            except OSError as error:
+                raise RemoteError(f"{self.name} cannot be reached: {error}.") from error
+
+    def _check_open(self) -> None:
+        """Check that the connection is not closed.
+
+        Raises:
+            RemoteClosedError: It is; the error says why.
+        """
+        if self._why_closed:
+            raise RemoteClosedError(f"The connection to {self.name} is closed: {self._why_closed}.")
+
+    def close(self, why: str = "it was closed here") -> None:
+        """End the connection; calling it again does nothing.
+
+        Args:
+            why: What later calls say.
+        """
+        self._why_closed = self._why_closed or why
+        self._socket.close()
