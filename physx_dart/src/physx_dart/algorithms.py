@@ -33,7 +33,7 @@ class MoverAlgorithms:
     """
 
     def __init__(self, mover: Mover, gravity: tuple[float, ...]) -> None:
-        self.resistance = Resistance(mover)
+        self.resistance = Resistance.of(mover)
         self.model = load_model(mover, gravity, armature=self.resistance.armature)
         self.data = self.model.createData()
         self.frames = frames_of(self.model, mover)

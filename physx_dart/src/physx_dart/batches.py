@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import pinocchio
 
 from physx_core.interfaces.backend import Vector
-from physx_dart.algorithms import Algorithms, MoverAlgorithms
+from physx_dart.resistance import Resistance
 
 
 class MoverBatches:
-    """Forward dynamics of many states of one robot or object; each row is a state."""
+    """Forward dynamics of many states of one robot or object; each row is a state.
 
-    def __init__(self, mover: MoverAlgorithms) -> None:
-        self.model, self._data, self._resistance = mover.model, mover.data, mover.resistance
-        self._pool = pinocchio.ModelPool(mover.model, 1)
+    Attributes:
+        model: Pinocchio's model, with gravity and the rotors' inertia.
+        resistance: What resists its joints' motion.
+    """
+
+    def __init__(self, model: Any, resistance: Resistance) -> None:
+        self.model, self.resistance = model, resistance
+        self._data, self._pool = model.createData(), pinocchio.ModelPool(model, 1)
 
     def forward(self, q: Vector, v: Vector, tau: Vector) -> Vector:
         """Return the accelerations, shape (n, nv), resistance included."""
         out = np.zeros((self.model.nv, len(q)), order="F")
         if out.size:
-            resisted = tau - self._resistance.torques(q, v)
+            resisted = tau - self.resistance.torques(q, v)
             columns = [np.ascontiguousarray(rows).T for rows in (q, v, resisted)]
             pinocchio.abaInParallel(1, self._pool, *columns, out)
         return out.T
@@ -35,7 +41,7 @@ class MoverBatches:
         The derivatives of the inverse dynamics take two thirds of the time of those of the forward
         dynamics, and leave M behind.
         """
-        model, data, resistance = self.model, self._data, self._resistance
+        model, data, resistance = self.model, self._data, self.resistance
         derive, dot = pinocchio.computeRNEADerivatives, np.dot
         decompose, solve = pinocchio.cholesky.decompose, pinocchio.cholesky.solve
         found = np.empty((3, *weights.shape))
@@ -55,10 +61,18 @@ class MoverBatches:
 
 
 class Batches:
-    """Forward dynamics of many states of a world; each row is a state. Nothing is checked here."""
+    """Forward dynamics of many states of a world; each row is a state. Nothing is checked here.
 
-    def __init__(self, algorithms: Algorithms) -> None:
-        self._movers = [MoverBatches(mover) for mover in algorithms.movers]
+    Attributes:
+        movers: One for each robot, then each object that moves.
+        nq: Length of the positions.
+        nv: Length of the velocities.
+    """
+
+    def __init__(self, movers: Sequence[MoverBatches]) -> None:
+        self.movers = movers
+        self.nq = sum(each.model.nq for each in movers)
+        self.nv = sum(each.model.nv for each in movers)
 
     def forward(self, q: Vector, v: Vector, tau: Vector) -> Vector:
         """Return the accelerations, shape (n, nv)."""
@@ -74,7 +88,7 @@ class Batches:
 
     def _slices(self) -> Iterator[tuple[MoverBatches, slice, slice]]:
         nq = nv = 0
-        for each in self._movers:
+        for each in self.movers:
             model = each.model
             yield each, slice(nq, nq + model.nq), slice(nv, nv + model.nv)
             nq, nv = nq + model.nq, nv + model.nv

@@ -31,7 +31,7 @@ class RobotEngine(ABC):
         self.base = 0 if self.fixed_base else 6
         self.nq = len(joints) + (0 if self.fixed_base else 7)
         self.nv = len(joints) + self.base
-        self.resistance = Resistance(mover)
+        self.resistance = Resistance.of(mover)
 
     def neutral(self) -> Vector:
         """Return the positions at rest: 0, or the limit nearest to 0; base where it begins."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 import numpy as np
 
 from physx_core.interfaces.backend import Vector
@@ -17,19 +19,29 @@ class Resistance:
         stiffness: Of the springs, in N m/rad or N/m.
         rest: Where the springs are slack, in rad or m.
         armature: Inertia of the rotors, in kg m² or kg.
+        table: All five as rows, shape (5, nv).
     """
 
-    def __init__(self, mover: Mover) -> None:
-        joints = mover.model.joints
-        nothing = [0.0] * (0 if mover.fixed_base else 6)
-        settings = [joint.settings for joint in joints]
-        self.damping = np.array([*nothing, *(joint.damping for joint in joints)])
-        self.friction = np.array([*nothing, *(joint.friction for joint in joints)])
-        self.stiffness = np.array([*nothing, *(each.stiffness for each in settings)])
-        self.rest = np.array([*nothing, *(each.rest for each in settings)])
-        self.armature = np.array([*nothing, *(each.armature for each in settings)])
+    def __init__(self, table: Vector) -> None:
+        """Keep the five, in the order above.
+
+        Args:
+            table: Shape (5, nv).
+        """
+        self.table = table
+        self.damping, self.friction, self.stiffness, self.rest, self.armature = table
         self._smooth = bool(self.damping.any() or self.stiffness.any())
         self._any = self._smooth or bool(self.friction.any())
+
+    @classmethod
+    def of(cls, mover: Mover) -> Self:
+        """Return what resists the joints of a robot or object."""
+        base = 0 if mover.fixed_base else 6
+        table = np.zeros((5, base + len(mover.model.joints)))
+        for column, joint in zip(table.T[base:], mover.model.joints, strict=True):
+            extra = joint.settings
+            column[:] = joint.damping, joint.friction, extra.stiffness, extra.rest, extra.armature
+        return cls(table)
 
     def torques(self, positions: Vector, velocities: Vector) -> Vector | float:
         """Return the torques against a motion, shape (..., nv), or 0."""

@@ -359,6 +359,8 @@ class RobotSimulation(WorldState):
         self._robots, self._only = (), None
         self._bodies = {}
         self._hooks.clear()
+        if self._made_batches is not None:
+            self._made_batches.close()
         self._made_algorithms = self._made_batches = None
 
 

@@ -11,14 +11,14 @@ import numpy as np
 from physx_core.errors import SimulationError, listed, nearest
 from physx_core.interfaces.backend import Simulation, Vector
 from physx_core.interfaces.vectors import finite_rows, finite_vector, written
-from physx_dart.checks import joined
+from physx_dart.checks import integer, joined
 from physx_dart.engine import RobotEngine
 from physx_dart.parts import Parts, layout_of, static_poses
 from physx_dart.reaching import Reach
 
 if TYPE_CHECKING:
     from physx_dart.algorithms import Algorithms
-    from physx_dart.batches import Batches
+    from physx_dart.batch_processes import SharedBatches
 
 
 class WorldState(Simulation):
@@ -50,7 +50,7 @@ class WorldState(Simulation):
         self._places = {name: i for i, name in enumerate(self.layout.names)}
         self._static_poses = static_poses(parts)
         self._made_algorithms: Algorithms | None = None
-        self._made_batches: Batches | None = None
+        self._made_batches: SharedBatches | None = None
         self._reaches: dict[int, Reach] = {}
         for robot in robots:
             robot.write(robot.neutral(), np.zeros(robot.nv))
@@ -174,27 +174,37 @@ class WorldState(Simulation):
         return self._algorithms.forward_dynamics_derivatives(q, v, tau)
 
     def forward_dynamics_batch(
-        self, positions: Vector, velocities: Vector, torques: Vector
+        self, positions: Vector, velocities: Vector, torques: Vector, *, processes: int = 1
     ) -> Vector:
         """Return `forward_dynamics` of many states, shape (n, nv), by Pinocchio's algorithms."""
+        processes = integer("processes", processes, 1)
         q, others = self._many_states(positions, velocities=velocities, torques=torques)
-        return self._batches.forward(q, *others)
+        return self._batches.forward(q, *others, processes=processes)
 
     def forward_dynamics_gradients_batch(
-        self, positions: Vector, velocities: Vector, accelerations: Vector, weights: Vector
+        self,
+        positions: Vector,
+        velocities: Vector,
+        accelerations: Vector,
+        weights: Vector,
+        *,
+        processes: int = 1,
     ) -> Vector:
         """Return gradients of weighted sums of `forward_dynamics`, shape (3, n, nv)."""
+        processes = integer("processes", processes, 1)
         q, others = self._many_states(
             positions, velocities=velocities, accelerations=accelerations, weights=weights
         )
-        return self._batches.gradients(q, *others)
+        return self._batches.gradients(q, *others, processes=processes)
 
     @property
-    def _batches(self) -> Batches:
+    def _batches(self) -> SharedBatches:
         if self._made_batches is None:
-            from physx_dart.batches import Batches
+            from physx_dart.batch_processes import SharedBatches
+            from physx_dart.batches import Batches, MoverBatches
 
-            self._made_batches = Batches(self._algorithms)
+            movers = [MoverBatches(x.model, x.resistance) for x in self._algorithms.movers]
+            self._made_batches = SharedBatches(Batches(movers))
         return self._made_batches
 
     @property

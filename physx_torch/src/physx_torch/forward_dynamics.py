@@ -25,21 +25,28 @@ class ForwardDynamics:
     its gradient is that of the normalized one. Second derivatives are not there.
 
     Example:
-        >>> dynamics = ForwardDynamics(simulation)
+        >>> dynamics = ForwardDynamics(simulation, processes=2)
         >>> loss = (dynamics(q, v, network(q, v)) - wanted).square().mean()
 
     Args:
         simulation: Of any engine with the feature ``derivatives``; its state is neither used nor
             changed. It must stay open.
+        processes: How many processes share a batch of states at most, this one among them. The
+            others start with the first batch that is large enough and end with the simulation.
 
     Raises:
         FeatureNotSupportedError: The simulation has no derivatives of its forward dynamics.
+        SimulationError: The number of processes is no integer of at least 1.
     """
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: Simulation, processes: int = 1) -> None:
         if "derivatives" not in simulation.features:
             raise FeatureNotSupportedError(simulation.engine, "derivatives", simulation.features)
-        self.simulation = simulation
+        if not isinstance(processes, int) or processes < 1:
+            raise SimulationError(
+                f"processes is {processes!r} but must be an integer of at least 1."
+            )
+        self.simulation, self.processes = simulation, processes
 
     def __call__(self, positions: Tensor, velocities: Tensor, torques: Tensor) -> Tensor:
         """Return the accelerations, shape (..., nv), in the type and on the device of the input.
@@ -52,7 +59,7 @@ class ForwardDynamics:
 
         Raises:
             SimulationError: A shape does not fit, a value is not finite, or a quaternion is not of
-                length 1 (within 0.001).
+                length 1 (within 0.001); or one of the processes ended.
         """
         given = (positions, velocities, torques)
         self._check(given)
@@ -61,10 +68,9 @@ class ForwardDynamics:
         leading = torch.broadcast_shapes(*(tensor.shape[:-1] for tensor in given))
         rows = [_rows(tensor, leading) for tensor in given]
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given):
-            found: Tensor = _Function.apply(self.simulation, *rows)
+            found: Tensor = _Function.apply(self, *rows)
         else:
-            arrays = [row.detach().numpy() for row in rows]
-            found = torch.from_numpy(self.simulation.forward_dynamics_batch(*arrays))
+            found = torch.from_numpy(_accelerations(self, rows))
         return found.reshape(*leading, velocities.shape[-1]).to(positions.device, dtype)
 
     def _check(self, given: tuple[Tensor, ...]) -> None:
@@ -86,24 +92,29 @@ def _rows(tensor: Tensor, leading: Sequence[int]) -> Tensor:
     return tensor.expand(*leading, -1).reshape(math.prod(leading), tensor.shape[-1])
 
 
+def _accelerations(dynamics: ForwardDynamics, rows: Sequence[Tensor]) -> Vector:
+    arrays = [row.detach().numpy() for row in rows]
+    return dynamics.simulation.forward_dynamics_batch(*arrays, processes=dynamics.processes)
+
+
 class _Function(torch.autograd.Function):
     """Forward dynamics of rows of states."""
 
     @staticmethod
-    def forward(ctx: Any, simulation: Simulation, *rows: Tensor) -> Tensor:
-        arrays = [row.detach().numpy() for row in rows]
-        accelerations = torch.from_numpy(simulation.forward_dynamics_batch(*arrays))
-        ctx.simulation = simulation
+    def forward(ctx: Any, dynamics: ForwardDynamics, *rows: Tensor) -> Tensor:
+        accelerations = torch.from_numpy(_accelerations(dynamics, rows))
+        ctx.dynamics = dynamics
         ctx.save_for_backward(*rows[:2], accelerations)
         return accelerations
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, given: Tensor) -> tuple[Tensor | None, ...]:
+        simulation, processes = ctx.dynamics.simulation, ctx.dynamics.processes
         arrays = [tensor.detach().numpy() for tensor in (*ctx.saved_tensors, given)]
-        gradients = list(ctx.simulation.forward_dynamics_gradients_batch(*arrays))
+        gradients = list(simulation.forward_dynamics_gradients_batch(*arrays, processes=processes))
         if ctx.needs_input_grad[1]:
-            gradients[0] = _by_positions(ctx.simulation.layout, arrays[0], gradients[0])
+            gradients[0] = _by_positions(simulation.layout, arrays[0], gradients[0])
         needed = zip(gradients, ctx.needs_input_grad[1:], strict=True)
         return None, *(torch.from_numpy(each) if needs else None for each, needs in needed)
 

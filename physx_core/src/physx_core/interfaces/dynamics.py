@@ -74,7 +74,7 @@ class Dynamics(ABC):
         raise self._lacks("derivatives")
 
     def forward_dynamics_batch(
-        self, positions: Vector, velocities: Vector, torques: Vector
+        self, positions: Vector, velocities: Vector, torques: Vector, *, processes: int = 1
     ) -> Vector:
         """Return `forward_dynamics` of many states, shape (n, nv); each row is a state.
 
@@ -82,13 +82,25 @@ class Dynamics(ABC):
             positions: Shape (n, nq).
             velocities: Shape (n, nv).
             torques: Shape (n, nv).
+            processes: How many processes share the rows at most, this one among them. The others
+                start when they are first needed and end with the simulation. An engine that
+                cannot share rows computes all of them in this process, with the same results.
+
+        Raises:
+            SimulationError: An array does not fit; or one of the processes ended.
         """
         states = zip(positions, velocities, torques, strict=True)
         found = [self.forward_dynamics(*state) for state in states]
         return np.array(found, np.float64).reshape(-1, self.layout.nv)
 
     def forward_dynamics_gradients_batch(
-        self, positions: Vector, velocities: Vector, accelerations: Vector, weights: Vector
+        self,
+        positions: Vector,
+        velocities: Vector,
+        accelerations: Vector,
+        weights: Vector,
+        *,
+        processes: int = 1,
     ) -> Vector:
         """Return gradients of weighted sums of `forward_dynamics` of many states.
 
@@ -100,10 +112,14 @@ class Dynamics(ABC):
             velocities: Shape (n, nv).
             accelerations: Shape (n, nv), as `forward_dynamics_batch` returned them.
             weights: Shape (n, nv).
+            processes: As in `forward_dynamics_batch`.
 
         Returns:
             Gradients by positions, velocities and torques, shape (3, n, nv); those by the positions
             are by small motions, as in `forward_dynamics_derivatives`.
+
+        Raises:
+            SimulationError: An array does not fit; or one of the processes ended.
         """
         found = np.empty((3, len(weights), self.layout.nv))
         rows = zip(positions, velocities, accelerations, weights, strict=True)
