@@ -9,7 +9,6 @@ but in the line that is about it.
 from __future__ import annotations
 
 import itertools
-import mmap
 import os
 import shutil
 import statistics
@@ -166,20 +165,8 @@ def generation(
     batch: int,
     clients: int,
     dataset: DatasetConfig | None = None,
-    memory: int = 0,
 ) -> Iterator[int]:
-    """Make and store so many rows with clients that are started before the time is taken.
-
-    Args:
-        root: Folder for the session.
-        environment: Class of the environments.
-        arguments: Its keyword arguments.
-        rows: How many rows.
-        batch: How many of them in a batch.
-        clients: How many clients.
-        dataset: Settings of the dataset.
-        memory: Bytes that the system must have at hand for its cache: see `warm_memory`.
-    """
+    """Make and store so many rows with clients that are started before the time is taken."""
     pipeline = DataGeneration(
         EnvironmentConfig(environment, env_kwargs=arguments, num_clients=clients, seed=0),
         dataset,
@@ -189,7 +176,6 @@ def generation(
         batch_size=batch,
     )
     with pipeline:
-        warm_memory(memory)
         yield 0
         for _ in range(rows // batch):
             pipeline.batch_begin()
@@ -234,14 +220,17 @@ def generation_small(root: Path) -> bool:
 def generation_large(root: Path) -> bool:
     """Compare streaming of large samples to disk with a raw stream that nobody keeps.
 
-    What a file alone takes is printed too: no program stores faster than that.
+    What a file alone reaches is measured too, for no program stores faster than that. It depends on
+    where the memory of the system's cache comes from: a file in memory that was in use a moment ago
+    is as fast as the raw stream, but a virtual machine may have to ask its host for each page, and
+    then a file is ten times as slow. Where a file alone could not meet the target with a tenth to
+    spare, the target is nine tenths of the file.
     """
     values, rows = SIZES["48 kB"], 6000
     small = DatasetConfig(max_file_size=0.05)
 
     def streamed(dataset: DatasetConfig | None = None) -> Iterator[int]:
-        memory = 10 * values * rows
-        return generation(root, Rows, {"values": values}, rows, 100, 1, dataset, memory)
+        return generation(root, Rows, {"values": values}, rows, 100, 1, dataset)
 
     with raw_client(8 * values, "stream") as connection:
         candidates: dict[str, Work] = {
@@ -255,29 +244,28 @@ def generation_large(root: Path) -> bool:
     heading = (
         "Generation of 48 kB samples with 1 client, to disk; sealed meanwhile: small partitions"
     )
-    met = report(heading, "MB", in_mb, "raw TCP stream", 0.45, "streamed to disk")
-    pairs = zip(in_mb["streamed to disk"], in_mb["a file alone"], strict=True)
-    share = statistics.median(mine / file for mine, file in pairs)
-    print(f"  streamed to disk, of what a file alone reaches: {share:.2f}, without a target\n")
-    return met
+    print(heading)
+    for name, each in in_mb.items():
+        spread = f"[{min(each):,.0f} .. {max(each):,.0f}]"
+        print(f"  {name:28} {statistics.median(each):12,.0f} MB/s  {spread}")
 
+    def share(name: str, of: str) -> float:
+        pairs = zip(in_mb[name], in_mb[of], strict=True)
+        return statistics.median(mine / other for mine, other in pairs)
 
-def warm_memory(size: int) -> None:
-    """Have the system hold so much free memory of its own.
-
-    The free memory of a virtual machine may be with its host, and coming back page by page it makes
-    a file ten times as slow as it is in memory that was used in the last seconds.
-    """
-    if size:
-        with mmap.mmap(-1, size) as memory:
-            np.frombuffer(memory, np.uint8)[:: mmap.PAGESIZE].fill(1)
+    of_raw = share("streamed to disk", "raw TCP stream")
+    of_file = share("streamed to disk", "a file alone")
+    file = share("a file alone", "raw TCP stream")
+    if file >= 0.5:
+        return claim("streamed to disk, of the raw TCP stream", of_raw, at_least=0.45)
+    print(f"  streamed to disk, of the raw TCP stream: {of_raw:.2f}; a file alone: {file:.2f}")
+    return claim("streamed to disk, of a file alone", of_file, at_least=0.9)
 
 
 def file_alone(path: Path, size: int, count: int) -> Iterator[int]:
     """Write so many messages to a file, twenty at a time, with the space reserved before."""
     messages = bytes(20 * size)
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT)
-    warm_memory(size * count)
     yield 0
     os.posix_fallocate(descriptor, 0, size * count)
     for place in range(0, size * count, len(messages)):
