@@ -48,15 +48,23 @@ class Asking(Rows):
 
 
 class Working(Rows):
-    """Computes for a while in each step."""
+    """Computes for a while in each step, and now and then for as long as many steps take.
 
-    def __init__(self, *, work: int, **kwargs: Any) -> None:
+    The arrays begin with when a step began to compute, and when it ended, in s.
+    """
+
+    def __init__(self, *, work: int, block: int, **kwargs: Any) -> None:
         super().__init__(values=6, **kwargs)
-        self.work = work
+        self.work, self.block, self.steps = work, block, 0
 
     def step(self) -> None:
-        """Compute, and then give the arrays."""
-        compute(self.work)
+        """Compute, in the first step and after each `block` further ones for `block` steps."""
+        count = 1 if self.steps % (self.block + 1) else self.block
+        self.steps += 1
+        self.x[0] = time.perf_counter()
+        for _ in range(count):
+            compute(self.work)
+        self.y[0] = time.perf_counter()
         super().step()
 
 

@@ -13,6 +13,7 @@ from physx_core.errors import PhysxError
 from physx_core.fields import Sample
 from physx_core.instance import Instance
 from physx_core.scene import Event
+from physx_core.transport.awake import has_core_for_each
 from physx_core.transport.failures import encode_error
 from physx_core.transport.frames import Kind, pack
 from physx_core.transport.joining import PATIENCE, join
@@ -66,6 +67,7 @@ def _serve(link: Link, setup: dict[str, Any], say: Callable[[str], None]) -> int
         f"runs {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"
         + (f"; {skip['rows']} rows are there and are made again" if skip["rows"] else "")
     )
+    link.waits_awake = has_core_for_each(setup["instance_nb"])
     client = _Client(link, Instance(**setup), skip)
     try:
         client.live(draw)

@@ -18,7 +18,7 @@ from physx_core.transport.values import decode, encode
 
 _BLOCK_BYTES = 1 << 20
 _BLOCK_ROWS = 4096
-_BLOCK_TIME = 5e-3
+_BLOCK_TIME = 20e-3
 
 
 class Producer:

@@ -16,6 +16,7 @@ from physx_core.errors import (
 )
 from physx_core.interfaces.environment import Services
 from physx_core.transport.answers import Answers
+from physx_core.transport.awake import awaited, has_core_for_each
 from physx_core.transport.claims import (
     check_environment_fields,
     check_row_fields,
@@ -29,6 +30,7 @@ from physx_core.transport.peer import Peer
 from physx_core.transport.rows import unpack_rows
 
 _HANDSHAKE_TIME = 5.0
+_AWAKE_TIME = 5e-5  # for which clients that got answers are waited for without sleeping
 _MAX_STRANGERS = 128
 _ACCEPTED_AT_ONCE = 16
 _TURNS = 64
@@ -68,6 +70,7 @@ class Server:
         self.peers: dict[int, Peer] = {}
         self.token = token
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
+        self._awake_time = _AWAKE_TIME if has_core_for_each(instance_nb) else 0.0
         self._answers = Answers(services)
         self._setup, self._replaces = setup, replaces
         self._ending = self._has_news = False
@@ -121,14 +124,21 @@ class Server:
         longer than `timeout`, it goes on.
         """
         until = time.monotonic() + timeout
-        while self._answer_at_once(timeout) and time.monotonic() < until:
-            continue
+        awake = 0.0
+        while self._answer_at_once(timeout, awake) and time.monotonic() < until:
+            awake = self._awake_time
         self._watch()
 
-    def _answer_at_once(self, timeout: float) -> bool:
-        """Do what there is to do; return whether it was to answer requests and nothing else."""
+    def _answer_at_once(self, timeout: float, awake: float) -> bool:
+        """Do what there is to do; return whether it was to answer requests and nothing else.
+
+        Args:
+            timeout: How long to wait for the first of it, in s.
+            awake: How much of that to wait without sleeping, in s.
+        """
         self._has_news = False
-        for key, events in self._selector.select(timeout):
+        found = awaited(lambda: self._selector.select(0), awake) if awake else []
+        for key, events in found or self._selector.select(timeout):
             if key.data is None:
                 self._accept()
                 self._has_news = True
