@@ -141,14 +141,15 @@ def check_rows(block: Batch, instance_id: int, last_step: int) -> int:
         ConnectionRefusedByPeerError: They are not of this instance, or their steps do not rise.
         NotFiniteError: One holds NaN or an infinite number.
     """
-    steps = block["step"]
-    if (block["env_id"] != instance_id).any():
+    steps, numbers = block["step"], block["env_id"]
+    several = len(steps) > 1
+    if numbers[0] != instance_id or (several and (numbers != instance_id).any()):
         raise ConnectionRefusedByPeerError("It sent rows of another instance.")
-    if steps[0] <= last_step or (len(steps) > 1 and (steps[1:] <= steps[:-1]).any()):
+    if steps[0] <= last_step or (several and (steps[1:] <= steps[:-1]).any()):
         raise ConnectionRefusedByPeerError("It sent rows whose steps do not rise.")
     for name, values in block.items():
         kind = values.dtype.kind
-        if kind == "b" and (values.view(np.uint8) > 1).any():
+        if kind == "b" and values.tobytes().translate(None, b"\0\1"):
             raise ConnectionRefusedByPeerError(
                 f'It sent rows whose field "{name}" is neither true nor false.'
             )

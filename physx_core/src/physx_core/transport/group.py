@@ -119,6 +119,8 @@ class ClientGroup:
             self._serve(0.0)
         while waited := missing():
             self._serve(_TICK)
+            if self._served - began < min(_SAY_EVERY, self.config.timeout):
+                continue
             self._say(waited, began)
             if self._silent(waited, began):
                 self._serve(0.0)  # an answer may have taken long while others had their say

@@ -96,6 +96,7 @@ class Link:
         Raises:
             RunEnded: The server is gone.
         """
+        self._wait_awake()
         return self._postponed.popleft() if self._postponed else self._next()
 
     def put_back(self, frame: Frame) -> None:
@@ -124,8 +125,7 @@ class Link:
         message = pack_value(kind, value, what, self._requests + 1)
         self._requests += 1
         self.send(message)
-        if self.waits_awake:
-            awaited(self.has_message, _AWAKE_TIME)
+        self._wait_awake()
         while True:
             frame = self._next()
             if frame.kind is Kind.CLOSE:
@@ -143,6 +143,10 @@ class Link:
         with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_RDWR)
         self._connection.close()
+
+    def _wait_awake(self) -> None:
+        if self.waits_awake:
+            awaited(self.has_message, _AWAKE_TIME)
 
     def _next(self) -> Frame:
         try:
