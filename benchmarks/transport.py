@@ -220,13 +220,13 @@ def generation_small(root: Path) -> bool:
 def generation_large(root: Path) -> bool:
     """Compare streaming of large samples to disk with a raw stream that nobody keeps.
 
-    What a file alone reaches is measured too, for no program stores faster than that. It depends on
-    where the memory of the system's cache comes from: a file in memory that was in use a moment ago
-    is as fast as the raw stream, but a virtual machine may have to ask its host for each page, and
-    then a file is ten times as slow. Where a file alone could not meet the target with a tenth to
-    spare, the target is nine tenths of the file.
+    What a file alone takes is measured too, for whoever stores a stream has to write it. It depends
+    on where the memory of the system's cache comes from: a file in memory that was in use a moment
+    ago is twice as fast as the raw stream, but a virtual machine may have to ask its host for each
+    page, and then it is ten times as slow. Where the raw stream and then the file alone would take
+    too long for the target, the target is nine tenths of what the two reach.
     """
-    values, rows = SIZES["48 kB"], 6000
+    values, rows = SIZES["48 kB"], 2000
     small = DatasetConfig(max_file_size=0.05)
 
     def streamed(dataset: DatasetConfig | None = None) -> Iterator[int]:
@@ -239,7 +239,7 @@ def generation_large(root: Path) -> bool:
             "streamed to disk": streamed,
             "in partitions of 50 MB": lambda: streamed(small),
         }
-        measured = rates(candidates, ROUNDS)
+        measured = rates(candidates, 3 * ROUNDS)
     in_mb = {name: [rate * 8e-6 * values for rate in each] for name, each in measured.items()}
     heading = (
         "Generation of 48 kB samples with 1 client, to disk; sealed meanwhile: small partitions"
@@ -254,12 +254,10 @@ def generation_large(root: Path) -> bool:
         return statistics.median(mine / other for mine, other in pairs)
 
     of_raw = share("streamed to disk", "raw TCP stream")
-    of_file = share("streamed to disk", "a file alone")
     file = share("a file alone", "raw TCP stream")
-    if file >= 0.5:
-        return claim("streamed to disk, of the raw TCP stream", of_raw, at_least=0.45)
-    print(f"  streamed to disk, of the raw TCP stream: {of_raw:.2f}; a file alone: {file:.2f}")
-    return claim("streamed to disk, of a file alone", of_file, at_least=0.9)
+    both = 1 / (1 + 1 / file)
+    print(f"  of the raw TCP stream: a file alone {file:.2f}, the two in turn {both:.2f}")
+    return claim("streamed to disk", of_raw, at_least=min(0.45, 0.9 * both))
 
 
 def file_alone(path: Path, size: int, count: int) -> Iterator[int]:
