@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import faulthandler
 import os
 import signal
@@ -25,7 +26,8 @@ def main() -> int:
     token = os.environ.pop(TOKEN_VARIABLE, "")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server decides when a run ends
     if hasattr(os, "SCHED_BATCH"):  # a client that is woken lets the server wake the others first
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        with contextlib.suppress(OSError):  # not every container lets it choose
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     try:
         return run_client(options.connect, token, options.instance)
     except PhysxError as error:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 Found = TypeVar("Found")
+_let_others: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
 
 
 def has_core_for_each(clients: int) -> bool:
@@ -26,6 +27,6 @@ def awaited(look: Callable[[], Found], seconds: float) -> Found:
     """
     found, until = look(), time.monotonic() + seconds
     while not found and time.monotonic() < until:
-        os.sched_yield()
+        _let_others()
         found = look()
     return found
