@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import ClassVar
 
+import gymnasium
 import numpy as np
 import psutil
 import pytest
@@ -283,14 +284,28 @@ class Fake(Visualizer):
     opened: ClassVar[list[Fake]] = []
 
     def __init__(self, **options):
-        self.options, self.steps, self.is_open = options, [], True
+        self.options, self.steps, self.drawn, self.is_open = options, [], {}, True
         self.opened.append(self)
 
     def events(self, instance_id, step, events):
         self.steps.append((instance_id, step, [event.action for event in events]))
+        self.drawn |= {event.name: event.values for event in events}
 
     def close(self):
         self.is_open = False
+
+
+@pytest.mark.parametrize(("name", "shown"), [("PushBox", "positions"), ("ArmReach", "position")])
+def test_an_environment_draws_its_goal(name, shown):
+    env = gymnasium.make(f"physx/{name}-v0", render_mode="human").unwrapped
+    env.viewer_kwargs |= {"visualizer": Fake}
+    for seed in (1, 2):
+        env.reset(seed=seed)
+        env.render()
+        drawn = np.atleast_2d(Fake.opened[-1].drawn["goal"][shown])
+        middle = 0.5 * (drawn.min(axis=0) + drawn.max(axis=0))
+        np.testing.assert_allclose(middle[: len(env.goal)], env.goal, atol=1e-6)
+    env.close()
 
 
 def test_a_viewer_for_humans_follows_each_step():

@@ -89,6 +89,7 @@ class Renderer:
             VisualizerError: It cannot draw; the message says what is missing.
         """
         simulator = self._env.simulator
+        own: Any = self._env.unwrapped  # the `RobotEnv` below all layers
         poses = simulator.simulation.body_poses()
         if self._world is not simulator.world:
             self.close()
@@ -105,8 +106,10 @@ class Renderer:
                 follow=self._follow,
             )
             self._drawing.add(poses)
+            own._draw(self._factory)
         else:
             self._drawing.move(poses)
+            own._redraw(self._factory)
         self._viewer.events(1, self._frames, self._factory.take_events())
         self._frames += 1
         if self.mode == "human":

@@ -13,6 +13,7 @@ from physx_core.gym.buffers import neutral
 from physx_core.gym.episodes import Episodes
 from physx_core.gym.pipeline_env import Info
 from physx_core.interfaces.backend import Vector
+from physx_core.scene import Factory
 
 
 class RobotEnv(Episodes):
@@ -183,6 +184,20 @@ class RobotEnv(Episodes):
             f"{type(self).__name__} cannot be played: override _key_to_action, which returns the "
             "action of a key."
         )
+
+    def _draw(self, scene: Factory) -> None:
+        """Draw what is shown but is not in the world, such as a goal, before the first frame.
+
+        Args:
+            scene: What to draw with.
+        """
+
+    def _redraw(self, scene: Factory) -> None:
+        """Bring what `_draw` drew to the present, before every further frame.
+
+        Args:
+            scene: What it was drawn with.
+        """
 
     def render(self) -> Any:
         """Show the world as `render_mode` says, with the options `viewer_kwargs`.

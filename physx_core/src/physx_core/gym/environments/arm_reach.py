@@ -14,6 +14,7 @@ from physx_core.gym.robot_env import RobotEnv
 from physx_core.gym.simulator import Simulator
 from physx_core.interfaces.backend import Vector
 from physx_core.motors import Motor
+from physx_core.scene import Factory
 from physx_core.world import JointSettings, Robot, World
 
 HAND = "panda_hand"
@@ -93,6 +94,12 @@ class ArmReachEnv(RobotEnv):
 
     def _recall(self, memory: Any) -> None:
         self.goal[:], self._target[:] = memory["goal"], memory["target"]
+
+    def _draw(self, scene: Factory) -> None:
+        scene.add_sphere("goal", CLOSE, position=self.goal, color="green")
+
+    def _redraw(self, scene: Factory) -> None:
+        scene.update_sphere("goal", position=self.goal)
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
         """Observe the joints, the hand and the point."""

@@ -15,6 +15,7 @@ from physx_core.gym.robot_env import RobotEnv
 from physx_core.gym.simulator import Simulator
 from physx_core.interfaces.backend import Vector
 from physx_core.motors import Motor
+from physx_core.scene import Factory
 from physx_core.world import Box, Ground, JointSettings, Robot, World
 
 FORCE = 20.0
@@ -80,6 +81,18 @@ class PushBoxEnv(RobotEnv):
 
     def _recall(self, memory: Any) -> None:
         self.goal[:] = memory
+
+    def _draw(self, scene: Factory) -> None:
+        scene.add_lines("goal", self._goal_circle(), color="green", size=0.008)
+
+    def _redraw(self, scene: Factory) -> None:
+        scene.update_lines("goal", positions=self._goal_circle())
+
+    def _goal_circle(self) -> Vector:
+        """Return points on the ground around the goal, where the box's middle has to be."""
+        angles = np.linspace(0.0, 2 * math.pi, 33)
+        around = CLOSE * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        return np.insert(self.goal + around, 2, 0.01, axis=1)
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
         """Observe the stick, the box and the goal."""
