@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import sys
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pluggy
@@ -82,6 +84,20 @@ def load(name: str) -> Plugin:
 
 
 def _found() -> dict[str, list[EntryPoint]]:
+    return _entries(tuple((entry, _changed(entry)) for entry in sys.path))
+
+
+def _changed(folder: str) -> int:
+    """Return when a package was last installed into a folder, or removed; 0: there is no folder."""
+    try:
+        return Path(folder).stat().st_mtime_ns
+    except OSError:
+        return 0
+
+
+@functools.lru_cache(maxsize=1)
+def _entries(installed: tuple[tuple[str, int], ...]) -> dict[str, list[EntryPoint]]:
+    """Read the metadata of all packages, which takes some ms; once for what is installed."""
     from importlib.metadata import entry_points
 
     # An editable package can be listed twice by its own metadata: one owner counts once.
