@@ -72,6 +72,11 @@ def test_h5py_the_virtual_index_and_dataset_show_the_same(script, run, tmp_path)
         assert partition["rows"][()] == 303
 
 
+def rows_in(path):
+    with h5py.File(path) as partition:
+        return int(partition["rows"][()])
+
+
 @pytest.mark.parametrize("where", ["local1", "tcp2"])
 def test_kill_9_loses_no_committed_row(where, script, run, tmp_path, processes):
     environment = {**os.environ, "PHYSX_TEST_MARK": f"{tmp_path}"}
@@ -81,10 +86,9 @@ def test_kill_9_loses_no_committed_row(where, script, run, tmp_path, processes):
     committed, deadline = 0, time.monotonic() + 60
     while committed < 3000 and time.monotonic() < deadline:
         time.sleep(0.1)
-        files = list(tmp_path.glob("sessions/run/dataset/run_training_x_0.h5"))
-        if files:
-            with h5py.File(files[0]) as partition:
-                committed = int(partition["rows"][()])
+        # A row is committed once it is in all five fields, one after the other.
+        files = list(tmp_path.glob("sessions/run/dataset/run_training_*_0.h5"))
+        committed = min(map(rows_in, files)) if len(files) == 5 else 0
     process.send_signal(signal.SIGKILL)
     process.wait(60)
     rows = rows_of(tmp_path / "sessions/run")
