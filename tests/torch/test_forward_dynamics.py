@@ -22,39 +22,14 @@ WORLDS = {
 }
 
 
-@pytest.fixture
-def build():
-    made = []
-
-    def build(world, engine="pinocchio"):
-        made.append(plugins.resolve("backend", engine).build(world))
-        return made[-1]
-
-    yield build
-    for simulation in made:
-        simulation.close()
-
-
-def draw(simulation, *leading):
-    """Return random states with unit quaternions, and torques."""
-    rng, layout = np.random.default_rng(4), simulation.layout
-    q = rng.normal(size=(*leading, layout.nq))
-    for part in layout.parts.values():
-        if part.floating:
-            base = slice(part.positions.start + 3, part.positions.start + 7)
-            q[..., base] /= np.linalg.norm(q[..., base], axis=-1, keepdims=True)
-    v, tau = rng.normal(size=(2, *leading, layout.nv))
-    return tuple(torch.tensor(values, requires_grad=True) for values in (q, v, tau))
-
-
 @pytest.mark.parametrize("name", WORLDS)
-def test_gradients_are_those_of_the_values(build, name):
+def test_gradients_are_those_of_the_values(build, name, draw):
     simulation = build(WORLDS[name])
     states = draw(simulation, 2)
     assert torch.autograd.gradcheck(ForwardDynamics(simulation), states, eps=1e-5, atol=1e-5)
 
 
-def test_gradients_of_an_arm(build):
+def test_gradients_of_an_arm(build, draw):
     backend = plugins.resolve("backend", "pinocchio")
     if "ur/ur5_robot" not in [info.name for info in backend.robots()]:
         pytest.skip("example-robot-data is not installed")
@@ -67,7 +42,7 @@ def test_gradients_of_an_arm(build):
 
 @pytest.mark.parametrize("engine", ["dart", "pinocchio"])
 @pytest.mark.parametrize("name", WORLDS)
-def test_values_and_gradients_are_those_of_single_states(build, name, engine):
+def test_values_and_gradients_are_those_of_single_states(build, name, engine, draw):
     simulation = build(WORLDS[name], engine)
     states = draw(simulation, 5)
     arrays = [state.detach().numpy() for state in states]
@@ -81,7 +56,7 @@ def test_values_and_gradients_are_those_of_single_states(build, name, engine):
     np.testing.assert_allclose(quick, slow, rtol=1e-9, atol=1e-12 * abs(slow).max())
 
 
-def test_without_gradients_the_values_are_the_same(build):
+def test_without_gradients_the_values_are_the_same(build, draw):
     simulation = build(WORLDS["floating base"])
     states = draw(simulation, 5)
     dynamics = ForwardDynamics(simulation)
@@ -95,7 +70,7 @@ def test_without_gradients_the_values_are_the_same(build):
     assert gradient.shape == (5, 14)
 
 
-def test_leading_axes_are_broadcast_and_types_kept(build):
+def test_leading_axes_are_broadcast_and_types_kept(build, draw):
     simulation = build(WORLDS["floating base"])
     dynamics = ForwardDynamics(simulation)
     q, v, _ = draw(simulation, 3, 4)
@@ -111,7 +86,7 @@ def test_leading_axes_are_broadcast_and_types_kept(build):
     assert dynamics(q[:, :0], v[:, :0], tau).shape == (3, 0, 14)
 
 
-def test_mistakes_are_named(build):
+def test_mistakes_are_named(build, draw):
     simulation = build(WORLDS["floating body"])
     dynamics = ForwardDynamics(simulation)
     q, v, tau = (x.detach() for x in draw(simulation, 2))

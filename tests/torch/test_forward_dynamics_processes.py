@@ -38,31 +38,6 @@ os.kill(os.getpid(), signal.SIGKILL) if sys.argv[1] == "kill" else None
 """
 
 
-@pytest.fixture
-def build():
-    made = []
-
-    def build(name="floating base", engine="pinocchio"):
-        made.append(plugins.resolve("backend", engine).build(WORLDS[name]))
-        return made[-1]
-
-    yield build
-    for simulation in made:
-        simulation.close()
-
-
-def draw(simulation, *leading):
-    """Return random states with unit quaternions, and torques."""
-    rng, layout = np.random.default_rng(4), simulation.layout
-    q = rng.normal(size=(*leading, layout.nq))
-    for part in layout.parts.values():
-        if part.floating:
-            base = slice(part.positions.start + 3, part.positions.start + 7)
-            q[..., base] /= np.linalg.norm(q[..., base], axis=-1, keepdims=True)
-    v, tau = rng.normal(size=(2, *leading, layout.nv))
-    return tuple(torch.tensor(values, requires_grad=True) for values in (q, v, tau))
-
-
 def workers():
     """Return the processes that compute batches for this one."""
     found = []
@@ -92,8 +67,8 @@ def shared_memory():
 @pytest.mark.parametrize(
     ("name", "engine"), [*((name, "pinocchio") for name in WORLDS), ("floating base", "dart")]
 )
-def test_values_and_gradients_are_those_of_one_process_bit_for_bit(build, name, engine):
-    simulation = build(name, engine)
+def test_values_and_gradients_are_those_of_one_process_bit_for_bit(build, name, engine, draw):
+    simulation = build(WORLDS[name], engine)
     for count in (50, 33, 131):  # of which none can be shared evenly, and the last needs more room
         states = draw(simulation, count)
         weights = torch.tensor(np.random.default_rng(5).normal(size=states[1].shape))
@@ -106,8 +81,8 @@ def test_values_and_gradients_are_those_of_one_process_bit_for_bit(build, name, 
     assert len(workers()) == 2
 
 
-def test_leading_axes_are_broadcast(build):
-    simulation = build()
+def test_leading_axes_are_broadcast(build, draw):
+    simulation = build(WORLDS["floating base"])
     q, v, tau = draw(simulation, 5, 12)
     given = q[:, :1], v, tau[0, 0]
     expected = ForwardDynamics(simulation)(*given)
@@ -117,8 +92,8 @@ def test_leading_axes_are_broadcast(build):
     assert torch.equal(mine, alone)
 
 
-def test_small_batches_stay_in_this_process(build):
-    simulation = build()
+def test_small_batches_stay_in_this_process(build, draw):
+    simulation = build(WORLDS["floating base"])
     dynamics = ForwardDynamics(simulation, processes=8)
     dynamics(*draw(simulation, 31)).sum().backward()
     assert dynamics(*draw(simulation, 0)).shape == (0, 14)
@@ -127,8 +102,8 @@ def test_small_batches_stay_in_this_process(build):
     assert len(workers()) == 2  # 16 rows for each process
 
 
-def test_closing_the_simulation_leaves_nothing(build):
-    simulation = build()
+def test_closing_the_simulation_leaves_nothing(build, draw):
+    simulation = build(WORLDS["floating base"])
     dynamics = ForwardDynamics(simulation, processes=3)
     states = draw(simulation, 64)
     dynamics(*states)
@@ -141,7 +116,7 @@ def test_closing_the_simulation_leaves_nothing(build):
     assert not workers()
 
 
-def test_a_simulation_that_nobody_uses_leaves_nothing():
+def test_a_simulation_that_nobody_uses_leaves_nothing(draw):
     simulation = plugins.resolve("backend", "pinocchio").build(WORLDS["arm"])
     ForwardDynamics(simulation, processes=2)(*draw(simulation, 64))
     (started,) = workers()
@@ -150,8 +125,8 @@ def test_a_simulation_that_nobody_uses_leaves_nothing():
     assert not there(started) and not shared_memory()
 
 
-def test_a_process_that_is_killed_is_an_error_and_replaced(build):
-    simulation = build()
+def test_a_process_that_is_killed_is_an_error_and_replaced(build, draw):
+    simulation = build(WORLDS["floating base"])
     dynamics = ForwardDynamics(simulation, processes=3)
     states = draw(simulation, 64)
     found = dynamics(*states)
@@ -168,8 +143,8 @@ def test_a_process_that_is_killed_is_an_error_and_replaced(build):
 @pytest.mark.parametrize(
     ("program", "said"), [("false", "ended with exit status 1"), ("nothing-of-that-name", "start")]
 )
-def test_a_process_that_does_not_come_to_life_is_an_error(build, monkeypatch, program, said):
-    simulation = build()
+def test_a_process_that_does_not_come_to_life_is_an_error(build, monkeypatch, program, said, draw):
+    simulation = build(WORLDS["floating base"])
     states = draw(simulation, 64)
     monkeypatch.setattr(sys, "executable", shutil.which(program) or program)
     with pytest.raises(SimulationError, match=said):
@@ -177,8 +152,8 @@ def test_a_process_that_does_not_come_to_life_is_an_error(build, monkeypatch, pr
     assert not workers() and not shared_memory()
 
 
-def test_an_interrupted_batch_leaves_no_answer_for_the_next(build, monkeypatch):
-    simulation = build()
+def test_an_interrupted_batch_leaves_no_answer_for_the_next(build, monkeypatch, draw):
+    simulation = build(WORLDS["floating base"])
     dynamics = ForwardDynamics(simulation, processes=2)
     states = draw(simulation, 64)
     dynamics(*states)
@@ -206,8 +181,8 @@ def test_processes_end_with_the_one_that_started_them(how):
     assert run.returncode == (-signal.SIGKILL if how == "kill" else 0) and errors == ""
 
 
-def test_a_forked_process_computes_alone(build):
-    simulation = build()
+def test_a_forked_process_computes_alone(build, draw):
+    simulation = build(WORLDS["floating base"])
     arrays = [state.detach().numpy() for state in draw(simulation, 64)]
     expected = simulation.forward_dynamics_batch(*arrays, processes=2)
     started = workers()
@@ -222,8 +197,8 @@ def test_a_forked_process_computes_alone(build):
     assert (simulation.forward_dynamics_batch(*arrays, processes=2) == expected).all()
 
 
-def test_an_engine_that_cannot_share_computes_alone(build):
-    simulation = build()
+def test_an_engine_that_cannot_share_computes_alone(build, draw):
+    simulation = build(WORLDS["floating base"])
     arrays = [state.detach().numpy() for state in draw(simulation, 40)]
     found = Simulation.forward_dynamics_batch(simulation, *arrays, processes=2)
     weights = np.ones_like(found)
@@ -234,8 +209,8 @@ def test_an_engine_that_cannot_share_computes_alone(build):
 
 
 @pytest.mark.parametrize("processes", [0, -1, 1.5, "2", None])
-def test_mistakes_are_named(build, processes):
-    simulation = build()
+def test_mistakes_are_named(build, processes, draw):
+    simulation = build(WORLDS["floating base"])
     arrays = [state.detach().numpy() for state in draw(simulation, 2)]
     with pytest.raises(SimulationError, match="processes is"):
         ForwardDynamics(simulation, processes)
