@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import DTypeLike
 
+from physx_core.closing import Closing
 from physx_core.dataset import policy as policies
 from physx_core.dataset import recovery
 from physx_core.dataset.appender import Appender
@@ -33,7 +33,7 @@ from physx_core.statistics import Normalization
 MAX_FILE_SIZE = 0.25
 
 
-class Dataset(Changes):
+class Dataset(Changes, Closing):
     """A folder of partition files with its manifest; make one with `create` or `open`.
 
     A context manager. One process at a time may write; any number may read, also meanwhile. What
@@ -156,17 +156,6 @@ class Dataset(Changes):
             self._columns.clear()
             if self._lock is not None:
                 os.close(self._lock)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     # Reading --------------------------------------------------------------------------------
 
