@@ -86,7 +86,7 @@ class Recording:
         """Record what is now."""
         env.robot_state.refresh()
         if self._action is not None:
-            np.copyto(self._action[1], self._action[0])
+            self._action[1][...] = self._action[0]
         if self._telemetry is not None:
             self._telemetry.record(env.stepper_state.t)
 

@@ -48,12 +48,13 @@ class RobotState(SharedArrays):
         self._stepper, self._when = stepper, -1
         self._simulation: Simulation | None = None
         self._equipment: Equipment | None = None
-        self._part, self._accelerates = slice(0, len(v)), False
+        self._part, self._accelerates, self._alone = slice(0, len(v)), False, True
 
     def connect(self, simulation: Simulation, equipment: Equipment, part: Part) -> None:
         """Read accelerations and torques from a simulation from now on."""
         self._accelerates = "accelerations" in simulation.features
         self._simulation, self._equipment, self._part = simulation, equipment, part.velocities
+        self._alone = simulation.layout.nv == len(self.v)
         self._when = -1
 
     def disconnect(self) -> None:
@@ -80,7 +81,7 @@ class RobotState(SharedArrays):
         self._when = frame
         if self._accelerates:
             found = simulation.accelerations()
-            self._a[:] = found if len(found) == len(self._a) else found[self._part]
+            self._a[:] = found if self._alone else found[self._part]
         equipment.torques(self._torques)
 
     def expire(self) -> None:
