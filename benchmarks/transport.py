@@ -223,8 +223,8 @@ def generation_large(root: Path) -> bool:
     What a file alone takes is measured too, for whoever stores a stream has to write it. It depends
     on where the memory of the system's cache comes from: a file in memory that was in use a moment
     ago is twice as fast as the raw stream, but a virtual machine may have to ask its host for each
-    page, and then it is ten times as slow. Where the raw stream and then the file alone would take
-    too long for the target, the target is nine tenths of what the two reach.
+    page, and then it is ten times as slow. So what the raw stream and then the file alone reach is
+    printed beside the claim.
     """
     values, rows = SIZES["48 kB"], 2000
     small = DatasetConfig(max_file_size=0.05)
@@ -257,7 +257,7 @@ def generation_large(root: Path) -> bool:
     file = share("a file alone", "raw TCP stream")
     both = 1 / (1 + 1 / file)
     print(f"  of the raw TCP stream: a file alone {file:.2f}, the two in turn {both:.2f}")
-    return claim("streamed to disk", of_raw, at_least=min(0.45, 0.9 * both))
+    return claim("streamed to disk", of_raw, at_least=0.45)
 
 
 def file_alone(path: Path, size: int, count: int) -> Iterator[int]:
