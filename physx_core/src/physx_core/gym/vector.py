@@ -18,8 +18,9 @@ from physx_core.errors import ActionError, ConfigError, UnknownOptionError, Usag
 from physx_core.fields import Array, Batch, Sample
 from physx_core.gym.making import make_env
 from physx_core.gym.space_fields import SpaceFields
-from physx_core.gym.vector_infos import joined, rows_of, with_numbers
-from physx_core.gym.vector_worker import COMMAND, FORBIDDEN, INFOS, VectorWorker, packed, unpacked
+from physx_core.gym.vector_infos import InfoLayout
+from physx_core.gym.vector_rows import ROW, RowLayout, text_value
+from physx_core.gym.vector_worker import COMMAND, FORBIDDEN, VectorWorker, packed
 from physx_core.scene import Event
 from physx_core.sources.clients import ClientSource
 
@@ -77,6 +78,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         self._describe(name, options, mode)
         share = -(-num_envs // min(processes or len(os.sched_getaffinity(0)), num_envs))
         self._share, self._copy = share, copy
+        has_finals = mode is AutoresetMode.SAME_STEP
+        self._row = RowLayout(self._observations, share, has_finals=has_finals)
         self._notes = _Notes()
         config = EnvironmentConfig(
             VectorWorker,
@@ -157,8 +160,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
                 for s, m in zip(self._shared(seeds), self._shared(mask.tolist()), strict=True)
             ],
         )
-        rows = self._answer()
-        return self._batch(rows), self._infos({})
+        records = self._answer()
+        return self._observed(records), self._infos(records, {})
 
     def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Step all environments.
@@ -175,17 +178,20 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             PhysxError: An environment raised, or a process failed.
         """
         self._open().apply(self._shares_of(actions), at_once=False)
-        rows = self._answer()
-        over = rows["terminated"] | rows["truncated"]
+        records = self._answer()
+        terminated = self._each(records["terminated"])
+        truncated = self._each(records["truncated"])
         finals: dict[int, Any] = {}
         if self._mode is AutoresetMode.SAME_STEP:
-            names = [field.name for field in self._observations.fields]
-            for i in np.flatnonzero(over).tolist():
-                arrays = {name: rows[f"final_{name}"][i].copy() for name in names}
+            last = {
+                f.name: self._each(records[f"final_{f.name}"]) for f in self._observations.fields
+            }
+            for i in np.flatnonzero(terminated | truncated).tolist():
+                arrays = {name: values[i].copy() for name, values in last.items()}
                 finals[i] = self._observations.value(arrays)
-        infos = self._infos(finals)
-        flags = rows["terminated"].copy(), rows["truncated"].copy()
-        return self._batch(rows), rows["reward"].copy(), *flags, infos
+        infos = self._infos(records, finals)
+        reward = self._each(records["reward"])
+        return self._observed(records), reward, terminated, truncated, infos
 
     def _shares_of(self, actions: Any) -> Batch:
         """Return the actions by client: arrays of shape (clients, share, *shape)."""
@@ -208,31 +214,37 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             shares[field.name] = array.reshape(self._clients, self._share, *wanted[1:])
         return shares
 
-    def _answer(self) -> Batch:
-        """Return what became of the last actions or commands, by field: (num_envs, *shape)."""
-        rows = self._open().batch(self._clients)
-        for number, row in enumerate(rows[INFOS], 1):
-            said = unpacked(row)
-            if isinstance(said, bytes):
-                self._notes.save_numbers(number, said)
-            elif said is not None:
-                self._notes.save_parameters(number, said)
-        return {
-            name: array.reshape(-1, *array.shape[2:])[: self.num_envs]
-            for name, array in rows.items()
-            if array.ndim > 1 and name != INFOS
-        }
+    def _answer(self) -> Array:
+        """Return what became of the last actions or commands, as records, shape (clients,)."""
+        records = self._row.records(self._open().batch(self._clients)[ROW])
+        if not records["has_numbers"].all():
+            for number, data in enumerate(records["infos"], 1):
+                said = None if records["has_numbers"][number - 1] else text_value(data)
+                if said is not None:
+                    self._notes.save_parameters(number, said)
+        return records
 
-    def _batch(self, rows: Batch) -> Any:
-        names = [field.name for field in self._observations.fields]
+    def _each(self, values: Array, *, copy: bool = True) -> Array:
+        """Return what clients sent, (clients, share, *shape), by environment."""
+        array = np.array(values) if copy else np.ascontiguousarray(values)
+        return array.reshape(-1, *array.shape[2:])[: self.num_envs]
+
+    def _observed(self, records: Array) -> Any:
         return self._observations.batch(
-            {name: rows[name].copy() if self._copy else rows[name] for name in names}
+            {
+                f.name: self._each(records[f.name], copy=self._copy)
+                for f in self._observations.fields
+            }
         )
 
-    def _infos(self, finals: Mapping[int, Any]) -> dict[str, Any]:
-        alike = None if finals else self._notes.take_columns(self._clients, self.num_envs)
+    def _infos(self, records: Array, finals: Mapping[int, Any]) -> dict[str, Any]:
+        has_numbers = records["has_numbers"]
+        alike = self._notes.layout if has_numbers.all() and not finals else None
         if alike is not None:
-            return alike
+            numbers = alike.records(records["infos"], self._share)
+            return alike.columns(numbers[: self.num_envs])
+        for place in np.flatnonzero(has_numbers).tolist():
+            self._notes.save_numbers(place + 1, records["infos"][place : place + 1], self._share)
         infos: dict[str, Any] = {}
         by_env = self._notes.take("infos", self._share)
         for i in range(self.num_envs):
@@ -302,26 +314,20 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
 
 
 class _Notes:
-    """What clients say beside their rows; the services of the run that they think they are in."""
+    """What clients say beside their rows; the services of the run that they think they are in.
+
+    Attributes:
+        layout: Layout of the infos of all clients; None where they differ.
+    """
 
     def __init__(self) -> None:
+        self.layout: InfoLayout | None = None
         self._said: dict[int, dict[str, Any]] = {}
-        self._columns: dict[int, dict[str, Any]] = {}
+        self._layouts: dict[int, InfoLayout] = {}
         self._left_out: set[str] = set()
-
-    def take_columns(self, clients: int, envs: int) -> dict[str, Any] | None:
-        """Return infos of all environments as `joined` does, and forget them; None: not alike."""
-        columns = [said["columns"] for _, said in sorted(self._said.items()) if "columns" in said]
-        whole = joined(columns, envs) if len(columns) == clients else None
-        if whole is not None:
-            self._said = {}
-        return whole
 
     def take(self, what: str, share: int) -> dict[int, Any]:
         """Return infos or results by environment, and forget them."""
-        for said in self._said.values():
-            if "columns" in said:
-                said["infos"] = rows_of(said["columns"])
         found = {
             (number - 1) * share + place: value
             for number, said in self._said.items()
@@ -333,8 +339,10 @@ class _Notes:
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
         """Keep what a client says before its row."""
         self._said[instance_id] = values
-        if "columns" in values:
-            self._columns[instance_id] = values["columns"]
+        if "layout" in values:
+            self._layouts[instance_id] = layout = InfoLayout(values["layout"])
+            differ = any(other.names != layout.names for other in self._layouts.values())
+            self.layout = None if differ else layout
         new = set(values.get("left_out", [])) - self._left_out
         if new:
             self._left_out |= new
@@ -344,9 +352,11 @@ class _Notes:
                 ", ".join(sorted(new)),
             )
 
-    def save_numbers(self, instance_id: int, numbers: bytes) -> None:
-        """Keep infos of a client that have the layout of its last ones."""
-        self._said[instance_id] = {"columns": with_numbers(self._columns[instance_id], numbers)}
+    def save_numbers(self, instance_id: int, data: Array, count: int) -> None:
+        """Keep infos of a client that are records of the layout that it told last."""
+        layout = self._layouts[instance_id]
+        records = layout.records(data, count)
+        self._said[instance_id] = {"infos": [layout.info(record) for record in records]}
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
         """Return nothing: workers do not ask."""

@@ -1,125 +1,159 @@
-"""Infos of several environments as columns: one array of numbers for each name."""
+"""Infos of several environments as records of numbers, where all have the same names."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-_PLAIN = (float, int, bool)
+from physx_core.fields import Array
+
+_CODES: dict[type[Any], str] = {
+    **{float: "d", int: "q", bool: "?"},
+    **{np.int8: "b", np.int16: "h", np.int32: "i", np.int64: "q"},
+    **{np.uint8: "B", np.uint16: "H", np.uint32: "I", np.uint64: "Q"},
+    **{np.float16: "e", np.float32: "f", np.float64: "d"},
+}
+_KINDS = {kind.__name__: kind for kind in _CODES}
 
 
-def columns_of(infos: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """Return arrays of shape (infos,), nested as the infos are; None: they are not all alike.
+class _Entry(NamedTuple):
+    """A name of an info: a number of some type, or a dictionary with entries of its own."""
 
-    Infos are alike if they have the same names, at least one, and numbers of the same types.
+    name: str
+    kind: type[Any]
+    below: list[_Entry]
+
+
+class InfoLayout:
+    """Names and types of infos that hold numbers alone, and dictionaries of them.
+
+    Attributes:
+        names: Pairs of a name and what it is: a type's name, or the pairs of a dictionary.
+        dtype: An info as a record; its fields are the numbers, in their order.
     """
-    first, found = infos[0], {}
-    differ = any(info.keys() != first.keys() for info in infos)
-    if differ or not first or "final_obs" in first:
-        return None
-    for name, value in first.items():
-        kind, values = type(value), [info[name] for info in infos]
-        if any(type(each) is not kind for each in values):
+
+    def __init__(self, names: Sequence[Any]) -> None:
+        """Take the names.
+
+        Raises:
+            ValueError: They are no names of numbers.
+        """
+        self.names = names
+        self._entries = _entries(names)
+        kinds = [*_kinds(self._entries)]
+        self.dtype = np.dtype([(str(place), kind) for place, kind in enumerate(kinds)])
+        self._codes = "".join(_CODES[kind] for kind in kinds)
+
+    @classmethod
+    def of(cls, info: Mapping[str, Any]) -> InfoLayout | None:
+        """Return the layout of an info; None: it holds nothing, or other things than numbers."""
+        try:
+            return cls(_names(info))
+        except ValueError:
             return None
-        if kind is dict:
-            column = columns_of(values)
-        elif kind in _PLAIN or issubclass(kind, np.number):
-            column = _column(values)
-        else:
-            return None
-        if column is None:
-            return None
-        found[name] = column
-    return found
+
+    def put(self, infos: Sequence[Mapping[str, Any]], target: Array) -> bool:
+        """Write infos as records, one behind the other.
+
+        Args:
+            infos: Dictionaries.
+            target: Bytes to write to, from their begin.
+
+        Returns:
+            Whether they are of this layout and there is room; otherwise nothing is written.
+        """
+        values: list[Any] = []
+        alike = all(_gather(self._entries, info, values) for info in infos)
+        if not alike or self.dtype.itemsize * len(infos) > len(target):
+            return False
+        try:
+            struct.pack_into("=" + self._codes * len(infos), target.data, 0, *values)
+        except struct.error:  # an integer is too large
+            return False
+        return True
+
+    def records(self, data: Array, count: int) -> Array:
+        """Return records that `put` wrote.
+
+        Args:
+            data: Bytes of several clients, shape (clients, bytes).
+            count: How many records each has room for.
+
+        Returns:
+            Shape (clients * count,).
+        """
+        return data[:, : count * self.dtype.itemsize].copy().view(self.dtype).reshape(-1)
+
+    def info(self, record: Any) -> dict[str, Any]:
+        """Return the info that a record was made of."""
+        return _info(self._entries, iter(record))
+
+    def columns(self, records: Array) -> dict[str, Any]:
+        """Return records as Gymnasium's infos of a vector environment.
+
+        Returns:
+            Each name with its array, shape (records,), and ``_name`` with which environments have
+            it: all.
+        """
+        columns = (records[name].copy() for name in self.dtype.names or ())
+        return _columns(self._entries, columns, len(records))
 
 
-def _column(values: list[Any]) -> Any:
-    try:
-        return np.array(values, type(values[0]))
-    except OverflowError:
-        return None
-
-
-def numbers_of(columns: Mapping[str, Any]) -> bytes:
-    """Return the numbers of columns alone, for one who knows columns of the same layout."""
-    return b"".join(array.tobytes() for array in _arrays(columns))
-
-
-def layout_of(columns: Mapping[str, Any]) -> list[Any]:
-    """Return what makes columns of the same names and types equal, whatever their numbers are."""
+def _names(info: Mapping[str, Any]) -> list[Any]:
     return [
-        (name, layout_of(column) if isinstance(column, dict) else column.dtype)
-        for name, column in columns.items()
+        (name, _names(value) if isinstance(value, dict) else type(value).__name__)
+        for name, value in info.items()
     ]
 
 
-def with_numbers(columns: Mapping[str, Any], numbers: bytes) -> dict[str, Any]:
-    """Return columns with the layout of others and with the numbers of `numbers_of`.
+def _entries(names: Sequence[Any]) -> list[_Entry]:
+    entries = []
+    for name, what in names:
+        kind = dict if isinstance(what, (list, tuple)) else _KINDS.get(what)
+        if kind is None or name.startswith("_") or name == "final_obs":  # Gymnasium's own
+            raise ValueError(f"{name} is no number")
+        entries.append(_Entry(name, kind, _entries(what) if kind is dict else []))
+    if not entries:
+        raise ValueError("there are no numbers")
+    return entries
 
-    Raises:
-        ValueError: There are more or fewer numbers.
-    """
-    if sum(array.nbytes for array in _arrays(columns)) != len(numbers):
-        raise ValueError(f"{len(numbers)} bytes are not the numbers of {list(columns)}")
-    return _filled(columns, numbers, [0])
 
-
-def _filled(columns: Mapping[str, Any], numbers: bytes, read: list[int]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, column in columns.items():
-        if isinstance(column, dict):
-            found[name] = _filled(column, numbers, read)
+def _kinds(entries: Sequence[_Entry]) -> Iterator[type[Any]]:
+    for _, kind, below in entries:
+        if below:
+            yield from _kinds(below)
         else:
-            found[name] = np.frombuffer(numbers, column.dtype, column.size, read[0])
-            read[0] += column.nbytes
-    return found
+            yield kind
 
 
-def _arrays(columns: Mapping[str, Any]) -> Iterator[Any]:
-    for column in columns.values():
-        if isinstance(column, dict):
-            yield from _arrays(column)
+def _gather(entries: Sequence[_Entry], info: Mapping[str, Any], values: list[Any]) -> bool:
+    """Add an info's numbers to a list; return whether it has these entries and no others."""
+    if len(info) != len(entries):
+        return False
+    for name, kind, below in entries:
+        value: Any = info.get(name)
+        if type(value) is not kind:
+            return False
+        if below:
+            if not _gather(below, value, values):
+                return False
         else:
-            yield column
+            values.append(value)
+    return True
 
 
-def rows_of(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the infos that columns were made of."""
-    rows = [
-        rows_of(column)
-        if isinstance(column, dict)
-        else column.tolist()
-        if column.dtype in _PLAIN
-        else list(column)
-        for column in columns.values()
-    ]
-    return [dict(zip(columns, values, strict=True)) for values in zip(*rows, strict=True)]
+def _info(entries: Sequence[_Entry], values: Iterator[Any]) -> dict[str, Any]:
+    return {
+        name: _info(below, values) if below else kind(next(values)) for name, kind, below in entries
+    }
 
 
-def joined(shares: Sequence[dict[str, Any]], count: int) -> dict[str, Any] | None:
-    """Return columns of several clients as Gymnasium's infos of a vector environment.
-
-    Args:
-        shares: The columns of each client.
-        count: How many environments they are of, together.
-
-    Returns:
-        Each name with its array, shape (count,), and ``_name`` with which environments have it;
-        None: the columns are not all alike.
-    """
-    first = shares[0]
-    if any(share.keys() != first.keys() for share in shares):
-        return None
+def _columns(entries: Sequence[_Entry], columns: Iterator[Array], count: int) -> dict[str, Any]:
     found: dict[str, Any] = {}
-    for name, value in first.items():
-        parts = [share[name] for share in shares]
-        kinds = {None if isinstance(part, dict) else part.dtype for part in parts}
-        if len(kinds) > 1:
-            return None
-        whole = joined(parts, count) if isinstance(value, dict) else np.concatenate(parts)
-        if whole is None:
-            return None
-        found[name], found[f"_{name}"] = whole, np.ones(count, np.bool_)
+    for name, _, below in entries:
+        found[name] = _columns(below, columns, count) if below else next(columns)
+        found[f"_{name}"] = np.ones(count, np.bool_)
     return found

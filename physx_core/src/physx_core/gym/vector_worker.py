@@ -10,30 +10,26 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from physx_core.errors import UsageError
-from physx_core.fields import Array, Field, Sample
+from physx_core.fields import Array, Sample
 from physx_core.gym.making import make_env
 from physx_core.gym.space_fields import SpaceFields
-from physx_core.gym.vector_infos import columns_of, layout_of, numbers_of
+from physx_core.gym.vector_infos import InfoLayout
+from physx_core.gym.vector_rows import LENGTH, ROW, RowLayout, put_text, text_value
 from physx_core.interfaces.environment import Environment
-from physx_core.transport.values import decode, encode
+from physx_core.transport.values import encode
 
 COMMAND = "command"
 """Entry of a prediction that is no action but says what else to do."""
-INFOS = "infos"
-"""Field of the infos as bytes, after their length."""
 FORBIDDEN = ("reset", "step", "close")
 """Methods that `call` does not call."""
-_LENGTH = 8
-_INFO_BYTES = 512
-"""Bytes of a row for the infos of each environment; longer ones go by another way."""
 
 
 class VectorWorker(Environment):
     """Steps some of a vector environment's environments; a row holds one step of all of them.
 
-    An action, or a command, comes as the prediction; the next row is what became of it. What has no
-    fixed shape, infos and returned values, goes by `save_parameters` before the row; infos that
-    are short go as bytes within the row, without waiting for an answer.
+    An action, or a command, comes as the prediction; the next row is what became of it, as one
+    record: see `RowLayout`. Infos that are too long for it, and what methods return, go by
+    `save_parameters` before the row, which waits for an answer.
     """
 
     def __init__(
@@ -64,7 +60,7 @@ class VectorWorker(Environment):
         self._mode = AutoresetMode(autoreset)
         self._envs: list[gymnasium.Env[Any, Any]] = []
         self._command: Mapping[str, Any] | None = None
-        self._layout: list[Any] = []  # of the infos that were sent last
+        self._infos: InfoLayout | None = None  # that was told last
 
     def create(self) -> None:
         """Make the environments."""
@@ -74,22 +70,14 @@ class VectorWorker(Environment):
         self._over = np.zeros(self._share, np.bool_)
 
     def init_database(self) -> None:
-        """Define the fields: each has a leading axis of the client's environments."""
-        fields = [
-            *self._observations.fields,
-            Field("reward", ()),
-            Field("terminated", (), "bool"),
-            Field("truncated", (), "bool"),
-        ]
-        if self._mode is AutoresetMode.SAME_STEP:
-            fields += [
-                Field(f"final_{field.name}", field.shape, field.dtype)
-                for field in self._observations.fields
-            ]
-        wide = [Field(f.name, (self._share, *(f.shape or ())), f.dtype) for f in fields]
-        wide.append(Field(INFOS, (_LENGTH + self._share * _INFO_BYTES,), "uint8"))
-        self._row = {f.name: np.zeros(f.shape or (), f.dtype) for f in wide}
-        self.define_training_fields(wide)
+        """Define the row."""
+        has_finals = self._mode is AutoresetMode.SAME_STEP
+        layout = RowLayout(self._observations, self._share, has_finals=has_finals)
+        record = np.zeros(1, layout.dtype)
+        self._row = {name: record[name][0] for name in layout.dtype.names or ()}
+        self._has_numbers = record["has_numbers"]
+        self._bytes = record.view(np.uint8)
+        self.define_training_fields([layout.field])
 
     def apply_prediction(self, prediction: Sample) -> None:
         """Keep the actions or the command for the next step."""
@@ -98,12 +86,13 @@ class VectorWorker(Environment):
     def step(self) -> None:
         """Do what the last prediction asked for."""
         command, self._command = self._command, None
-        self._row[INFOS][:_LENGTH] = 0
+        self._has_numbers[0] = False
+        self._row["infos"][:LENGTH] = 0
         if command is not None and COMMAND in command:
-            self._obey(unpacked(command[COMMAND]))
+            self._obey(text_value(command[COMMAND]))
         elif command is not None:
             self._advance(command)
-        self.set_training_data(**self._row)
+        self.set_training_data(**{ROW: self._bytes})
 
     def close(self) -> None:
         """Close the environments."""
@@ -173,31 +162,25 @@ class VectorWorker(Environment):
         """Send the infos, if there is anything in them; what cannot travel is named instead."""
         if not any(infos):
             return
-        named = [{str(name): value for name, value in info.items()} for info in infos]
-        columns = columns_of(named)
-        if columns is not None and self._tell_numbers(columns):
+        if self._infos is not None and self._infos.put(infos, self._row["infos"]):
+            self._has_numbers[0] = True
             return
-        said: dict[str, Any] = {"columns": columns} if columns else {"infos": named}
+        named = [{str(name): value for name, value in info.items()} for info in infos]
+        said: dict[str, Any] = {"infos": named}
+        layout = InfoLayout.of(named[0])
+        if layout is not None:
+            self._infos, said["layout"] = layout, layout.names
         try:
             text = encode(said, "infos")
         except UsageError:
             left_out: set[str] = set()
-            said = {"infos": [_plain(info, left_out) for info in infos]}
+            said["infos"] = [_plain(info, left_out) for info in infos]
             said["left_out"] = sorted(left_out)
             text = encode(said, "infos")
-        if _LENGTH + len(text) <= self._row[INFOS].size:
-            _put_text(self._row[INFOS], text)
+        if LENGTH + len(text) <= self._row["infos"].size:
+            put_text(self._row["infos"], text)
         else:
             self.save_parameters(**said)
-
-    def _tell_numbers(self, columns: dict[str, Any]) -> bool:
-        """Send the numbers alone, if they are of the layout that was sent last."""
-        known, self._layout = self._layout, layout_of(columns)
-        numbers = numbers_of(columns)
-        if known != self._layout or _LENGTH + len(numbers) > self._row[INFOS].size:
-            return False
-        _put_text(self._row[INFOS], numbers, are_numbers=True)
-        return True
 
 
 def _called(
@@ -228,24 +211,7 @@ def _plain(info: Mapping[str, Any], left_out: set[str]) -> dict[str, Any]:
 def packed(name: str, arguments: Sequence[Any]) -> Array:
     """Return a command for each client, as bytes of one length, shape (clients, bytes)."""
     texts = [encode({"name": name, "arguments": each}, name) for each in arguments]
-    rows = np.zeros((len(texts), _LENGTH + max(map(len, texts))), np.uint8)
+    rows = np.zeros((len(texts), LENGTH + max(map(len, texts))), np.uint8)
     for row, text in zip(rows, texts, strict=True):
-        _put_text(row, text)
+        put_text(row, text)
     return rows
-
-
-def _put_text(row: Array, text: bytes, *, are_numbers: bool = False) -> None:
-    """Write bytes to the begin of a row, after their length, which is negative for numbers."""
-    length = -len(text) if are_numbers else len(text)
-    whole = length.to_bytes(_LENGTH, "little", signed=True) + text
-    row[: len(whole)] = np.frombuffer(whole, np.uint8)
-
-
-def unpacked(row: Array) -> Any:
-    """Return the command of one client, or what a client says in a row; None: nothing.
-
-    Numbers of `numbers_of` are returned as they are, as bytes.
-    """
-    length = int.from_bytes(row[:_LENGTH].tobytes(), "little", signed=True)
-    text = row[_LENGTH : _LENGTH + abs(length)].tobytes()
-    return decode(text) if length > 0 else text if length < 0 else None
