@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import operator
 import os
@@ -19,7 +20,7 @@ from physx_core.fields import Array, Batch, Sample
 from physx_core.gym.making import make_env
 from physx_core.gym.space_fields import SpaceFields
 from physx_core.gym.vector_infos import InfoLayout
-from physx_core.gym.vector_rows import ROW, RowLayout, text_value
+from physx_core.gym.vector_rows import ROW, Info, RowLayout, text_value
 from physx_core.gym.vector_worker import COMMAND, FORBIDDEN, VectorWorker, packed
 from physx_core.scene import Event
 from physx_core.sources.clients import ClientSource
@@ -179,19 +180,15 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         """
         self._open().apply(self._shares_of(actions), at_once=False)
         records = self._answer()
-        terminated = self._each(records["terminated"])
-        truncated = self._each(records["truncated"])
+        terminated, truncated = records["terminated"].copy(), records["truncated"].copy()
         finals: dict[int, Any] = {}
         if self._mode is AutoresetMode.SAME_STEP:
-            last = {
-                f.name: self._each(records[f"final_{f.name}"]) for f in self._observations.fields
-            }
+            names = [field.name for field in self._observations.fields]
             for i in np.flatnonzero(terminated | truncated).tolist():
-                arrays = {name: values[i].copy() for name, values in last.items()}
+                arrays = {name: records[f"final_{name}"][i].copy() for name in names}
                 finals[i] = self._observations.value(arrays)
         infos = self._infos(records, finals)
-        reward = self._each(records["reward"])
-        return self._observed(records), reward, terminated, truncated, infos
+        return self._observed(records), records["reward"].copy(), terminated, truncated, infos
 
     def _shares_of(self, actions: Any) -> Batch:
         """Return the actions by client: arrays of shape (clients, share, *shape)."""
@@ -215,44 +212,38 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         return shares
 
     def _answer(self) -> Array:
-        """Return what became of the last actions or commands, as records, shape (clients,)."""
-        records = self._row.records(self._open().batch(self._clients)[ROW])
-        if not records["has_numbers"].all():
-            for number, data in enumerate(records["infos"], 1):
-                said = None if records["has_numbers"][number - 1] else text_value(data)
-                if said is not None:
-                    self._notes.save_parameters(number, said)
-        return records
-
-    def _each(self, values: Array, *, copy: bool = True) -> Array:
-        """Return what clients sent, (clients, share, *shape), by environment."""
-        array = np.array(values) if copy else np.ascontiguousarray(values)
-        return array.reshape(-1, *array.shape[2:])[: self.num_envs]
+        """Return what became of the last actions or commands, as records, shape (num_envs,)."""
+        return self._row.records(self._open().batch(self._clients)[ROW])[: self.num_envs]
 
     def _observed(self, records: Array) -> Any:
+        names = [field.name for field in self._observations.fields]
         return self._observations.batch(
-            {
-                f.name: self._each(records[f.name], copy=self._copy)
-                for f in self._observations.fields
-            }
+            {name: records[name].copy() if self._copy else records[name] for name in names}
         )
 
     def _infos(self, records: Array, finals: Mapping[int, Any]) -> dict[str, Any]:
-        has_numbers = records["has_numbers"]
-        alike = self._notes.layout if has_numbers.all() and not finals else None
-        if alike is not None:
-            numbers = alike.records(records["infos"], self._share)
-            return alike.columns(numbers[: self.num_envs])
-        for place in np.flatnonzero(has_numbers).tolist():
-            self._notes.save_numbers(place + 1, records["infos"][place : place + 1], self._share)
+        kinds, data = records["info"], records["infos"]
+        layout = self._notes.layout
+        if layout is not None and not finals and not (kinds == Info.TEXT).any():
+            given = kinds == Info.NUMBERS
+            return layout.columns(layout.records(data), given) if given.any() else {}
         infos: dict[str, Any] = {}
-        by_env = self._notes.take("infos", self._share)
-        for i in range(self.num_envs):
-            info = by_env.get(i, {})
+        told: list[tuple[int, dict[str, Any]]] = []
+        for i, kind in enumerate(kinds.tolist()):
+            client, place = divmod(i, self._share)
+            info: dict[str, Any] = {}
+            if kind == Info.NUMBERS:
+                info = self._notes.info(client, data[i])
+            elif kind == Info.TEXT:
+                said = text_value(data[i]) or self._notes.said(client)["infos"][str(place)]
+                told.append((client, said))
+                info = said["info"]
             if i in finals:
                 info = {"final_obs": finals[i], **info}
             if info:
                 infos = self._add_info(infos, info, i)
+        for client, said in told:  # from the next row on
+            self._notes.learn(client, said)
         return infos
 
     # Everything else ------------------------------------------------------------------------
@@ -267,8 +258,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             raise UsageError(f'call("{name}") would go past this object: use {name}() itself.')
         self._command("call", [(name, list(args), kwargs)] * self._clients)
         self._answer()
-        results = self._notes.take("results", self._share)
-        return tuple(results.get(i) for i in range(self.num_envs))
+        results = [self._notes.said(client)["results"] for client in range(self._clients)]
+        return tuple(itertools.chain.from_iterable(results))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Return an attribute of each environment."""
@@ -317,7 +308,7 @@ class _Notes:
     """What clients say beside their rows; the services of the run that they think they are in.
 
     Attributes:
-        layout: Layout of the infos of all clients; None where they differ.
+        layout: Layout of the infos of all clients that told one; None where they differ.
     """
 
     def __init__(self) -> None:
@@ -326,24 +317,22 @@ class _Notes:
         self._layouts: dict[int, InfoLayout] = {}
         self._left_out: set[str] = set()
 
-    def take(self, what: str, share: int) -> dict[int, Any]:
-        """Return infos or results by environment, and forget them."""
-        found = {
-            (number - 1) * share + place: value
-            for number, said in self._said.items()
-            for place, value in enumerate(said.get(what, []))
-        }
-        self._said = {}
-        return found
+    def said(self, client: int) -> dict[str, Any]:
+        """Return what a client, counted from 0, said before its last row."""
+        return self._said[client]
 
-    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Keep what a client says before its row."""
-        self._said[instance_id] = values
-        if "layout" in values:
-            self._layouts[instance_id] = layout = InfoLayout(values["layout"])
+    def info(self, client: int, data: Array) -> dict[str, Any]:
+        """Return an info that is a record of the layout that a client told last."""
+        layout = self._layouts[client]
+        return layout.info(layout.records(data[np.newaxis])[0])
+
+    def learn(self, client: int, said: Mapping[str, Any]) -> None:
+        """Note the layout that was told with an info; warn of what was left out."""
+        if "layout" in said:
+            self._layouts[client] = layout = InfoLayout(said["layout"])
             differ = any(other.names != layout.names for other in self._layouts.values())
             self.layout = None if differ else layout
-        new = set(values.get("left_out", [])) - self._left_out
+        new = set(said.get("left_out", [])) - self._left_out
         if new:
             self._left_out |= new
             _LOG.warning(
@@ -352,11 +341,9 @@ class _Notes:
                 ", ".join(sorted(new)),
             )
 
-    def save_numbers(self, instance_id: int, data: Array, count: int) -> None:
-        """Keep infos of a client that are records of the layout that it told last."""
-        layout = self._layouts[instance_id]
-        records = layout.records(data, count)
-        self._said[instance_id] = {"infos": [layout.info(record) for record in records]}
+    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
+        """Keep what a client says before its row."""
+        self._said[instance_id - 1] = values
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
         """Return nothing: workers do not ask."""

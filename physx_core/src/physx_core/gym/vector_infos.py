@@ -45,7 +45,7 @@ class InfoLayout:
         self._entries = _entries(names)
         kinds = [*_kinds(self._entries)]
         self.dtype = np.dtype([(str(place), kind) for place, kind in enumerate(kinds)])
-        self._codes = "".join(_CODES[kind] for kind in kinds)
+        self._codes = "=" + "".join(_CODES[kind] for kind in kinds)
 
     @classmethod
     def of(cls, info: Mapping[str, Any]) -> InfoLayout | None:
@@ -55,51 +55,47 @@ class InfoLayout:
         except ValueError:
             return None
 
-    def put(self, infos: Sequence[Mapping[str, Any]], target: Array) -> bool:
-        """Write infos as records, one behind the other.
+    def put(self, info: Mapping[str, Any], target: Array) -> bool:
+        """Write an info as a record.
 
         Args:
-            infos: Dictionaries.
+            info: A dictionary.
             target: Bytes to write to, from their begin.
 
         Returns:
-            Whether they are of this layout and there is room; otherwise nothing is written.
+            Whether it is of this layout and there is room; otherwise nothing is written.
         """
         values: list[Any] = []
-        alike = all(_gather(self._entries, info, values) for info in infos)
-        if not alike or self.dtype.itemsize * len(infos) > len(target):
+        if not _gather(self._entries, info, values) or self.dtype.itemsize > len(target):
             return False
         try:
-            struct.pack_into("=" + self._codes * len(infos), target.data, 0, *values)
+            struct.pack_into(self._codes, target.data, 0, *values)
         except struct.error:  # an integer is too large
             return False
         return True
 
-    def records(self, data: Array, count: int) -> Array:
-        """Return records that `put` wrote.
-
-        Args:
-            data: Bytes of several clients, shape (clients, bytes).
-            count: How many records each has room for.
-
-        Returns:
-            Shape (clients * count,).
-        """
-        return data[:, : count * self.dtype.itemsize].copy().view(self.dtype).reshape(-1)
+    def records(self, data: Array) -> Array:
+        """Return the records that begin each row of bytes, shape (rows,)."""
+        return data[:, : self.dtype.itemsize].copy().view(self.dtype)[:, 0]
 
     def info(self, record: Any) -> dict[str, Any]:
         """Return the info that a record was made of."""
         return _info(self._entries, iter(record))
 
-    def columns(self, records: Array) -> dict[str, Any]:
+    def columns(self, records: Array, given: Array) -> dict[str, Any]:
         """Return records as Gymnasium's infos of a vector environment.
 
+        Args:
+            records: Shape (environments,).
+            given: Which of them are given, shape (environments,); the others count as zeros.
+
         Returns:
-            Each name with its array, shape (records,), and ``_name`` with which environments have
-            it: all.
+            Each name with its array, shape (environments,), and ``_name`` with which environments
+            have it.
         """
-        columns = (records[name].copy() for name in self.dtype.names or ())
-        return _columns(self._entries, columns, len(records))
+        if not given.all():
+            records[~given] = 0
+        return _columns(self._entries, (records[name] for name in self.dtype.names or ()), given)
 
 
 def _names(info: Mapping[str, Any]) -> list[Any]:
@@ -151,9 +147,9 @@ def _info(entries: Sequence[_Entry], values: Iterator[Any]) -> dict[str, Any]:
     }
 
 
-def _columns(entries: Sequence[_Entry], columns: Iterator[Array], count: int) -> dict[str, Any]:
+def _columns(entries: Sequence[_Entry], columns: Iterator[Array], given: Array) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, _, below in entries:
-        found[name] = _columns(below, columns, count) if below else next(columns)
-        found[f"_{name}"] = np.ones(count, np.bool_)
+        found[name] = _columns(below, columns, given) if below else next(columns).copy()
+        found[f"_{name}"] = given.copy()
     return found

@@ -1,7 +1,8 @@
-"""What a client of a parallel vector environment sends after each step: one record of bytes."""
+"""What a client of a parallel vector environment sends after each step: records of bytes."""
 
 from __future__ import annotations
 
+import enum
 from typing import Any
 
 import numpy as np
@@ -11,20 +12,30 @@ from physx_core.gym.space_fields import SpaceFields
 from physx_core.transport.values import decode
 
 ROW = "row"
-"""Name of the field that holds the record."""
+"""Name of the field that holds the records."""
 LENGTH = 8
 """Bytes of the length in front of a text."""
 _INFO_BYTES = 512
 
 
+class Info(enum.IntEnum):
+    """How a record holds an info."""
+
+    NONE = 0
+    """There is none."""
+    NUMBERS = 1
+    """As a record of the layout that the client told last."""
+    TEXT = 2
+    """As a text, or not at all if that is empty: then it came before the row."""
+
+
 class RowLayout:
-    """Where everything lies in a row; each entry has a leading axis of the client's environments.
+    """Where everything lies in a row, which has a record for each of a client's environments.
 
     Attributes:
-        dtype: The row as a record: the observation's fields; ``reward``, ``terminated`` and
-            ``truncated``; in front of each field of the observation ``final_`` for that of an
-            episode that is over; ``has_numbers``: whether infos are records of the layout that was
-            told last; ``infos``: those, or a text after its length, which is 0 for none.
+        dtype: A record: the fields of the observation; ``reward``, ``terminated``, ``truncated``;
+            the fields of the last observation of an episode that is over, where such are sent, with
+            ``final_`` in front; ``info``: an `Info`; ``infos``: the bytes of the info.
         field: The row as a field of bytes.
     """
 
@@ -34,25 +45,19 @@ class RowLayout:
         Args:
             observations: Fields of an observation.
             share: How many environments a client has.
-            has_finals: Whether rows hold the last observations of episodes that are over.
+            has_finals: Whether last observations are sent.
         """
-        entries = [(f.name, f.dtype, (share, *(f.shape or ()))) for f in observations.fields]
+        entries = [(field.name, field.dtype, field.shape or ()) for field in observations.fields]
         finals = [(f"final_{name}", *rest) for name, *rest in entries if has_finals]
-        each: list[Any] = [
-            *entries,
-            ("reward", "float64", (share,)),
-            ("terminated", "bool", (share,)),
-            ("truncated", "bool", (share,)),
-            *finals,
-            ("has_numbers", "bool"),
-            ("infos", "uint8", (LENGTH + share * _INFO_BYTES,)),
-        ]
+        flags = [("terminated", "bool"), ("truncated", "bool")]
+        info = [("info", "uint8"), ("infos", "uint8", (_INFO_BYTES,))]
+        each: list[Any] = [*entries, ("reward", "float64"), *flags, *finals, *info]
         self.dtype = np.dtype(each, align=True)
-        self.field = Field(ROW, (self.dtype.itemsize,), "uint8")
+        self.field = Field(ROW, (share * self.dtype.itemsize,), "uint8")
 
     def records(self, rows: Array) -> Array:
-        """Return rows of bytes, shape (clients, bytes), as records, shape (clients,)."""
-        return rows.view(self.dtype)[:, 0]
+        """Return the records of rows, shape (rows, bytes), one behind the other."""
+        return rows.reshape(-1).view(self.dtype)
 
 
 def put_text(target: Array, text: bytes) -> None:
@@ -62,6 +67,6 @@ def put_text(target: Array, text: bytes) -> None:
 
 
 def text_value(data: Array) -> Any:
-    """Return the value of a text that `put_text` wrote; None: there is none."""
+    """Return the value of a text that `put_text` wrote; None: it is empty."""
     length = int.from_bytes(data[:LENGTH].tobytes(), "little")
     return decode(data[LENGTH : LENGTH + length].tobytes()) if length else None

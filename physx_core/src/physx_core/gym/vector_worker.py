@@ -14,7 +14,7 @@ from physx_core.fields import Array, Sample
 from physx_core.gym.making import make_env
 from physx_core.gym.space_fields import SpaceFields
 from physx_core.gym.vector_infos import InfoLayout
-from physx_core.gym.vector_rows import LENGTH, ROW, RowLayout, put_text, text_value
+from physx_core.gym.vector_rows import LENGTH, ROW, Info, RowLayout, put_text, text_value
 from physx_core.interfaces.environment import Environment
 from physx_core.transport.values import encode
 
@@ -27,9 +27,9 @@ FORBIDDEN = ("reset", "step", "close")
 class VectorWorker(Environment):
     """Steps some of a vector environment's environments; a row holds one step of all of them.
 
-    An action, or a command, comes as the prediction; the next row is what became of it, as one
-    record: see `RowLayout`. Infos that are too long for it, and what methods return, go by
-    `save_parameters` before the row, which waits for an answer.
+    An action, or a command, comes as the prediction; the next row is what became of it: see
+    `RowLayout`. Infos that are too long for it, and what methods return, go by `save_parameters`
+    before the row, which waits for an answer.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class VectorWorker(Environment):
         self._mode = AutoresetMode(autoreset)
         self._envs: list[gymnasium.Env[Any, Any]] = []
         self._command: Mapping[str, Any] | None = None
-        self._infos: InfoLayout | None = None  # that was told last
+        self._layout: InfoLayout | None = None  # of infos, that was told last
 
     def create(self) -> None:
         """Make the environments."""
@@ -73,10 +73,9 @@ class VectorWorker(Environment):
         """Define the row."""
         has_finals = self._mode is AutoresetMode.SAME_STEP
         layout = RowLayout(self._observations, self._share, has_finals=has_finals)
-        record = np.zeros(1, layout.dtype)
-        self._row = {name: record[name][0] for name in layout.dtype.names or ()}
-        self._has_numbers = record["has_numbers"]
-        self._bytes = record.view(np.uint8)
+        records = np.zeros(self._share, layout.dtype)
+        self._row = {name: records[name] for name in layout.dtype.names or ()}
+        self._bytes = records.view(np.uint8)
         self.define_training_fields([layout.field])
 
     def apply_prediction(self, prediction: Sample) -> None:
@@ -86,8 +85,6 @@ class VectorWorker(Environment):
     def step(self) -> None:
         """Do what the last prediction asked for."""
         command, self._command = self._command, None
-        self._has_numbers[0] = False
-        self._row["infos"][:LENGTH] = 0
         if command is not None and COMMAND in command:
             self._obey(text_value(command[COMMAND]))
         elif command is not None:
@@ -160,27 +157,36 @@ class VectorWorker(Environment):
 
     def _tell(self, infos: Sequence[dict[str, Any]]) -> None:
         """Send the infos, if there is anything in them; what cannot travel is named instead."""
-        if not any(infos):
-            return
-        if self._infos is not None and self._infos.put(infos, self._row["infos"]):
-            self._has_numbers[0] = True
-            return
-        named = [{str(name): value for name, value in info.items()} for info in infos]
-        said: dict[str, Any] = {"infos": named}
-        layout = InfoLayout.of(named[0])
+        known, long = self._layout, {}
+        for place, info in enumerate(infos):
+            target = self._row["infos"][place]
+            if not info:
+                self._row["info"][place] = Info.NONE
+            elif known is not None and known.put(info, target):
+                self._row["info"][place] = Info.NUMBERS
+            else:
+                self._row["info"][place] = Info.TEXT
+                said, text = self._said(info)
+                is_long = LENGTH + len(text) > len(target)
+                put_text(target, b"" if is_long else text)
+                if is_long:
+                    long[str(place)] = said
+        if long:
+            self.save_parameters(infos=long)
+
+    def _said(self, info: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
+        """Return an info as a value and as a text, with its layout, which the next may have."""
+        said: dict[str, Any] = {"info": {str(name): value for name, value in info.items()}}
+        layout = InfoLayout.of(said["info"])
         if layout is not None:
-            self._infos, said["layout"] = layout, layout.names
+            self._layout, said["layout"] = layout, layout.names
         try:
-            text = encode(said, "infos")
+            return said, encode(said, "infos")
         except UsageError:
             left_out: set[str] = set()
-            said["infos"] = [_plain(info, left_out) for info in infos]
+            said["info"] = _plain(said["info"], left_out)
             said["left_out"] = sorted(left_out)
-            text = encode(said, "infos")
-        if LENGTH + len(text) <= self._row["infos"].size:
-            put_text(self._row["infos"], text)
-        else:
-            self.save_parameters(**said)
+            return said, encode(said, "infos")
 
 
 def _called(
