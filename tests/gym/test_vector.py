@@ -70,6 +70,11 @@ class Talker(Counter):
         lambda n: {"speed": -0.5 * n, "reward": {"alive": False, "effort": np.float32(-n)}},
         lambda n: {"speed": n, "reward": {"alive": True, "effort": np.float32(n)}},
         lambda n: {"speed": n} if n % 2 else {"other": np.int16(n)},
+        lambda n: {"speed": 0.25 * n},
+        lambda n: {"speed": 0.5 * n},
+        lambda n: {"speed": 0.5 * n} if n % 2 else {},
+        lambda n: {"speed": 7} if n % 2 else {"speed": 1.5},
+        lambda n: {"long": np.arange(100.0), "speed": n},
         lambda n: {"speed": 0.5 if n > 10 else 1, "nothing": {}},
         lambda n: {"speed": np.arange(3.0), "word": "yes"},
         lambda n: {"speed": 3},
@@ -88,6 +93,16 @@ class Talker(Counter):
     def step(self, action):
         found = self.TALK[self.count % len(self.TALK)](self.start + self.count)
         return *super().step(action)[:4], found
+
+
+class Broken(Counter):
+    """Its numbers are none."""
+
+    def observe(self):
+        return {**super().observe(), "count": np.array([np.nan, np.inf])}
+
+    def step(self, action):
+        return self.observe(), np.nan, False, False, {"speed": np.nan}
 
 
 class Unstorable(Counter):
@@ -148,6 +163,18 @@ def test_infos_whose_layout_changes(count, nothing_stays_behind):
         same(ours.reset(seed=8), theirs.reset(seed=8))
         for _ in range(2 * len(Talker.TALK)):
             same(ours.step(actions)[4], theirs.step(actions)[4])
+
+
+def test_numbers_that_are_none_are_handed_on(nothing_stays_behind):
+    ours, theirs = (
+        ParallelVectorEnv(HERE + "Broken", 2, processes=2),
+        SyncVectorEnv([Broken] * 2),
+    )
+    actions = {"kind": np.zeros(2, int), "size": np.zeros((2, 1), np.float32)}
+    with contextlib.closing(ours):
+        same(ours.reset(seed=8), theirs.reset(seed=8))
+        for _ in range(3):
+            same(ours.step(actions), theirs.step(actions))
 
 
 def test_nested_spaces_infos_calls_and_attributes(caplog, nothing_stays_behind):
