@@ -58,8 +58,16 @@ def raw_answers(connection: socket.socket, size: int, count: int) -> int:
 
 def raw_stream(connection: socket.socket, size: int, count: int) -> int:
     """Read so many messages in blocks of 256 kB."""
+    for _ in raw_blocks(connection, size, count):
+        pass
+    return count
+
+
+def raw_blocks(connection: socket.socket, size: int, count: int) -> Iterator[memoryview]:
+    """Read so many messages; yield each block of at most 256 kB, valid until the next one."""
     buffer, missing = memoryview(bytearray(1 << 18)), size * count
     connection.sendall(count.to_bytes(8, "little"))
     while missing:
-        missing -= connection.recv_into(buffer, min(missing, len(buffer)))
-    return count
+        received = connection.recv_into(buffer, min(missing, len(buffer)))
+        missing -= received
+        yield buffer[:received]
