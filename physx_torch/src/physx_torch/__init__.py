@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from physx_core.openmp import rest_soon
+
 if TYPE_CHECKING:
     from physx_torch.data import StoredDataset
     from physx_torch.forward_dynamics import ForwardDynamics
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
     from physx_torch.transformation import TorchTransformation
 
 __version__ = "0.1.0"
+
+rest_soon()
 
 _HOMES = {
     "EncoderDecoder": "networks.encoder_decoder",

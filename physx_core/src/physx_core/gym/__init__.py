@@ -1,7 +1,8 @@
 """Robots as Gymnasium environments, on any engine.
 
 The public names are imported when they are first used. Importing the package registers its
-environments with Gymnasium, ``physx/Cartpole-v0`` and others.
+environments with Gymnasium, ``physx/Cartpole-v0`` and others, and has OpenMP's threads rest soon,
+so that a policy's network leaves the processor to them: import it before the network's library.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from physx_core.gym.registration import register
+from physx_core.openmp import rest_soon
 
 if TYPE_CHECKING:
     from physx_core.gym.blocks import (
@@ -118,3 +120,4 @@ def __dir__() -> list[str]:
 
 
 register()
+rest_soon()
