@@ -224,9 +224,12 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
     def _infos(self, records: Array, finals: Mapping[int, Any]) -> dict[str, Any]:
         kinds, data = records["info"], records["infos"]
         layout = self._notes.layout
-        if layout is not None and not finals and not (kinds == Info.TEXT).any():
-            given = kinds == Info.NUMBERS
-            return layout.columns(layout.records(data), given) if given.any() else {}
+        found = kinds.tobytes()
+        if Info.TEXT not in found and not finals:
+            if Info.NUMBERS not in found:
+                return {}
+            if layout is not None:
+                return layout.columns(layout.records(data), kinds == Info.NUMBERS)
         infos: dict[str, Any] = {}
         told: list[tuple[int, dict[str, Any]]] = []
         for i, kind in enumerate(kinds.tolist()):

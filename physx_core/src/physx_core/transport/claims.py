@@ -153,7 +153,7 @@ def check_rows(block: Batch, instance_id: int, last_step: int) -> int:
             raise ConnectionRefusedByPeerError(
                 f'It sent rows whose field "{name}" is neither true nor false.'
             )
-        if not is_finite(values):
+        if kind in "fc" and not is_finite(values):
             row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
             raise NotFiniteError(
                 f'field "{name}" holds NaN or an infinite number.',
