@@ -11,6 +11,9 @@ from physx_core.errors import ConnectionRefusedByPeerError
 from physx_core.fields import Array, Batch, Field
 from physx_core.transport.frames import Kind, header
 
+_SMALL = 1 << 14
+"""Bytes of rows that are quicker copied than sent in parts."""
+
 
 def row_bytes(fields: Sequence[Field]) -> int:
     """Return the bytes of one row; all shapes are known."""
@@ -18,7 +21,7 @@ def row_bytes(fields: Sequence[Field]) -> int:
 
 
 def pack_rows(block: Batch, count: int, kind: Kind = Kind.ROWS) -> list[bytes | memoryview]:
-    """Return the message that carries a block of rows, in parts: the rows are not copied.
+    """Return the message that carries a block of rows, in parts: many rows are not copied.
 
     Args:
         block: Field name to contiguous array of shape (count, *field shape).
@@ -30,7 +33,10 @@ def pack_rows(block: Batch, count: int, kind: Kind = Kind.ROWS) -> list[bytes | 
     """
     arrays = list(block.values())
     length = sum(array.nbytes for array in arrays)
-    return [header(kind, length, count), *(array.reshape(-1).view("u1").data for array in arrays)]
+    begin = header(kind, length, count)
+    if length <= _SMALL:
+        return [b"".join((begin, *(array.data for array in arrays)))]
+    return [begin, *(array.reshape(-1).view("u1").data for array in arrays)]
 
 
 def unpack_rows(payload: bytearray, fields: Sequence[Field], count: int) -> Batch:
