@@ -93,6 +93,9 @@ class Wanderer(Environment):
 
     # Ways to break --------------------------------------------------------------------------
 
+    def dawdle(self):
+        time.sleep(0.5)
+
     def fail(self):
         raise RuntimeError("no more beans")
 

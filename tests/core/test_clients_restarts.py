@@ -108,6 +108,18 @@ def test_rows_depend_on_the_seed_alone(clients, batch_services, kill_one, asks):
     assert len(hashes) == 1
 
 
+def test_the_run_ends_before_a_client_that_was_started_again_has_joined(
+    clients, batch_services, process_ids, caplog, nothing_stays_behind
+):
+    arguments = {"fault": "dawdle", "place": "close", "pace": 0.1}
+    source = clients(WANDERER, num_clients=2, env_kwargs=arguments, run_ahead=0, restarts=1)
+    with source:
+        source.batch(3)
+        os.kill(process_ids()[1], signal.SIGKILL)
+        source.batch(1)  # of instance 2
+    assert "Restart 1 of 1" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("fault", "place"),
     [

@@ -141,7 +141,8 @@ class ClientGroup:
         patience = 0.0
         self._closing = True
         try:
-            stop([h for n, h in self._handles.items() if self._present(n) is None], 0.0)
+            absent = [number for number in self._handles if self._present(number) is None]
+            stop([self._handles.pop(number) for number in absent], 0.0)
             self.server.end()
             if orderly:
                 self.wait(self._unfinished)
