@@ -35,6 +35,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/backends.py
 	$(BIN)/python benchmarks/differentiable.py
 	$(BIN)/python benchmarks/gym.py
+	$(BIN)/python benchmarks/idle_threads.py
 	$(BIN)/python benchmarks/remote.py
 
 clean:
