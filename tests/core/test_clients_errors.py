@@ -98,6 +98,20 @@ def test_an_error_in_a_row_that_nobody_asked_for_is_no_error(clients):
         time.sleep(0.1)
 
 
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_an_error_far_ahead_waits_until_the_server_hears_it(clients, process_ids, goes_on):
+    kwargs = {"value": np.full(2, np.nan), "at": 30_000}
+    with clients("Bad", run_ahead=40_000, env_kwargs=kwargs) as source:
+        assert len(source.batch(5)["x"]) == 5
+        until = time.monotonic() + 1.0  # for more rows than a socket holds, and the error
+        while process_ids() and time.monotonic() < until:
+            time.sleep(0.01)
+        if goes_on:
+            assert source.batch(29_995)["step"][-1] == 29_999
+            with pytest.raises(NotFiniteError, match="Instance 1, step 30000"):
+                source.batch(1)
+
+
 def test_a_missing_field_and_wrong_samples_are_as_in_process(errors_of):
     (local, _), (error, _) = errors_of(
         "Walk", [3], env_kwargs={"refuse": 1}, max_wrong_samples_per_step=4

@@ -77,11 +77,10 @@ def _serve(link: Link, setup: dict[str, Any], say: Callable[[str], None]) -> int
         raise ServerGone
     with contextlib.suppress(ServerGone):  # the run has ended, for whatever reason
         link.send(pack(Kind.BYE))
-    if client.failure is not None:
-        say(f"{type(client.failure).__name__}: {client.failure}")
-        return 1
-    say("the run has ended")
-    return 0
+    failure = client.failure
+    say("the run has ended" if failure is None else f"{type(failure).__name__}: {failure}")
+    link.finish()
+    return 0 if failure is None else 1
 
 
 def _take_place(path: list[str], directory: str) -> None:

@@ -20,6 +20,7 @@ from physx_core.transport.values import decode, pack_value
 
 _AWAKE_TIME = 2e-4
 _CLEANUP_TIME = 1.0
+_REST = 1 << 16
 _MOST_PARTS = 512  # a system call takes no more than 1024
 _HANGUP = getattr(select, "POLLRDHUP", 0)
 
@@ -136,6 +137,16 @@ class Link:
                 if frame.kind is Kind.REFUSAL:
                     raise decode_error(frame.payload)
                 return decode(frame.payload)
+
+    def finish(self) -> None:
+        """Wait until the server has read all that was sent and has closed the connection.
+
+        What a socket still has to send is lost once it is closed and the other side sends to it.
+        """
+        with contextlib.suppress(OSError):
+            self._connection.shutdown(socket.SHUT_WR)
+            while self._connection.recv(_REST):
+                pass
 
     def close(self) -> None:
         """Close the connection."""

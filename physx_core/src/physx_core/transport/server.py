@@ -326,6 +326,7 @@ class Server:
         if not (self._ending or peer.failure):
             raise ConnectionRefusedByPeerError("It said that it is done, but nobody ended the run.")
         peer.finished = peer.failure is None
+        self._drop(peer)  # for which it waits
 
 
 def _ready(peer: Peer, frame: Frame) -> None:
