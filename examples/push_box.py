@@ -2,10 +2,10 @@
 
     python examples/push_box.py                             # 20 episodes
     python examples/push_box.py --episodes 5 --render push_box.rrd
-    python examples/push_box.py --learn 200000              # PPO of stable-baselines3 instead
+    python examples/push_box.py --learn 300000              # PPO of stable-baselines3 instead
 
-Prints how many episodes succeeded; exits with 1 if the scripted policy failed in more than one of
-ten. `--render` writes the last episode as a recording that Rerun opens.
+Prints how many episodes succeeded; exits with 1 if the policy failed in more than one of ten.
+`--render` writes the last episode as a recording that Rerun opens.
 """
 
 import argparse
@@ -47,8 +47,9 @@ def learned(steps, seed):
     from stable_baselines3.common.env_util import make_vec_env
 
     torch.set_num_threads(1)
-    many = make_vec_env("physx/PushBox-v0", n_envs=8, seed=seed)
-    settings = {"n_steps": 256, "batch_size": 512, "learning_rate": 3e-4, "gamma": 0.98}
+    many = make_vec_env("physx/PushBox-v0", n_envs=16, seed=seed)
+    settings = {"n_steps": 128, "batch_size": 512, "n_epochs": 8, "learning_rate": 5e-4}
+    settings |= {"gamma": 0.98, "policy_kwargs": {"net_arch": [128, 128]}}
     model = PPO("MlpPolicy", many, seed=seed, device="cpu", **settings)
     model.learn(steps)
     many.close()
@@ -83,7 +84,7 @@ def main():
     if chosen.render:
         print(f"recorded {base.replay(path=chosen.render)}")
     env.close()
-    return 0 if chosen.learn or successes >= 0.9 * chosen.episodes else 1
+    return 0 if successes >= 0.9 * chosen.episodes else 1
 
 
 if __name__ == "__main__":
