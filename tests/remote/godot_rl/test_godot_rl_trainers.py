@@ -116,6 +116,16 @@ def test_clean_rl_sees_the_episodes_of_an_environment_in_this_process(train):
     assert len({tuple(observation) for observation in first}) == 3, "agents differ"
 
 
+def test_stable_baselines_learns_in_environments_that_its_wrapper_starts(train, tmp_path):
+    launcher = write_launcher(tmp_path / "cart.x86_64", "gym/CartPole-v1", num_worlds=2)
+    told = train("stable_baselines", launcher)
+    assert told["num_envs"] == 4
+    assert told["updates"] == 20, "ten epochs after each 256 steps"
+    lengths, returns = told["ends"]
+    assert len(lengths) > 8
+    assert lengths == returns, "the reward of each step is 1"
+
+
 def test_petting_zoo(train):
     told = train("petting_zoo", worlds=open_worlds(CART, 3, {"length": 1}))
     assert told["agents"] == [0, 1, 2]

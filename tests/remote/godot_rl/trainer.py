@@ -49,6 +49,20 @@ def clean_rl(port, path):
     return {"num_envs": env.num_envs, "seen": seen, "ends": ends, "statuses": statuses}
 
 
+def stable_baselines(port, path):
+    from godot_rl.wrappers.stable_baselines_wrapper import StableBaselinesGodotEnv
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env.vec_monitor import VecMonitor
+
+    env = VecMonitor(StableBaselinesGodotEnv(env_path=path, n_parallel=2, seed=11, port=port))
+    model = PPO("MultiInputPolicy", env, n_steps=64, batch_size=64, device="cpu")
+    model.learn(512)
+    env.close()
+    lengths = [int(episode["l"]) for episode in model.ep_info_buffer]
+    returns = [float(episode["r"]) for episode in model.ep_info_buffer]
+    return {"num_envs": env.num_envs, "updates": model._n_updates, "ends": [lengths, returns]}
+
+
 def petting_zoo(port, path):
     from godot_rl.wrappers.petting_zoo_wrapper import GDRLPettingZooEnv
 
