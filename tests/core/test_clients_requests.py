@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
 from pathlib import Path
 
@@ -150,6 +152,34 @@ def test_a_client_at_its_end_stays_until_the_server_has_read_what_it_sent(
     assert len(shown) > 1000
     assert ended == [False]
     assert has_ended(closing[0])
+
+
+def test_what_a_client_sent_before_it_was_killed_is_read(clients, services, process_ids):
+    """The server is slow, and thousands of messages of a process that is no more wait."""
+    shown, killing = [], []
+
+    def show(instance_id, step, events):
+        if killing:
+            time.sleep(1.0)  # meanwhile the client gets ahead
+            os.kill(killing[0], signal.SIGKILL)
+            while not has_ended(killing[0]):
+                time.sleep(0.01)
+            killing.clear()
+        if len(shown) % 500 == 0:
+            time.sleep(0.3)
+        shown.append(step)
+
+    services.show = show
+    with (
+        pytest.raises(ClientError, match="killed by signal 9"),
+        clients("Drawing", run_ahead=3000, visualizer="any") as source,
+    ):
+        source.batch(1)
+        killing.append(process_ids()[1])
+        assert source.batch(2000)["step"].tolist() == list(range(1, 2001))
+        assert not killing
+        shown.append("all")
+    assert "all" in shown
 
 
 def has_ended(number):
