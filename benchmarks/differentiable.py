@@ -18,7 +18,7 @@ import torch
 from measure import finish, rates, report
 
 from physx_core import Robot, World, plugins
-from physx_dart.algorithms import Algorithms
+from physx_dart.shared.algorithms import Algorithms
 from physx_torch import ForwardDynamics
 
 STATES, ROUNDS, REPEATS = 256, 25, 4

@@ -30,12 +30,11 @@ from typing import Any, NoReturn
 import numpy as np
 from measure import claim, finish
 
-from physx_core import Environment, EnvironmentConfig, Field
-from physx_core.errors import PhysxError
+from physx_core import Environment, EnvironmentConfig, Field, PhysxError
+from physx_core.net import HEADER, Kind
 from physx_core.observers import Observers
 from physx_core.pipelines.services import RunServices
-from physx_core.sources.clients import ClientSource
-from physx_core.transport.frames import HEADER, Kind
+from physx_core.sources import ClientSource
 
 ROUNDS = 5
 CLIENTS = 2

@@ -33,9 +33,9 @@ from jiminy_zoo import ACTIONS, steps_per_second
 from measure import claim, finish, rates
 from raw_vector import RawVectorEnv
 
-import physx_core.gym  # noqa: F401 - registers the environments
-from physx_core.gym import build_pipeline, load_pipeline
-from physx_core.gym.environments.quadruped import STAND
+import physx_gym  # noqa: F401 - registers the environments
+from physx_gym import build_pipeline, load_pipeline
+from physx_gym.environments.quadruped import STAND
 
 clock = time.perf_counter
 HERE = Path(__file__).parent
@@ -51,7 +51,7 @@ def registered(name: str, **options: Any) -> Any:
 def three_blocks() -> Any:
     """Return a quadruped with a PD controller, a Mahony filter and a safety limit, once a step."""
     kwargs = {"urdf": "a1/a1", "fixed_base": False, "period": 2.5e-3}
-    simulator = {"cls": "physx_core.gym:Simulator.build", "kwargs": kwargs}
+    simulator = {"cls": "physx_gym:Simulator.build", "kwargs": kwargs}
     pd = {"kp": 80.0, "kd": 0.02, "joint_velocity_limit": 12.0, "joint_acceleration_limit": 400.0}
     layers = [
         {"block": {"cls": "MotorSafetyLimit", "kwargs": {"kp": 20.0, "kd": 2.0}}},
@@ -272,7 +272,7 @@ def telemetry() -> list[bool]:
 
 _IMPORTS = "import gymnasium, dartpy"
 _FIRST_RESET = """
-import gymnasium, physx_core.gym
+import gymnasium, physx_gym
 gymnasium.make("physx/Cartpole-v0").reset(seed=0)
 """
 
@@ -294,7 +294,7 @@ def start_up() -> bool:
     imports, reset = (1e3 * statistics.median(spent) for spent in times.values())
     print(
         f"New processes, time of the processor: import of gymnasium and dartpy {imports:.0f} ms; "
-        f"import of physx_core.gym and first reset of cartpole {reset:.0f} ms"
+        f"import of physx_gym and first reset of cartpole {reset:.0f} ms"
     )
     pairs = zip(*times.values(), strict=True)
     return claim("times as long", statistics.median(b / a for a, b in pairs), at_most=1.5)
@@ -303,11 +303,11 @@ def start_up() -> bool:
 _MEMORY = """
 import gc, os, sys
 import gymnasium
-import physx_core.gym
+import physx_gym
 
 def made():
     if sys.argv[1].endswith(".toml"):
-        return physx_core.gym.load_pipeline(sys.argv[1])()
+        return physx_gym.load_pipeline(sys.argv[1])()
     return gymnasium.make(sys.argv[1])
 
 def resident():

@@ -23,7 +23,7 @@ import gymnasium
 import numpy as np
 from measure import claim, finish
 
-import physx_core.gym  # noqa: F401 - it tells OpenMP to rest soon
+import physx_gym  # noqa: F401 - it tells OpenMP to rest soon
 from physx_core import Dataset, DatasetConfig, NetworkConfig, Training
 
 ROUNDS, SLICE = 9, 0.5

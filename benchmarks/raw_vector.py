@@ -51,7 +51,7 @@ class RawVectorEnv:
 
 def serve(name: str, count: int, port: int) -> None:
     """Step some environments as long as actions come; an episode that is over begins again."""
-    import physx_core.gym  # noqa: F401 - registers the environments
+    import physx_gym  # noqa: F401 - registers the environments
 
     envs: list[Any] = [gymnasium.make(name, disable_env_checker=True) for _ in range(count)]
     answers = np.zeros((count, envs[0].observation_space.shape[0] + 3))

@@ -27,7 +27,7 @@ from cores import on_core, two_cores
 from measure import claim, finish, rates, report
 from remote_servers import ACTION, messages
 
-from physx_core.remote import GodotGymClient, PhysxClient, PhysxEnv, PhysxVectorEnv
+from physx_remote import GodotGymClient, PhysxClient, PhysxEnv, PhysxVectorEnv
 
 ROUNDS = 15
 FEW_STEPS = 4

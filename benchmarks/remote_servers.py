@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from physx_core import Field, Simulation, plugins
-from physx_core.remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
-from physx_core.remote.messages import fill
-from physx_core.world import Ground, JointSettings, Robot, World
+from physx_core.simulation import Ground, JointSettings, Robot, World
+from physx_remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
+from physx_remote.godot_gym.messages import fill
 
 FRAME = 1 / 60
 WHEELS = ("left_wheel_joint", "right_wheel_joint")

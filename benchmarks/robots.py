@@ -19,9 +19,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from physx_core import PhysxError, Robot, Simulation, World, plugins
-from physx_core.interfaces.robots import RobotInfo
-from physx_dart.robot_files import find_robot
-from physx_dart.urdf import read_robot
+from physx_core.simulation import RobotInfo
+from physx_dart.shared.robot_files import find_robot
+from physx_dart.shared.urdf import read_robot
 
 ENGINES = ("dart", "pinocchio")
 STATES, STEPS, LOADS, TIMEOUT, NEGLIGIBLE = 20, 200, 5, 300, 1e-6

@@ -36,12 +36,11 @@ from physx_core import (
     Field,
     NetworkConfig,
 )
-from physx_core.fields import Batch
 from physx_core.observers import Observers
-from physx_core.pipelines.learner import Learner
+from physx_core.pipelines import Learner
 from physx_core.pipelines.services import RunServices
-from physx_core.sources.clients import ClientSource
-from physx_core.sources.local import LocalSource
+from physx_core.sources import ClientSource, LocalSource
+from physx_core.typing import Batch
 
 ROUNDS = 7
 FEWER = 5  # where many processes are started in each round

@@ -14,7 +14,7 @@ import sys
 import gymnasium
 import numpy as np
 
-import physx_core.gym  # noqa: F401 - registers the environments
+import physx_gym  # noqa: F401 - registers the environments
 
 AWAY = 0.3  # m, from the middle of the box, at which the stick goes around it
 

@@ -19,7 +19,7 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 
-import physx_core.gym  # noqa: F401 - registers the environments
+import physx_gym  # noqa: F401 - registers the environments
 
 SETTINGS = {
     "physx/Cartpole-v0": {

@@ -6,9 +6,9 @@ import numpy as np
 from gymnasium import spaces
 
 from physx_core import Field, plugins
-from physx_core.remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
-from physx_core.remote.messages import fill
-from physx_core.world import Box, Ground, JointSettings, Robot, World
+from physx_core.simulation import Box, Ground, JointSettings, Robot, World
+from physx_remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
+from physx_remote.godot_gym.messages import fill
 
 SIZE = 6.0  # of the room, in m
 RAYS = 16

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from physx_core.remote import connect
+from physx_remote import connect
 
 ROOM = Path(__file__).with_name("room.py")
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from physx_core.gym import load_pipeline
+from physx_gym import load_pipeline
 
 STAND = np.array([0.0, 0.9, -1.6])
 LIFT = np.array([0.0, 0.3, -0.6])

@@ -8,7 +8,7 @@ import secrets
 import subprocess
 import sys
 
-from physx_core.remote import connect
+from physx_remote import connect
 
 os.environ["PHYSX_TOKEN"] = secrets.token_hex(32)  # the server inherits it
 words = [sys.executable, "-m", "physx_core.cli", "serve", "physx/Cartpole-v0"]

@@ -16,10 +16,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 import pytest
 
-from physx_core import Dataset, Field
-from physx_core.config import EnvironmentConfig
-from physx_core.sources.clients import ClientSource
-from physx_core.sources.local import LocalSource
+from physx_core import Dataset, EnvironmentConfig, Field
+from physx_core.sources import ClientSource, LocalSource
 
 SEED = [5, 0, 7]
 
@@ -169,7 +167,7 @@ def unhurried():
     What is added is several times as long as an interpreter takes to start here and now.
     """
     began = time.monotonic()
-    command = [sys.executable, "-c", "import physx_core.transport.client, h5py"]
+    command = [sys.executable, "-c", "import physx_core.workers.client.client, h5py"]
     subprocess.run(command, check=True)
     starting = time.monotonic() - began
     return lambda seconds: round(seconds + 5 * starting, 1)

@@ -2,8 +2,8 @@ import pytest
 
 from physx_core import Backend, plugins
 from physx_core.cli import main
-from physx_core.interfaces.robots import RobotInfo
 from physx_core.plugins import Plugin
+from physx_core.simulation import RobotInfo
 
 
 class Engine(Backend):

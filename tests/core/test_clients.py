@@ -146,7 +146,7 @@ def test_the_class_may_come_from_the_script_that_runs(tmp_path, nothing_stays_be
 if __name__ == "__main__":
     sys.path.insert(0, {str(ENVS.parent)!r})
     from physx_core.config import EnvironmentConfig
-    from physx_core.sources.clients import ClientSource
+    from physx_core.sources.client_source import ClientSource
     with ClientSource(EnvironmentConfig(Plain, num_clients=2), None, [1]) as clients:
         print(clients.batch(3)["x"].tolist())
 """

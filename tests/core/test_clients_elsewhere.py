@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from physx_core.errors import ClientError, ConfigError
-from physx_core.transport.frames import Kind, pack
+from physx_core.net import Kind, pack
 
 ENVS = Path(__file__).with_name("transport_envs.py")
 WANDERER = f"{Path(__file__).with_name('restart_envs.py')}:Wanderer"
@@ -102,7 +102,7 @@ def test_clients_join_a_waiting_run_and_say_what_they_do(by_hand, join, port, ca
 
 
 def test_the_server_says_now_and_then_what_it_waits_for(by_hand, caplog, monkeypatch):
-    monkeypatch.setattr("physx_core.transport.group._SAY_EVERY", 0.2)
+    monkeypatch.setattr("physx_core.workers.server.client_group._SAY_EVERY", 0.2)
     with (
         pytest.raises(ClientError, match=r"Client 1 did not connect for 3 s"),
         by_hand(num_clients=2, timeout=3.0),
@@ -294,7 +294,7 @@ SERVER = f"""
 import sys
 from pathlib import Path
 from physx_core.config import EnvironmentConfig
-from physx_core.sources.clients import ClientSource
+from physx_core.sources.client_source import ClientSource
 
 class Services:
     def load_parameters(self, instance_id): return {{}}

@@ -114,7 +114,7 @@ def test_after_an_error_outside_the_clients_are_not_waited_for(clients):
 SERVER = """
 from pathlib import Path
 from physx_core.config import EnvironmentConfig
-from physx_core.sources.clients import ClientSource
+from physx_core.sources.client_source import ClientSource
 
 kwargs = {{"fault": {fault!r}, "place": "step"}}
 config = EnvironmentConfig({environment!r}, env_kwargs=kwargs, num_clients=2)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from physx_core import Dataset
-from physx_core.errors import ClientError, EnvironmentFailedError, PhysxError
+from physx_core import Dataset, PhysxError
+from physx_core.errors import ClientError, EnvironmentFailedError
 
 PLACES = ["create", "init_database", "step", "prediction", "close"]
 TEXTS = {

@@ -15,11 +15,9 @@ import numpy as np
 import pytest
 
 from physx_core import Dataset, Field
-from physx_core.columns import ROW_FIELDS
 from physx_core.errors import ClientError, NotFiniteError
-from physx_core.transport.frames import HEADER, Kind, pack
-from physx_core.transport.handshake import introduce
-from physx_core.transport.values import encode
+from physx_core.net import HEADER, Kind, encode, introduce, pack
+from physx_core.rows import ROW_FIELDS
 
 TOKEN = "a token for this test"
 DEFINED = [Field("x", shape=(2,)), Field("flag", shape=(), dtype="bool")]

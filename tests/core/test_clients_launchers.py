@@ -13,7 +13,12 @@ import pytest
 
 from physx_core import ClientHandle, Environment, Launcher, plugins
 from physx_core.errors import ClientError, ComponentNotFoundError, ConfigError
-from physx_core.transport.launcher import ClientProcess, ManualLauncher, SubprocessLauncher, stop
+from physx_core.workers.processes.launchers import (
+    ClientProcess,
+    ManualLauncher,
+    SubprocessLauncher,
+    stop,
+)
 
 HERE = Path(__file__)
 

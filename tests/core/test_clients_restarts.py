@@ -16,8 +16,8 @@ import pytest
 
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.errors import ClientError, EnvironmentFailedError, SampleError
-from physx_core.transport.frames import Kind, pack
-from physx_core.transport.journal import Journal
+from physx_core.net import Kind, pack
+from physx_core.workers.server.journal import Journal
 
 ENVS = Path(__file__).with_name("restart_envs.py")
 WANDERER = f"{ENVS}:Wanderer"

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from physx_core.columns import Columns, shaped_by
+from physx_core import Field
 from physx_core.errors import (
     FieldShapeError,
     FieldTypeError,
@@ -9,7 +9,7 @@ from physx_core.errors import (
     NotFiniteError,
     UnknownFieldError,
 )
-from physx_core.fields import Field
+from physx_core.rows import Columns, shaped_by
 
 FIELDS = [Field("x", (2,)), Field("n", (), "int32")]
 

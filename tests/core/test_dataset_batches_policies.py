@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from physx_core import Dataset, Field
-from physx_core.dataset import memory
+from physx_core import Dataset, Field, Normalization
+from physx_core.dataset.read import memory
 from physx_core.errors import ConfigError, DatasetError
-from physx_core.statistics import Normalization
 
 POLICIES = ["memory", "disk exact", "disk windowed"]
 
@@ -88,7 +87,7 @@ def test_memory_is_known():
 
 def test_limits_of_the_process_count():
     code = (
-        "import resource; from physx_core.dataset.memory import available_memory;"
+        "import resource; from physx_core.dataset.read.memory import available_memory;"
         "resource.setrlimit(resource.RLIMIT_AS, (2**32, 2**32)); print(available_memory())"
     )
     words = [sys.executable, "-c", code]

@@ -2,8 +2,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from physx_core import Dataset, Environment, Training
-from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig
+from physx_core import (
+    Dataset,
+    DatasetConfig,
+    Environment,
+    EnvironmentConfig,
+    NetworkConfig,
+    Training,
+)
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.statistics import RunningStatistics
 

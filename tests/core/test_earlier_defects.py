@@ -24,6 +24,7 @@ from physx_core import (
     Prediction,
     Training,
 )
+from physx_core.components import options_of
 from physx_core.errors import (
     ConfigError,
     DatasetNotFoundError,
@@ -35,7 +36,6 @@ from physx_core.errors import (
     UnknownFieldError,
     UsageError,
 )
-from physx_core.interfaces.environment import options_of
 
 SPRING = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=1)
 NETWORK = NetworkConfig("toy/linear", network_kwargs={"net_fields": ["state", "force"]})

@@ -16,8 +16,8 @@ from physx_core import (
     Prediction,
     Training,
 )
+from physx_core.components import Observer
 from physx_core.errors import DatasetError
-from physx_core.interfaces.visualizer import Observer
 from physx_core.pipelines.services import RunServices
 
 ENVS = Path(__file__).with_name("source_envs.py")

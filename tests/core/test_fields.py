@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from physx_core import Field
 from physx_core.errors import ConfigError
-from physx_core.fields import Field, as_fields
+from physx_core.fields import as_fields
 
 
 def test_field_brings_shape_and_type_to_their_plain_form():

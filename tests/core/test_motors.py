@@ -15,8 +15,7 @@ from physx_core.errors import (
     FeatureNotSupportedError,
     SimulationError,
 )
-from physx_core.interfaces.backend import Layout
-from physx_core.motors import Motor, Motors, with_rotors
+from physx_core.simulation import Layout, Motor, Motors, with_rotors
 
 WORLD = World([Robot("masses.urdf")], period=1e-3)
 

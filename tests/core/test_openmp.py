@@ -20,15 +20,15 @@ def spins(module, **variables):
     return done.stdout.strip()
 
 
-@pytest.mark.parametrize("module", ["physx_core.gym", "physx_torch"])
+@pytest.mark.parametrize("module", ["physx_gym", "physx_torch"])
 def test_threads_rest_soon(module):
     pytest.importorskip(module)
     assert spins(module) == "10000"
 
 
 def test_what_the_user_chose_stays():
-    assert spins("physx_core.gym", GOMP_SPINCOUNT="7") == "7"
-    assert spins("physx_core.gym", OMP_WAIT_POLICY="ACTIVE") == "None"
+    assert spins("physx_gym", GOMP_SPINCOUNT="7") == "7"
+    assert spins("physx_gym", OMP_WAIT_POLICY="ACTIVE") == "None"
 
 
 def test_the_core_alone_changes_nothing():

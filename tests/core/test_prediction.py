@@ -99,8 +99,7 @@ def test_clients_give_the_numbers_of_instances_in_process(name, nothing_stays_be
 
 
 def test_several_run_in_clients_and_one_in_this_process(nothing_stays_behind):
-    from physx_core.sources.clients import ClientSource
-    from physx_core.sources.local import LocalSource
+    from physx_core.sources import ClientSource, LocalSource
 
     for number, over_tcp, expected in (
         (1, True, LocalSource),

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from physx_core.components import Factory
 from physx_core.errors import ConfigError, UnknownOptionError
-from physx_core.scene import Factory
 
 
 def test_events_are_copies_and_are_taken_once():

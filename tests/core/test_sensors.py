@@ -13,8 +13,7 @@ from physx_core.errors import (
     SimulationError,
     UnknownOptionError,
 )
-from physx_core.interfaces.backend import Layout
-from physx_core.sensors import ContactSensor, EffortSensor, Encoder, Imu, Sensor, Sensors
+from physx_core.simulation import ContactSensor, EffortSensor, Encoder, Imu, Layout, Sensor, Sensors
 
 WORLD = World([Robot("signal.urdf")], period=1e-3)
 

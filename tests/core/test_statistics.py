@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from physx_core import Dataset
-from physx_core.statistics import Normalization, RunningStatistics
+from physx_core import Dataset, Normalization
+from physx_core.statistics import RunningStatistics
 
 
 def statistics_of(*blocks):

@@ -18,8 +18,8 @@ from physx_core import (
     Training,
 )
 from physx_core.checkpoint import read
+from physx_core.components import Group
 from physx_core.errors import CheckpointError, ConfigError, UnknownOptionError
-from physx_core.interfaces.group import Group
 from physx_core.toy import LeastSquares, Linear
 
 DATA = DatasetConfig(existing_dir="data")

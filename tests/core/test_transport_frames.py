@@ -17,9 +17,8 @@ from physx_core.errors import (
     FieldShapeError,
     UnknownOptionError,
 )
-from physx_core.transport.failures import decode_error, encode_error
-from physx_core.transport.frames import HEADER, FrameReader, Kind, pack
-from physx_core.transport.link import Link
+from physx_core.net import HEADER, FrameReader, Kind, decode_error, encode_error, pack
+from physx_core.workers.client.link import Link
 
 # Frames -----------------------------------------------------------------------------------------
 

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
-from physx_core.transport.frames import Kind, pack
-from physx_core.transport.group import ClientGroup
+from physx_core.net import Kind, pack
+from physx_core.workers.server.client_group import ClientGroup
 
 ROGUE = Path(__file__).with_name("transport_rogue.py")
 ENVS = Path(__file__).with_name("transport_envs.py")
@@ -193,7 +193,7 @@ class Attacked:
 
 @contextlib.contextmanager
 def honest_clients(port, numbers):
-    command = [sys.executable, "-m", "physx_core.transport", "--connect", f"127.0.0.1:{port}"]
+    command = [sys.executable, "-m", "physx_core.workers", "--connect", f"127.0.0.1:{port}"]
     processes = [subprocess.Popen([*command, "--instance", str(number)]) for number in numbers]
     try:
         yield processes

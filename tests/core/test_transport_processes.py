@@ -15,8 +15,8 @@ from pathlib import Path
 import pytest
 
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
-from physx_core.transport.client import run_client
-from physx_core.transport.launcher import ClientProcess, stop
+from physx_core.workers.client.client import run_client
+from physx_core.workers.processes.launchers import ClientProcess, stop
 
 ENVS = Path(__file__).with_name("transport_envs.py")
 
@@ -69,7 +69,7 @@ def test_stop_ends_what_ignores_a_polite_signal(clients, services, tmp_path):
 HAND = """
 import os, sys, time
 from physx_core.errors import PhysxError
-from physx_core.transport.client import run_client
+from physx_core.workers.client.client import run_client
 for _ in range(500):
     try:
         status = run_client(sys.argv[1], os.environ["PHYSX_TOKEN"])
@@ -137,7 +137,7 @@ SERVER = """
 import sys, time
 from pathlib import Path
 from physx_core.config import EnvironmentConfig
-from physx_core.sources.clients import ClientSource
+from physx_core.sources.client_source import ClientSource
 
 class Services:
     def predict(self, fields): return fields

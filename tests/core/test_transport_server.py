@@ -11,9 +11,8 @@ import time
 import pytest
 
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
-from physx_core.transport.client import run_client
-from physx_core.transport.frames import HEADER, Kind, pack
-from physx_core.transport.handshake import introduce
+from physx_core.net import HEADER, Kind, introduce, pack
+from physx_core.workers.client.client import run_client
 
 
 def test_strangers_do_not_disturb_a_run(clients, port):
@@ -64,7 +63,7 @@ def test_strangers_do_not_disturb_a_run(clients, port):
 
 
 def test_a_silent_stranger_is_dropped_after_a_while(clients, port, monkeypatch):
-    monkeypatch.setattr("physx_core.transport.server._HANDSHAKE_TIME", 0.2)
+    monkeypatch.setattr("physx_core.workers.server.server._HANDSHAKE_TIME", 0.2)
     with clients(port=port) as source, socket.create_connection(("127.0.0.1", port)) as stranger:
         stranger.settimeout(30)
         stranger.sendall(b"\0")

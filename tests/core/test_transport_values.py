@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from physx_core.errors import ConnectionRefusedByPeerError, UsageError
-from physx_core.transport.frames import Kind, pack
-from physx_core.transport.values import decode, encode, pack_value
+from physx_core.net import Kind, decode, encode, pack, pack_value
 
 PLAIN_DTYPES = st.one_of(
     hnp.boolean_dtypes(),
@@ -259,7 +258,7 @@ def test_malicious_text_is_refused_and_takes_little_memory(text):
 
 
 def test_too_much_text_is_refused_on_both_sides(monkeypatch):
-    monkeypatch.setattr("physx_core.transport.values._MAX_TEXT", 1000)
+    monkeypatch.setattr("physx_core.net.values._MAX_TEXT", 1000)
     assert decode(encode(list(range(100)))) == list(range(100))
     with pytest.raises(UsageError, match=r"numbers holds .* Pass NumPy arrays"):
         encode(list(range(1000)), "numbers")

@@ -19,12 +19,9 @@ import time
 import numpy as np
 
 from physx_core import Field
-from physx_core.columns import ROW_FIELDS
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
-from physx_core.transport.failures import encode_error
-from physx_core.transport.frames import HEADER, Kind, pack
-from physx_core.transport.handshake import introduce
-from physx_core.transport.values import encode
+from physx_core.net import HEADER, Kind, encode, encode_error, introduce, pack
+from physx_core.rows import ROW_FIELDS
 
 FIELDS = [Field("x", shape=(2,)), Field("flag", shape=(), dtype="bool")]
 EDGES = [0, 1, 2, 3, 255, 2**15, 2**16, 2**30, 2**31, 2**32 - 1, 2**63, 2**64 - 1]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from physx_core import Robot, World, plugins
-from physx_dart.double_pendulum import URDF
+from physx_dart.environments.double_pendulum import URDF
 
 ROBOTS = {
     "panda": ("panda_description/urdf/panda.urdf", True),

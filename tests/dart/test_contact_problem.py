@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from physx_core.errors import SimulationError
-from physx_dart.contact_problem import ContactProblem
-from physx_dart.pinocchio_solver import ImpulseSolver
+from physx_dart.pinocchio.contact_problem import ContactProblem
+from physx_dart.pinocchio.solver import ImpulseSolver
 
 
 def random_problem(rng, points, limits, bounded, spare):

@@ -16,7 +16,7 @@ from physx_core import (
     plugins,
 )
 from physx_core.errors import FeatureNotSupportedError, SimulationError, UnknownOptionError
-from physx_core.interfaces.backend import CONTACT, FEATURES, RAY_HIT
+from physx_core.simulation import CONTACT, FEATURES, RAY_HIT
 
 BALL = Sphere(name="ball", radius=0.1, mass=2.0)
 CALM = {"gravity": (0.0, 0.0, 0.0)}

@@ -9,9 +9,9 @@ import pytest
 
 from physx_core import Factory, plugins
 from physx_core.errors import ConfigError, ModelError, UnknownOptionError
-from physx_dart.arm import DartArm, PinocchioArm
-from physx_dart.double_pendulum import DartDoublePendulum, PinocchioDoublePendulum
-from physx_dart.trajectories import SmoothTrajectory
+from physx_dart.environments.arm import DartArm, PinocchioArm
+from physx_dart.environments.double_pendulum import DartDoublePendulum, PinocchioDoublePendulum
+from physx_dart.environments.trajectories import SmoothTrajectory
 
 ARMS = [DartArm, PinocchioArm]
 PENDULUMS = [DartDoublePendulum, PinocchioDoublePendulum]

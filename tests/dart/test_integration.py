@@ -9,7 +9,7 @@ import pytest
 
 from physx_core import JointSettings, Robot, World, Wrench, plugins
 from physx_core.errors import FeatureNotSupportedError
-from physx_dart.double_pendulum import URDF
+from physx_dart.environments.double_pendulum import URDF
 
 SLIDERS = """
 <robot name="sliders">

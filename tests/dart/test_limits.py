@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physx_dart.limits import solve
+from physx_dart.pinocchio.limits import solve
 
 
 @pytest.mark.parametrize("n", [1, 2, 5, 20])

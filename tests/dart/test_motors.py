@@ -9,7 +9,7 @@ import pytest
 
 from physx_core import JointSettings, Robot, World
 from physx_core.errors import FeatureNotSupportedError
-from physx_core.motors import Motor, Motors, with_rotors
+from physx_core.simulation import Motor, Motors, with_rotors
 
 INERTIA = 0.6 + 1e-9
 PERIOD = 1e-3

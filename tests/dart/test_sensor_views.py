@@ -10,8 +10,7 @@ import pytest
 
 from physx_core import Ground, Robot, World
 from physx_core.errors import ComponentNotFoundError
-from physx_core.motors import Motor, Motors
-from physx_core.sensors import ContactSensor, EffortSensor, Encoder, Imu, Sensors
+from physx_core.simulation import ContactSensor, EffortSensor, Encoder, Imu, Motor, Motors, Sensors
 
 
 @pytest.fixture

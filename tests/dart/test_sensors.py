@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from physx_core import Box, Ground, JointSettings, Robot, Sphere, World, Wrench
-from physx_core.motors import Motor, Motors
-from physx_core.sensors import (
+from physx_core.simulation import (
     ContactSensor,
     EffortSensor,
     Encoder,
     ForceTorqueSensor,
     Imu,
+    Motor,
+    Motors,
     Sensors,
 )
 

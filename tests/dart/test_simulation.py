@@ -12,7 +12,7 @@ import pytest
 
 from physx_core import Robot, World, plugins
 from physx_core.errors import SimulationError
-from physx_dart.double_pendulum import URDF
+from physx_dart.environments.double_pendulum import URDF
 
 
 def test_both_plugins_are_found_without_importing_an_engine():

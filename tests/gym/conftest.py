@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from physx_core.gym import Log
+from physx_gym import Log
 
 
 @pytest.fixture(params=["dart", "pinocchio"])

@@ -2,8 +2,8 @@
 
 import sys
 
-from physx_core.gym import RobotEnv
-from physx_core.sensors import Encoder, Imu
+from physx_core.simulation import Encoder, Imu
+from physx_gym import RobotEnv
 
 
 def make(backend):

@@ -5,7 +5,7 @@ import sys
 
 import gymnasium
 
-import physx_core.gym  # noqa: F401 - registers them
+import physx_gym  # noqa: F401 - registers them
 
 NAMES = ("Cartpole", "Acrobot", "Ant", "Quadruped", "ArmReach", "PushBox")
 ALL = [(n, b) for n in NAMES for b in ("dart", "pinocchio") if (n, b) != ("PushBox", "pinocchio")]

@@ -14,13 +14,11 @@ import pytest
 from gymnasium import spaces
 
 from physx_core.errors import SimulationError, VisualizerError
-from physx_core.gym import ControlledEnv, PDController, RobotEnv, Simulator, read_log
-from physx_core.gym.quantities import BodyPoses, geometry
-from physx_core.gym.terminations import lost_ground, roll_pitch, unsafe_joints
-from physx_core.motors import Motor
-from physx_core.sensors import Encoder, Imu
-from physx_core.sensors.attitudes import from_rotation_vectors, product
-from physx_core.world import Wrench
+from physx_core.simulation import Encoder, Imu, Motor, Wrench
+from physx_core.simulation.sensors.attitudes import from_rotation_vectors, product
+from physx_gym import ControlledEnv, PDController, RobotEnv, Simulator, read_log
+from physx_gym.tasks.quantities import BodyPoses, geometry
+from physx_gym.tasks.terminations import lost_ground, roll_pitch, unsafe_joints
 
 STAND = np.tile([0.0, 0.8, -1.6], 4)
 SHINS = ("back_left_shin", "back_right_shin", "front_left_shin", "front_right_shin")

@@ -12,10 +12,9 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from physx_core.errors import EpisodeError, VisualizerError
-from physx_core.gym import Layer, RobotEnv
-from physx_core.gym.quantities import BodyPositions, Delta, JointPositions
-from physx_core.motors import Motor
-from physx_core.sensors import Encoder
+from physx_core.simulation import Encoder, Motor
+from physx_gym import Layer, RobotEnv
+from physx_gym.tasks.quantities import BodyPositions, Delta, JointPositions
 
 MEMBERS = (
     "simulator", "render_mode", "stepper_state", "is_simulation_running", "robot", "robot_state",

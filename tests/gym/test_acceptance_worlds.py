@@ -10,14 +10,13 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from physx_core.errors import ActionError, ConfigError, EpisodeError, PhysxError, UnknownOptionError
-from physx_core.gym import ComposedEnv, PDController, RobotEnv, Simulator, build_pipeline
-from physx_core.gym.quantities import BodyPositions, JointPositions, Stacked
-from physx_core.gym.rewards import Minimizing, Sum, Survival, Tracking
-from physx_core.gym.terminations import OutOfBounds
-from physx_core.motors import Motor
-from physx_core.sensors import Encoder
-from physx_core.world import Robot, Sphere, World
+from physx_core import PhysxError
+from physx_core.errors import ActionError, ConfigError, EpisodeError, UnknownOptionError
+from physx_core.simulation import Encoder, Motor, Robot, Sphere, World
+from physx_gym import ComposedEnv, PDController, RobotEnv, Simulator, build_pipeline
+from physx_gym.tasks.quantities import BodyPositions, JointPositions, Stacked
+from physx_gym.tasks.rewards import Minimizing, Sum, Survival, Tracking
+from physx_gym.tasks.terminations import OutOfBounds
 
 
 def cart(kind=RobotEnv, **options):

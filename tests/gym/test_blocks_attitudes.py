@@ -5,8 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physx_core.gym.blocks import mahony
-from physx_core.sensors.attitudes import from_rotation_vectors, product, turned, turned_back
+from physx_core.simulation.sensors.attitudes import (
+    from_rotation_vectors,
+    product,
+    turned,
+    turned_back,
+)
+from physx_gym.blocks import mahony
 
 DT = 0.005
 UP = np.array([0.0, 0.0, 1.0])

@@ -7,7 +7,8 @@ import pytest
 
 from physx_core import Encoder, Robot, World
 from physx_core.errors import ConfigError
-from physx_core.gym import (
+from physx_core.simulation import Motor
+from physx_gym import (
     ControlledEnv,
     MotorSafetyLimit,
     PDAdapter,
@@ -15,7 +16,6 @@ from physx_core.gym import (
     RobotEnv,
     Simulator,
 )
-from physx_core.motors import Motor
 
 DT = 0.005
 

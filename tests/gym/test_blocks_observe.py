@@ -7,7 +7,8 @@ import pytest
 
 from physx_core import Encoder, Imu
 from physx_core.errors import ConfigError, SimulationError
-from physx_core.gym import (
+from physx_core.simulation.sensors.attitudes import turned_back
+from physx_gym import (
     BodyObserver,
     ControlledEnv,
     MahonyFilter,
@@ -17,9 +18,8 @@ from physx_core.gym import (
     RobotEnv,
     Simulator,
 )
-from physx_core.gym.blocks import mahony
-from physx_core.gym.quantities import BaseHeight, Touching
-from physx_core.sensors.attitudes import turned_back
+from physx_gym.blocks import mahony
+from physx_gym.tasks.quantities import BaseHeight, Touching
 
 DT = 0.005
 TILTED = (0.1, -0.2, 0.3, 0.927361849549570)

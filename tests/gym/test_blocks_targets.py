@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from physx_core.errors import ConfigError
-from physx_core.gym.blocks import Targets
+from physx_gym.blocks import Targets
 
 DT = 0.005
 

@@ -14,8 +14,8 @@ from physx_core import (
     Training,
 )
 from physx_core.errors import ConfigError, UsageError
-from physx_core.gym.policy import Policy, action_arrays
-from physx_core.gym.space_fields import SpaceFields
+from physx_gym.bridge.policy import Policy, action_arrays
+from physx_gym.bridge.space_fields import SpaceFields
 
 
 def lean(observation):
@@ -130,7 +130,7 @@ def test_mistakes_are_named(tmp_path):
     with pytest.raises(ConfigError, match="CartPole-v7"):
         generate(
             tmp_path,
-            "physx_core.gym.bridge:GymEnvironment",
+            "physx_gym.bridge.gym_environment:GymEnvironment",
             env_kwargs={"id": "CartPole-v7"},
             as_tcp_ip_client=False,
         )

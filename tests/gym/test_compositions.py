@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from physx_core.errors import ConfigError, LogError
-from physx_core.gym import RobotEnv, Simulator
-from physx_core.gym.layers.composed import ComposedEnv
-from physx_core.gym.quantities import (
+from physx_gym import RobotEnv, Simulator
+from physx_gym.env.layers.composed import ComposedEnv
+from physx_gym.tasks.quantities import (
     BaseHeight,
     JointPositions,
     MechanicalPower,
@@ -16,8 +16,8 @@ from physx_core.gym.quantities import (
     RollPitch,
     odometry_difference,
 )
-from physx_core.gym.rewards import Minimizing, Product, Sum, Survival, Tracking
-from physx_core.gym.terminations import (
+from physx_gym.tasks.rewards import Minimizing, Product, Sum, Survival, Tracking
+from physx_gym.tasks.terminations import (
     Drift,
     OutOfBounds,
     Shift,
@@ -30,7 +30,7 @@ from physx_core.gym.terminations import (
     slippage,
     unsafe_joints,
 )
-from physx_core.gym.trajectory import Trajectory
+from physx_gym.tasks.trajectory import Trajectory
 
 SHINS = ("back_left_shin", "back_right_shin", "front_left_shin", "front_right_shin")
 STEP = 0.02

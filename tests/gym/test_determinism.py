@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physx_core.gym import Layer, RobotEnv
-from physx_core.gym.buffers import copied
-from physx_core.motors import Motor
-from physx_core.sensors import Encoder, Imu
+from physx_core.simulation import Encoder, Imu, Motor
+from physx_gym import Layer, RobotEnv
+from physx_gym.env.buffers import copied
 
 PROGRAM = Path(__file__).with_name("noisy_ant.py")
 program = runpy.run_path(str(PROGRAM))

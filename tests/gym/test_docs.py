@@ -12,7 +12,7 @@ import gymnasium
 import pytest
 
 from physx_core.config import read_toml
-from physx_core.gym import RobotEnv, read_log
+from physx_gym import RobotEnv, read_log
 
 PAGE = Path(__file__).parents[2] / "docs" / "gym.md"
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)

@@ -9,9 +9,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-import physx_core.gym  # registers them
-from physx_core.errors import FeatureNotSupportedError
-from physx_core.gym import RobotEnv
+from physx_core.errors import EpisodeError, FeatureNotSupportedError
+from physx_gym import RobotEnv
 
 ENGINES = ("dart", "pinocchio")
 NAMES = ("Cartpole", "Acrobot", "Ant", "Quadruped", "ArmReach", "PushBox")
@@ -103,7 +102,7 @@ def test_an_acrobot_above_the_bar_terminates():
     env = make("Acrobot", "pinocchio").unwrapped
     env.reset(seed=0)
     env._sample_state = lambda: (np.array([np.pi, 0.0]), np.zeros(2))
-    with pytest.raises(physx_core.errors.EpisodeError, match="terminated at its first state"):
+    with pytest.raises(EpisodeError, match="terminated at its first state"):
         env.reset()
     env._sample_state = lambda: (np.array([1.5, 0.0]), np.array([6.0, 0.0]))
     env.reset()
@@ -218,5 +217,5 @@ def test_subclasses_call_their_attributes_as_they_like():
         other.restore(state)
         np.testing.assert_array_equal(other.step(np.ones(2))[0]["states"]["agent"]["q"], following)
     env.stop()
-    with pytest.raises(physx_core.errors.EpisodeError, match="stopped"):
+    with pytest.raises(EpisodeError, match="stopped"):
         env.step(np.ones(2))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from physx_core.errors import ConfigError, SimulationError
-from physx_core.gym import RobotEnv, read_log
+from physx_gym import RobotEnv, read_log
 
 
 class Balance(RobotEnv):

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from physx_core.errors import ConfigError, SimulationError
-from physx_core.gym import (
+from physx_gym import (
     BodyObserver,
     ControlledEnv,
     ControllerBlock,

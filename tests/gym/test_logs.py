@@ -10,10 +10,7 @@ import pytest
 
 from physx_core.cli import main
 from physx_core.errors import ComponentNotFoundError, LogError
-from physx_core.gym import Log, RobotEnv, Simulator, read_log
-from physx_core.gym.log_folder import KEPT, LogFolder
-from physx_core.gym.telemetry import Telemetry
-from physx_core.world import (
+from physx_core.simulation import (
     Box,
     Cylinder,
     Ground,
@@ -25,6 +22,9 @@ from physx_core.world import (
     Stairs,
     World,
 )
+from physx_gym import Log, RobotEnv, Simulator, read_log
+from physx_gym.telemetry.log_folder import KEPT, LogFolder
+from physx_gym.telemetry.telemetry import Telemetry
 
 
 def run(env, steps, seed=0):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from physx_core.errors import LogError
-from physx_core.gym import Log, RobotEnv, read_log, replay
+from physx_gym import Log, RobotEnv, read_log, replay
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.6, 0.9, 0.999])
@@ -182,7 +182,7 @@ def test_a_log_that_cannot_be_written(log, tmp_path):
 WRITER = """
 import sys
 import numpy as np
-from physx_core.gym.log import Log
+from physx_gym.telemetry.log import Log
 log = Log({}, {"time": np.arange(20000.0), "v": np.arange(20000.0)})
 print("ready", flush=True)
 number = 0

@@ -4,19 +4,17 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from physx_core import PhysxError
 from physx_core.errors import (
     ActionError,
     ComponentNotFoundError,
     ConfigError,
     EpisodeError,
-    PhysxError,
     SimulationError,
     UnknownOptionError,
 )
-from physx_core.gym import RobotEnv
-from physx_core.motors import Motor
-from physx_core.sensors import Encoder
-from physx_core.world import Wrench
+from physx_core.simulation import Encoder, Motor, Wrench
+from physx_gym import RobotEnv
 
 
 def cart(**options):

@@ -5,8 +5,8 @@ import pytest
 from gymnasium import spaces
 
 from physx_core.errors import ConfigError, EpisodeError
-from physx_core.gym import Layer, RobotEnv
-from physx_core.motors import Motor
+from physx_core.simulation import Motor
+from physx_gym import Layer, RobotEnv
 
 HOOKS = (
     "_setup",

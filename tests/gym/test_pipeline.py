@@ -15,7 +15,7 @@ from physx_core.errors import (
     ConfigFileError,
     UnknownOptionError,
 )
-from physx_core.gym import (
+from physx_gym import (
     ComposedEnv,
     ControlledEnv,
     MahonyFilter,
@@ -27,10 +27,10 @@ from physx_core.gym import (
 )
 
 ENVIRONMENT = {
-    "cls": "physx_core.gym:RobotEnv",
+    "cls": "physx_gym:RobotEnv",
     "kwargs": {
         "simulator": {
-            "cls": "physx_core.gym:Simulator.build",
+            "cls": "physx_gym:Simulator.build",
             "kwargs": {"urdf": "ant", "fixed_base": False, "control_period": 0.005},
         },
         "step_dt": 0.02,
@@ -89,7 +89,7 @@ def run(env, steps=6):
 
 
 def in_code():
-    from physx_core.gym import Simulator
+    from physx_gym import Simulator
 
     simulator = Simulator.build("ant", fixed_base=False, control_period=0.005)
     env = RobotEnv(simulator, 0.02)
@@ -181,7 +181,7 @@ def test_class_and_environment_are_pickled(layers):
 
 def test_wrappers_of_gymnasium_and_scripts(tmp_path):
     (tmp_path / "own.py").write_text(
-        "from physx_core.gym import RobotEnv\nclass Own(RobotEnv):\n    mine = True\n",
+        "from physx_gym import RobotEnv\nclass Own(RobotEnv):\n    mine = True\n",
         encoding="utf-8",
     )
     environment = {**ENVIRONMENT, "cls": f"{tmp_path / 'own.py'}:Own"}
@@ -217,7 +217,7 @@ def altered(path, value):
         (("env_config", "kwarg"), {}, UnknownOptionError, 'no option "kwarg"'),
         (("env_config", "cls"), None, ConfigError, 'env_config has no "cls"'),
         (("env_config", "cls"), "RobotEn", ComponentNotFoundError, 'mean "RobotEnv"'),
-        (("env_config", "cls"), "physx_core.gym:Nothing", ComponentNotFoundError, "Nothing"),
+        (("env_config", "cls"), "physx_gym:Nothing", ComponentNotFoundError, "Nothing"),
         (("env_config", "cls"), "nowhere:Nothing", ComponentNotFoundError, "nowhere"),
         (("env_config", "cls"), 3, ConfigError, "makes no environment"),
         (("layers_config", 0, "blok"), {}, UnknownOptionError, 'no option "blok"'),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from physx_core.errors import LogError, MissingLibraryError
-from physx_core.gym import Log, RobotEnv, plot
+from physx_gym import Log, RobotEnv, plot
 
 
 def log_of(*names, rows=5, units=None):

@@ -7,9 +7,10 @@ import pinocchio as pin
 import pytest
 
 from physx_core.errors import ComponentNotFoundError, ConfigError, FeatureNotSupportedError
-from physx_core.gym import RobotEnv, Simulator
-from physx_core.gym.layers.composed import ComposedEnv
-from physx_core.gym.quantities import (
+from physx_dart.shared.robot_files import find_robot
+from physx_gym import RobotEnv, Simulator
+from physx_gym.env.layers.composed import ComposedEnv
+from physx_gym.tasks.quantities import (
     BaseHeight,
     BaseVelocity,
     BodyOrientations,
@@ -48,9 +49,8 @@ from physx_core.gym.quantities import (
     ZeroMomentPoint,
     geometry,
 )
-from physx_core.gym.quantities.quantity import Quantity
-from physx_core.gym.trajectory import Trajectory
-from physx_dart.robot_files import find_robot
+from physx_gym.tasks.quantities.quantity import Quantity
+from physx_gym.tasks.trajectory import Trajectory
 
 SHINS = ("back_left_shin", "back_right_shin", "front_left_shin", "front_right_shin")
 ENGINES = ("dart", "pinocchio")

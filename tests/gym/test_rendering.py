@@ -13,6 +13,7 @@ import rerun as rr
 from PIL import Image
 
 from physx_core import plugins
+from physx_core.components import Factory, Visualizer
 from physx_core.errors import (
     ConfigError,
     LogError,
@@ -20,12 +21,7 @@ from physx_core.errors import (
     UnknownOptionError,
     VisualizerError,
 )
-from physx_core.gym import RobotEnv, Simulator, replay
-from physx_core.gym.drawing import WorldDrawing
-from physx_core.gym.film import write_film
-from physx_core.interfaces.visualizer import Visualizer
-from physx_core.scene import Factory
-from physx_core.world import (
+from physx_core.simulation import (
     Box,
     Capsule,
     Cylinder,
@@ -37,6 +33,9 @@ from physx_core.world import (
     Stairs,
     World,
 )
+from physx_gym import RobotEnv, Simulator, replay
+from physx_gym.show.drawing import WorldDrawing
+from physx_gym.show.film import write_film
 
 SIZE = (160, 120)
 

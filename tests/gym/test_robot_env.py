@@ -8,10 +8,8 @@ import pytest
 from gymnasium import spaces
 
 from physx_core.errors import ConfigError, EpisodeError, UnknownOptionError, UsageError
-from physx_core.gym import RobotEnv, Simulator
-from physx_core.motors import Motor
-from physx_core.sensors import Encoder
-from physx_core.world import Ground
+from physx_core.simulation import Encoder, Ground, Motor
+from physx_gym import RobotEnv, Simulator
 
 SLIDER = [Motor(joint="slider")]
 

@@ -9,9 +9,8 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from physx_core.errors import ConfigError, EpisodeError, SimulationError
-from physx_core.gym import Layer, PipelineEnv, RobotEnv, Simulator
-from physx_core.motors import Motor
-from physx_core.world import Robot, World
+from physx_core.simulation import Motor, Robot, World
+from physx_gym import Layer, PipelineEnv, RobotEnv, Simulator
 
 SLIDER = [Motor(joint="slider")]
 

@@ -4,10 +4,24 @@ import numpy as np
 import pytest
 
 from physx_core.errors import ConfigError, EpisodeError, SimulationError
-from physx_core.gym import RobotEnv, Simulator
-from physx_core.motors import Motor, Motors
-from physx_core.sensors import ContactSensor, EffortSensor, Encoder, ForceTorqueSensor, Imu, Sensors
-from physx_core.world import Box, Ground, HeightField, Robot, Stairs, World, Wrench
+from physx_core.simulation import (
+    Box,
+    ContactSensor,
+    EffortSensor,
+    Encoder,
+    ForceTorqueSensor,
+    Ground,
+    HeightField,
+    Imu,
+    Motor,
+    Motors,
+    Robot,
+    Sensors,
+    Stairs,
+    World,
+    Wrench,
+)
+from physx_gym import RobotEnv, Simulator
 
 
 def test_one_line_from_a_robots_name(backend):

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from physx_core.errors import ConfigError, EpisodeError
-from physx_core.gym.telemetry import Telemetry
+from physx_gym.telemetry.telemetry import Telemetry
 
 
 def columns(telemetry):

@@ -17,7 +17,7 @@ from physx_core.errors import (
     UnknownOptionError,
     UsageError,
 )
-from physx_core.gym.vector import ParallelVectorEnv
+from physx_gym.vector.vector_env import ParallelVectorEnv
 
 HERE = f"{__file__}:"
 

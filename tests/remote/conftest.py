@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from physx_core import Field
-from physx_core.remote import Messages, RLAgent, RLEnvironment, RLEnvWorld, connect, serve
-from physx_core.remote.messages import ERROR, extension, fill
+from physx_remote import Messages, RLAgent, RLEnvironment, RLEnvWorld, connect, serve
+from physx_remote.godot_gym.messages import ERROR, extension, fill
 
 PATIENCE = 30.0
 

@@ -10,9 +10,9 @@ import time
 import numpy as np
 import pytest
 
-from physx_core import Field, Robot, World, plugins
-from physx_core.errors import ConfigError, PhysxError, RequestError, UsageError
-from physx_core.remote import (
+from physx_core import Field, PhysxError, Robot, World, plugins
+from physx_core.errors import ConfigError, RequestError, UsageError
+from physx_remote import (
     GodotGymClient,
     Messages,
     RLAgent,
@@ -20,7 +20,7 @@ from physx_core.remote import (
     RLEnvWorld,
     connect,
 )
-from physx_core.remote.messages import fill
+from physx_remote.godot_gym.messages import fill
 
 LIVES = {"observation": {"world": []}}
 ALIVE = bytes.fromhex("120d080110ffffffffffffffffff01")

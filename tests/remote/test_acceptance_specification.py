@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from physx_core.remote import (
+from physx_remote import (
     Communication,
     PhysicsFramesTimer,
     RLAgent,

@@ -16,12 +16,12 @@ from pathlib import Path
 
 import pytest
 
-from physx_core.remote import serve
-from physx_core.remote.clients.link import Link
-from physx_core.remote.communication import Communication
-from physx_core.remote.protocol import find_protocol
-from physx_core.remote.protocols.godot_rl import GodotRL
-from physx_core.remote.protocols.physx import Physx
+from physx_remote import serve
+from physx_remote.godot_gym.communication import Communication
+from physx_remote.godot_rl.protocol import GodotRL
+from physx_remote.physx.protocol import Physx
+from physx_remote.serving.client_link import Link
+from physx_remote.serving.protocol import find_protocol
 
 PAGE = Path(__file__).parents[2] / "docs" / "remote.md"
 TEXT = PAGE.read_text(encoding="utf-8")

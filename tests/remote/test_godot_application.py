@@ -15,8 +15,8 @@ from gymnasium import spaces
 
 from physx_core import Field
 from physx_core.errors import RemoteClosedError, RemoteTimeoutError
-from physx_core.remote import connect, connect_vector
-from physx_core.remote.messages import Messages
+from physx_remote import connect, connect_vector
+from physx_remote.godot_gym.messages import Messages
 
 PROJECT = Path(__file__).with_name("godot")
 BINARY = "godot3-server"

@@ -18,8 +18,8 @@ from physx_core.errors import (
     RemoteProtocolError,
     RemoteTimeoutError,
 )
-from physx_core.remote import GodotGymClient, GodotGymEnv, Messages, connect
-from physx_core.remote.messages import fill
+from physx_remote import GodotGymClient, GodotGymEnv, Messages, connect
+from physx_remote.godot_gym.messages import fill
 
 
 def test_a_server_that_says_nothing_of_itself(in_thread, scene_class):

@@ -8,8 +8,8 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from physx_core import Field, Robot, World, plugins
-from physx_core.remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
-from physx_core.remote.messages import fill
+from physx_remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
+from physx_remote.godot_gym.messages import fill
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*Box:UserWarning")
 
@@ -140,7 +140,7 @@ def test_steps_of_ones_own(start, scene_class, peer_class):
 
 
 def test_an_environment_is_also_known_by_its_reference(start, tmp_path, monkeypatch):
-    text = "from physx_core.remote import RLEnvironment\n\n\nclass Room(RLEnvironment):\n"
+    text = "from physx_remote import RLEnvironment\n\n\nclass Room(RLEnvironment):\n"
     script = tmp_path / "room.py"
     script.write_text(text + "    def _ready(self):\n        self.messages = None\n")
     service = start(f"{script}:Room")

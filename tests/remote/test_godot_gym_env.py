@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from physx_core.errors import RemoteError, UsageError
-from physx_core.remote import serve
+from physx_remote import serve
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*Box observation space:UserWarning")
 

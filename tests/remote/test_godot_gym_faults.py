@@ -8,7 +8,7 @@ import struct
 import pytest
 
 from physx_core.errors import UsageError
-from physx_core.remote import serve
+from physx_remote import serve
 
 SEE = {"agent": ["a"]}
 LIVES = {"observation": {"world": []}}
@@ -139,7 +139,7 @@ def test_missing_parts_are_named(peer, peer_class, scene):
 
 
 def test_what_a_subclass_forgot_is_named(peer, scene):
-    from physx_core.remote import RLAgent, RLEnvironment, RLEnvWorld
+    from physx_remote import RLAgent, RLEnvironment, RLEnvWorld
 
     scene.agent, scene.world = RLAgent(), RLEnvWorld()
     assert "does not implement set_action" in peer.error({"action": 1})

@@ -7,8 +7,9 @@ import threading
 
 import pytest
 
-from physx_core.errors import ConfigError, PhysxError, RemoteError, UnknownOptionError, UsageError
-from physx_core.remote import serve
+from physx_core import PhysxError
+from physx_core.errors import ConfigError, RemoteError, UnknownOptionError, UsageError
+from physx_remote import serve
 
 LIVES = {"observation": {"world": []}}
 ALIVE = bytes.fromhex("120d080110ffffffffffffffffff01")

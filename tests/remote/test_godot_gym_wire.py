@@ -290,8 +290,8 @@ def test_a_client_that_waits_for_each_answer(in_thread, scene, original_client):
 
 def test_many_floats_and_a_flag(in_thread, scene_class, original_client):
     from physx_core import Field
-    from physx_core.remote import Messages
-    from physx_core.remote.messages import fill
+    from physx_remote import Messages
+    from physx_remote.godot_gym.messages import fill
 
     class Seeker(scene_class):
         def _ready(self):

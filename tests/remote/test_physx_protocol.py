@@ -24,7 +24,7 @@ from physx_core.errors import (
     RequestError,
     UsageError,
 )
-from physx_core.remote import (
+from physx_remote import (
     PhysxClient,
     PhysxEnv,
     PhysxObserver,
@@ -153,7 +153,7 @@ def test_the_same_trajectory_in_process_and_over_both_protocols(place, in_thread
     rng = np.random.default_rng(5)
     actions = rng.integers(0, 3, 60).tolist()
     found = []
-    here = gymnasium.make("physx_core.gym:physx/Cartpole-v0", disable_env_checker=True)
+    here = gymnasium.make("physx_gym:physx/Cartpole-v0", disable_env_checker=True)
     address = "{}:{}".format(*service.address)
     for env in (
         here,
@@ -321,11 +321,9 @@ def test_an_observer_gets_what_the_actor_gets(client):
 
 
 def test_an_observer_changes_nothing(client):
-    from physx_core.remote.clients.physx_link import PhysxLink
-    from physx_core.remote.protocols.physx_wire import OBSERVE
-    from physx_core.transport.failures import decode_error
-    from physx_core.transport.frames import Kind
-    from physx_core.transport.values import pack_value
+    from physx_core.net import Kind, decode_error, pack_value
+    from physx_remote.physx.link import PhysxLink
+    from physx_remote.physx.wire import OBSERVE
 
     client.reset(seeds=[1, 2, 3])
     link = PhysxLink(_place(client.address), OBSERVE, token=TOKEN)

@@ -20,13 +20,11 @@ from physx_core.errors import (
     RemoteTimeoutError,
     UsageError,
 )
-from physx_core.remote import PhysxObserver, RLEnvironment, connect, serve
-from physx_core.remote.clients.physx_link import PhysxLink
-from physx_core.remote.protocols.physx_wire import ACT, SERVICE, VERSION
-from physx_core.remote.spaces import describe_space
-from physx_core.transport.frames import FrameReader, Kind, header, pack
-from physx_core.transport.handshake import ServerHandshake
-from physx_core.transport.values import pack_value
+from physx_core.net import FrameReader, Kind, ServerHandshake, header, pack, pack_value
+from physx_remote import PhysxObserver, RLEnvironment, connect, serve
+from physx_remote.physx.link import PhysxLink
+from physx_remote.physx.wire import ACT, SERVICE, VERSION
+from physx_remote.serving.spaces import describe_space
 
 TOKEN = "0123456789abcdef"
 PATIENCE = 30.0

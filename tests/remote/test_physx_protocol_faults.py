@@ -19,12 +19,10 @@ from physx_core.errors import (
     RemoteTimeoutError,
     RequestError,
 )
-from physx_core.remote import PhysxObserver, connect, connect_vector
-from physx_core.remote.clients.physx_link import PhysxLink
-from physx_core.remote.protocols.physx_wire import ACT
-from physx_core.transport.failures import decode_error
-from physx_core.transport.frames import HEADER, Kind, header, pack
-from physx_core.transport.values import pack_value
+from physx_core.net import HEADER, Kind, decode_error, header, pack, pack_value
+from physx_remote import PhysxObserver, connect, connect_vector
+from physx_remote.physx.link import PhysxLink
+from physx_remote.physx.wire import ACT
 
 TOKEN = "0123456789abcdef"
 PATIENCE = 30.0

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from physx_core.cli import main
-from physx_core.remote import connect, connect_vector
+from physx_remote import connect, connect_vector
 
 PATIENCE = 30.0
 GODOT = ["--protocol", "godot-gym"]

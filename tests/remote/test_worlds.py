@@ -19,8 +19,8 @@ from physx_core.errors import (
     UnknownOptionError,
     UsageError,
 )
-from physx_core.remote import Worlds, open_worlds
 from physx_core.toy import Spring
+from physx_remote import Worlds, open_worlds
 
 BOX = spaces.Box(-1, 1, (2,), np.float64)
 
@@ -72,7 +72,7 @@ def test_ids_of_gymnasium():
         ("toy/sprin", ComponentNotFoundError, 'Did you mean "spring"'),
         ("nowhere/spring", PluginNotFoundError, "nowhere"),
         ("physx_core.toy:Linear", ConfigError, "no environment|not take|no gymnasium"),
-        ("physx_core.remote.worlds:open_worlds", ConfigError, "does not take"),
+        ("physx_remote.serving.worlds:open_worlds", ConfigError, "does not take"),
     ],
 )
 def test_references_that_lead_nowhere(reference, error, said):

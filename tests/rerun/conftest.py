@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import rerun as rr
 
+from physx_core.components import Factory
 from physx_core.errors import VisualizerError
-from physx_core.scene import Factory
-from physx_rerun.headless import render_picture
-from physx_rerun.viewer import Viewer
+from physx_rerun.viewer.headless import render_picture
+from physx_rerun.viewer.viewer import Viewer
 from physx_rerun.visualizer import RerunVisualizer
 
 ARM = """<?xml version="1.0"?>

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from physx_core.errors import ConfigError
-from physx_rerun import colors
+from physx_rerun.drawing import colors
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import rerun as rr
 
+from physx_core.components import Event, Factory
+from physx_core.components.scene import KINDS
 from physx_core.errors import ConfigError, VisualizerError
-from physx_core.scene import KINDS, Event, Factory
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
 CELLS = np.array([[0, 1, 2], [0, 2, 3]])

@@ -9,10 +9,10 @@ import psutil
 import pytest
 from PIL import Image
 
+from physx_core.components import Factory
 from physx_core.errors import VisualizerError
-from physx_core.scene import Factory
-from physx_rerun import viewer
-from physx_rerun.headless import render_picture
+from physx_rerun.viewer import viewer
+from physx_rerun.viewer.headless import render_picture
 
 
 @pytest.fixture

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import rerun.blueprint as rrb
 
-from physx_core.scene import Factory
-from physx_rerun.drawing import Drawing
-from physx_rerun.layout import Layout
-from physx_rerun.rows import Rows
+from physx_core.components import Factory
+from physx_rerun.drawing.drawing import Drawing
+from physx_rerun.drawing.layout import Layout
+from physx_rerun.drawing.rows import Rows
 
 
 def views(container):

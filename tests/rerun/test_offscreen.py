@@ -6,8 +6,8 @@ import numpy as np
 import psutil
 import pytest
 
+from physx_core.components import Factory
 from physx_core.errors import VisualizerError
-from physx_core.scene import Factory
 from physx_rerun.visualizer import RerunVisualizer
 
 SIZE = (96, 64)

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from physx_core.scene import Factory
-from physx_rerun import streams
-from physx_rerun.rows import Rows
-from physx_rerun.streams import LiveWriter
+from physx_core.components import Factory
+from physx_rerun.drawing.rows import Rows
+from physx_rerun.viewer import streams
+from physx_rerun.viewer.streams import LiveWriter
 
 
 def steps_of(path, entity="/env_1/error"):
@@ -64,7 +64,7 @@ def test_a_viewer_that_dies(opened, receiver):
 
 HANGING = """
     import sys
-    from physx_core.scene import Factory
+    from physx_core.components.scene import Factory
     from physx_rerun.visualizer import RerunVisualizer
 
     visualizer = RerunVisualizer(mode="connect", address=sys.argv[1])
@@ -124,7 +124,7 @@ def test_rows_for_a_viewer_that_hangs_are_dropped_and_counted(receiver, monkeypa
 
 ENDLESS = """
     import itertools, sys, time
-    from physx_core.scene import Factory
+    from physx_core.components.scene import Factory
     from physx_rerun.visualizer import RerunVisualizer
 
     visualizer = RerunVisualizer()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from physx_core.errors import VisualizerError
-from physx_rerun import urdf
+from physx_rerun.drawing import urdf
 
 
 def test_shapes_sit_on_their_bodies(arm):

@@ -10,10 +10,10 @@ import rerun as rr
 from rerun.experimental import ViewerClient
 
 from physx_core import plugins
+from physx_core.components import Factory
 from physx_core.errors import ConfigError, UnknownOptionError, VisualizerError
-from physx_core.scene import Factory
 from physx_rerun import visualizer as visualizer_module
-from physx_rerun.viewer import Viewer, free_port
+from physx_rerun.viewer.viewer import Viewer, free_port
 from physx_rerun.visualizer import RerunVisualizer
 
 

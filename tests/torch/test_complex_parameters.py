@@ -5,7 +5,7 @@ from collections import OrderedDict
 import pytest
 import torch
 
-from physx_torch.module_network import ModuleNetwork
+from physx_torch.networks.module_network import ModuleNetwork
 
 
 class Spectral(torch.nn.Module):

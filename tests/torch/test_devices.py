@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from physx_core import Field, NetworkConfig
-from physx_core.pipelines.learner import Learner
-from physx_core.statistics import Normalization
-from physx_torch import TorchOptimization, devices, network, state
+from physx_core import Field, NetworkConfig, Normalization
+from physx_core.pipelines import Learner
+from physx_torch import TorchOptimization, devices
+from physx_torch.networks import network
+from physx_torch.storage import state
 
 GRID = {"input": (4, 5, 1), "ground_truth": (4, 5, 2)}
 FLAT = {"input": (3,), "ground_truth": (2, 1)}
@@ -91,7 +92,7 @@ def test_mixed_precision_is_that_of_the_device(monkeypatch):
             super().__init__("cpu", torch.bfloat16)
 
     monkeypatch.setattr(torch, "autocast", Autocast)
-    from physx_torch.training_forward import in_precision
+    from physx_torch.training.training_forward import in_precision
 
     forward = in_precision(lambda x: x, torch.device("cuda:1"), torch.float16, torch.float32)
     assert forward(torch.zeros(2)).dtype == torch.float32

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from physx_core import Dataset, DatasetConfig, Field, NetworkConfig, Training
+from physx_core import Dataset, DatasetConfig, Field, NetworkConfig, Normalization, Training
 from physx_core.cli import main
 from physx_core.errors import CheckpointError, ConfigError, MissingLibraryError
-from physx_core.pipelines.learner import Learner
-from physx_core.statistics import Normalization
+from physx_core.pipelines import Learner
 
 FORMS = ("onnx", "torchscript", "pt2")
 NETWORKS = {

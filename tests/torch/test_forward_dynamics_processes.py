@@ -45,7 +45,7 @@ def workers():
         with contextlib.suppress(OSError):
             parent = int(stat.read_text().rpartition(")")[2].split()[1])
             command = stat.with_name("cmdline").read_bytes()
-            if parent == os.getpid() and b"physx_dart.batch_worker" in command:
+            if parent == os.getpid() and b"physx_dart.batch.worker" in command:
                 found.append(int(stat.parent.name))
     return found
 
@@ -163,7 +163,7 @@ def test_an_interrupted_batch_leaves_no_answer_for_the_next(build, monkeypatch, 
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("physx_dart.batch_processes.computed", interrupt)
+        patch.setattr("physx_dart.batch.processes.computed", interrupt)
         with pytest.raises(KeyboardInterrupt):
             dynamics(*states)
     assert not any(map(there, started))

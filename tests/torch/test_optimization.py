@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from physx_core import Field
+from physx_core import Field, Normalization
 from physx_core.errors import CheckpointError, ConfigError, UsageError
-from physx_core.statistics import Normalization
 from physx_torch import FC, TorchNetwork, TorchOptimization, TorchTransformation
 
 SHAPES = {"input": Field("input", (2,)), "ground_truth": Field("ground_truth", (1,))}

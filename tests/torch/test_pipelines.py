@@ -21,7 +21,7 @@ from physx_core import (
     Training,
 )
 from physx_core.errors import ConfigError, UsageError
-from physx_core.pipelines.learner import Learner
+from physx_core.pipelines import Learner
 from physx_torch import FC, TorchNetwork, TorchOptimization, TorchTransformation
 
 

@@ -12,7 +12,7 @@ import torch
 
 from physx_core import Dataset, DatasetConfig, NetworkConfig, Training, checkpoint
 from physx_core.errors import ComponentNotFoundError, ConfigError
-from physx_core.pipelines.learner import Learner, restored
+from physx_core.pipelines import Learner, restored
 from physx_core.plugins.networks import resolve_network
 from physx_torch import FC, ModuleNetwork
 

@@ -15,8 +15,8 @@ from physx_core import (
     NetworkConfig,
     Training,
 )
+from physx_core.components import Factory
 from physx_core.errors import ConfigError, MissingLibraryError
-from physx_core.scene import Factory
 from physx_torch import TensorBoard
 
 events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")

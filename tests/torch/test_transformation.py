@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from physx_core import Normalization
 from physx_core.errors import ConfigError
-from physx_core.statistics import Normalization
 from physx_torch import FC, TorchTransformation
 
 

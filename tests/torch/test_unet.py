@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from physx_core import Dataset, DatasetConfig, Field, NetworkConfig, Training
+from physx_core import Dataset, DatasetConfig, Field, NetworkConfig, Normalization, Training
 from physx_core.errors import ConfigError, FieldsMismatchError
-from physx_core.statistics import Normalization
 from physx_torch import FC, UNet, UNetTransformation
 
 FORMS = [

@@ -17,11 +17,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from physx_core.components.network import Network
+from physx_core.components.optimization import Optimization
 from physx_core.config import NetworkConfig, read_toml, to_plain, write_toml
 from physx_core.errors import CheckpointError, ConfigFileError, listed
 from physx_core.fields import Field
-from physx_core.interfaces.network import Network
-from physx_core.interfaces.optimization import Optimization
 from physx_core.statistics import Normalization
 
 FORMAT_VERSION = 1

@@ -9,15 +9,11 @@ from functools import cached_property
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
 from physx_core.errors import ConfigError
+from physx_core.typing import Array
 
-Array: TypeAlias = NDArray[Any]
-Sample: TypeAlias = dict[str, Array]
-"""One step: field name to array of the field's shape."""
-Batch: TypeAlias = dict[str, Array]
-"""Several steps: field name to array of shape (samples, *field shape)."""
 Role: TypeAlias = Literal["training", "additional"]
 
 RESERVED = ("env_id", "episode", "step")

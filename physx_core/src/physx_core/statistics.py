@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from physx_core.fields import Array
+from physx_core.typing import Array
 
 Doubles = NDArray[np.float64]
 _WIDTH = 512

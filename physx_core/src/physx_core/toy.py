@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from physx_core.components.environment import Environment
+from physx_core.components.network import Network
+from physx_core.components.optimization import Optimization
+from physx_core.components.scene import Factory
+from physx_core.components.transformation import Transformation
 from physx_core.errors import CheckpointError, ConfigError, FieldsMismatchError
-from physx_core.fields import Array, Batch, Field
-from physx_core.interfaces.environment import Environment
-from physx_core.interfaces.network import Network, Tensors
-from physx_core.interfaces.optimization import Optimization
-from physx_core.interfaces.transformation import Transformation
+from physx_core.fields import Field
 from physx_core.plugins import hookimpl
-from physx_core.scene import Factory
+from physx_core.typing import Array, Batch, Tensors
 
 
 class Spring(Environment):

@@ -6,45 +6,6 @@ an engine.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+import lazy_loader
 
-if TYPE_CHECKING:
-    from physx_dart.arm import DartArm, PinocchioArm
-    from physx_dart.dart_simulation import DartBackend
-    from physx_dart.double_pendulum import DartDoublePendulum, PinocchioDoublePendulum
-    from physx_dart.pinocchio_simulation import PinocchioBackend
-
-__version__ = "0.1.0"
-
-_HOMES = {
-    "DartArm": "arm",
-    "DartBackend": "dart_simulation",
-    "DartDoublePendulum": "double_pendulum",
-    "PinocchioArm": "arm",
-    "PinocchioBackend": "pinocchio_simulation",
-    "PinocchioDoublePendulum": "double_pendulum",
-}
-
-__all__ = [
-    "DartArm",
-    "DartBackend",
-    "DartDoublePendulum",
-    "PinocchioArm",
-    "PinocchioBackend",
-    "PinocchioDoublePendulum",
-]
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"physx_dart.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    """Return the public names."""
-    return sorted([*globals(), *__all__])
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -6,29 +6,6 @@ Rerun.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+import lazy_loader
 
-if TYPE_CHECKING:
-    from physx_rerun.headless import render_picture
-    from physx_rerun.visualizer import RerunVisualizer
-
-__version__ = "0.1.0"
-
-_HOMES = {"RerunVisualizer": "visualizer", "render_picture": "headless"}
-
-__all__ = ["RerunVisualizer", "render_picture"]
-
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"physx_rerun.{_HOMES[name]}"), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    """Return the public names."""
-    return sorted([*globals(), *__all__])
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

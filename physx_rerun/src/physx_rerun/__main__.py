@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 
-from physx_core.errors import PhysxError
-from physx_rerun.headless import render_picture
+from physx_core import PhysxError
+from physx_rerun.viewer.headless import render_picture
 
 
 def main() -> int:

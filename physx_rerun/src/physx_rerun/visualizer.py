@@ -12,18 +12,18 @@ import numpy as np
 import rerun as rr
 
 from physx_core import Visualizer
+from physx_core.components import Event
 from physx_core.config import at_least, options
 from physx_core.errors import ConfigError, VisualizerError
-from physx_core.fields import Array
-from physx_core.scene import Event
-from physx_rerun import colors
-from physx_rerun.drawing import Drawing
-from physx_rerun.headless import render_picture
-from physx_rerun.layout import Layout
-from physx_rerun.offscreen import OffscreenViewer
-from physx_rerun.rows import TIME, Rows
-from physx_rerun.streams import Recording
-from physx_rerun.viewer import Viewer, has_display, listens
+from physx_core.typing import Array
+from physx_rerun.drawing import colors
+from physx_rerun.drawing.drawing import Drawing
+from physx_rerun.drawing.layout import Layout
+from physx_rerun.drawing.rows import TIME, Rows
+from physx_rerun.viewer.headless import render_picture
+from physx_rerun.viewer.offscreen import OffscreenViewer
+from physx_rerun.viewer.streams import Recording
+from physx_rerun.viewer.viewer import Viewer, has_display, listens
 
 MODES = ("save", "spawn", "connect", "headless", "offscreen")
 BINS = 30

@@ -17,7 +17,7 @@ from physx_core import Field, Transformation
 from physx_core.errors import ConfigError, MissingLibraryError
 
 if TYPE_CHECKING:
-    from physx_torch.network import TorchNetwork
+    from physx_torch.networks.network import TorchNetwork
 
 Tensors = dict[str, torch.Tensor]
 

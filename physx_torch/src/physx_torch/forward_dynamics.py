@@ -13,7 +13,8 @@ from torch.autograd.function import once_differentiable
 
 from physx_core import Simulation
 from physx_core.errors import FeatureNotSupportedError, SimulationError
-from physx_core.interfaces.backend import Layout, Vector
+from physx_core.simulation import Layout
+from physx_core.typing import Vector
 
 
 class ForwardDynamics:
@@ -52,7 +53,7 @@ class ForwardDynamics:
         """Return the accelerations, shape (..., nv), in the type and on the device of the input.
 
         Args:
-            positions: Shape (..., nq), in the convention of `physx_core.interfaces.layout`.
+            positions: Shape (..., nq), in the convention of `physx_core.simulation.layout`.
             velocities: Shape (..., nv).
             torques: Shape (..., nv), in N m or N; a base's first six are a force and a torque on
                 it, along its own axes. The leading axes of the three are broadcast.

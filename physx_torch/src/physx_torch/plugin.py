@@ -11,7 +11,7 @@ def physx_networks() -> dict[str, str]:
     return {
         "fc": "physx_torch.networks.fc:FC",
         "encoder_decoder": "physx_torch.networks.encoder_decoder:EncoderDecoder",
-        "module": "physx_torch.module_network:ModuleNetwork",
+        "module": "physx_torch.networks.module_network:ModuleNetwork",
         "unet": "physx_torch.networks.unet:UNet",
     }
 
@@ -19,14 +19,14 @@ def physx_networks() -> dict[str, str]:
 @hookimpl
 def physx_optimizations() -> dict[str, str]:
     """Return the optimizations by name."""
-    return {"default": "physx_torch.optimization:TorchOptimization"}
+    return {"default": "physx_torch.training.optimization:TorchOptimization"}
 
 
 @hookimpl
 def physx_transformations() -> dict[str, str]:
     """Return the transformations by name."""
     return {
-        "default": "physx_torch.transformation:TorchTransformation",
+        "default": "physx_torch.networks.transformation:TorchTransformation",
         "unet": "physx_torch.networks.unet_transformation:UNetTransformation",
     }
 
@@ -34,4 +34,4 @@ def physx_transformations() -> dict[str, str]:
 @hookimpl
 def physx_visualizers() -> dict[str, str]:
     """Return the observers by name."""
-    return {"tensorboard": "physx_torch.tensorboard:TensorBoard"}
+    return {"tensorboard": "physx_torch.training.tensorboard:TensorBoard"}

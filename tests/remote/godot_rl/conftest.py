@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from physx_core.plugins import resolve
-from physx_core.remote import Worlds
-from physx_core.remote.protocols.godot_rl import GodotRL
+from physx_remote import Worlds
+from physx_remote.godot_rl.protocol import GodotRL
 
 
 class Trainer:

@@ -8,8 +8,8 @@ import pytest
 from gymnasium import spaces
 
 from physx_core.errors import ConfigError, UsageError
-from physx_core.remote import Worlds, open_worlds
-from physx_core.remote.protocols.godot_rl import GodotRL
+from physx_remote import Worlds, open_worlds
+from physx_remote.godot_rl.protocol import GodotRL
 
 ACTION = {"force": [0.0, -1.0], "gear": 1}
 

@@ -22,8 +22,8 @@ from physx_core.errors import (
     UsageError,
 )
 from physx_core.plugins import resolve
-from physx_core.remote import connect, connect_vector, open_worlds, serve
-from physx_core.remote.protocols.godot_rl import GodotRL
+from physx_remote import connect, connect_vector, open_worlds, serve
+from physx_remote.godot_rl.protocol import GodotRL
 
 CART = f"{Path(__file__).with_name('envs.py')}:Cart"
 

@@ -10,8 +10,8 @@ import struct
 import pytest
 
 from physx_core.errors import ConfigError, RemoteError, UnknownOptionError
-from physx_core.remote import Worlds
-from physx_core.remote.protocols.godot_rl import GodotRL
+from physx_remote import Worlds
+from physx_remote.godot_rl.protocol import GodotRL
 
 ACTION = {"force": [0.0, -1.0], "gear": 1}
 

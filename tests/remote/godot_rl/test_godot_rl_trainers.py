@@ -16,18 +16,18 @@ import numpy as np
 import pytest
 
 from physx_core.errors import ConfigError, UsageError
-from physx_core.remote.protocols.godot_rl import GodotRL
-from physx_core.remote.protocols.godot_rl_launch import (
+from physx_remote.godot_rl.launch import (
     Launch,
     main,
     parse_flags,
     write_launcher,
 )
-from physx_core.remote.worlds import open_worlds
+from physx_remote.godot_rl.protocol import GodotRL
+from physx_remote.serving.worlds import open_worlds
 
 HERE = Path(__file__).parent
 CART = f"{HERE / 'envs.py'}:Cart"
-MODULE = "physx_core.remote.protocols.godot_rl_launch"
+MODULE = "physx_remote.godot_rl.launch"
 
 
 @pytest.fixture

@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-import importlib
-import keyword
+import ast
+import importlib.util
 import os
 import sys
 import traceback
 from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from physx_core.errors import PhysxError, UsageError, nearest
 
-VERBS = {
-    "plugins": "list the installed plugins, what they bring, and those that are broken",
-    "robots": "list the robots that can be given by name, and what collides of them",
-    "info": "show a session or dataset: fields, units, samples, normalization, integrity",
-    "generate": "make samples with an environment and store them in a session",
-    "train": "train a network on a dataset, or on what an environment makes",
-    "stats": "show the numbers of a training as a table, or in TensorBoard",
-    "verify": "check the files of a dataset, and repair them",
-    "export": "write a dataset as npz, parquet, minari, zarr or one HDF5 file",
-    "export-network": "write a session's network as a file that runs without physx",
-    "import": "make a dataset of an npz or HDF5 file",
-    "predict": "put a session's network into a running environment",
-    "client": "run an environment for a run that waits for clients, on this machine or another",
-    "serve": "let another process drive an environment: Godot clients, trainers, physx",
-    "log": "show what was recorded of an episode: table, plot, replay",
-    "replay": "send stored samples through their environment, to look at them in a viewer",
-}
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
+
+GROUP = "physx.commands"
+"""Entry-point group of the commands: name of the command, module with a function ``run(words)``."""
+_PACKAGES = {"log": "physx-gym", "robots": "physx-dart", "serve": "physx-remote"}
+"""Commands of the physx project that other distributions bring."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -58,11 +50,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
-def _run(verb: str, words: list[str]) -> int:
-    if verb not in VERBS:
-        raise UsageError(f'There is no command "{verb}".{nearest(verb, VERBS)} See physx --help.')
-    name = f"{verb}_" if keyword.iskeyword(verb) else verb.replace("-", "_")
-    module = importlib.import_module(f"physx_core.cli.{name}")
+def _run(name: str, words: list[str]) -> int:
+    commands = _commands()
+    if name not in commands:
+        if name in _PACKAGES:
+            package = _PACKAGES[name]
+            raise UsageError(f"physx {name} belongs to {package}: pip install {package}")
+        guess = nearest(name, commands)
+        raise UsageError(f'There is no command "{name}".{guess} See physx --help.')
+    module = commands[name].load()
     try:
         module.run(words)
     except SystemExit as end:  # how the parser ends after --help or a mistake in the options
@@ -70,15 +66,33 @@ def _run(verb: str, words: list[str]) -> int:
     return 0
 
 
+def _commands() -> dict[str, EntryPoint]:
+    from importlib.metadata import entry_points
+
+    return {entry.name: entry for entry in sorted(entry_points(group=GROUP))}
+
+
 def _overview() -> str:
-    width = max(len(verb) for verb in VERBS)
-    verbs = "\n".join(f"  {verb:{width}}  {text}" for verb, text in VERBS.items())
+    commands = _commands()
+    width = max(map(len, commands), default=0)
+    lines = "\n".join(f"  {name:{width}}  {_summary(entry)}" for name, entry in commands.items())
     return (
         "physx: connect physics engines with deep learning (not NVIDIA PhysX)\n\n"
-        f"usage: physx COMMAND [OPTIONS]\n\n{verbs}\n\n"
+        f"usage: physx COMMAND [OPTIONS]\n\n{lines}\n\n"
         "physx COMMAND --help lists the command's options. "
         "--debug shows the traceback of an error.\n--version shows the version."
     )
+
+
+def _summary(entry: EntryPoint) -> str:
+    """Return the first line of a command's module, which is read but not imported."""
+    try:
+        spec = importlib.util.find_spec(entry.value)
+        source = Path(spec.origin).read_text() if spec and spec.origin else ""
+        text = (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
+    except Exception as error:  # a broken package breaks its own command only
+        return f"(broken: {error})"
+    return text.partition(": ")[2].rstrip(".")
 
 
 def _message(error: PhysxError, debug: bool) -> str:

@@ -1,4 +1,4 @@
-"""``physx client``: run one instance of a run that waits for clients, here or elsewhere."""
+"""``physx client``: join a run that waits for clients, from this or another machine."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Annotated
 import tyro
 
 from physx_core.errors import ConfigError
-from physx_core.transport.client import run_client
-from physx_core.transport.descendants import kill_descendants
-from physx_core.transport.handshake import TOKEN_VARIABLE
-from physx_core.transport.joining import PATIENCE
-from physx_core.transport.tokens import given_token
+from physx_core.net.handshake import TOKEN_VARIABLE
+from physx_core.net.tokens import given_token
+from physx_core.workers.client.client import run_client
+from physx_core.workers.client.joining import PATIENCE
+from physx_core.workers.processes.descendants import kill_descendants
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""``physx export``: a dataset in another format."""
+"""``physx export``: export a dataset as npz, Parquet, Minari, Zarr or a single HDF5 file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physx_core.cli.dataset_report import counted
+from physx_core.cli.dataset_tables import counted
 from physx_core.dataset import Dataset
 from physx_core.dataset.exchange import ExportOptions, export
 from physx_core.observers import ProgressBar

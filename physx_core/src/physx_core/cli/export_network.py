@@ -1,4 +1,4 @@
-"""``physx export-network``: a session's network as a file that runs without physx."""
+"""``physx export-network``: export a session's network to a file that runs without physx."""
 
 from __future__ import annotations
 

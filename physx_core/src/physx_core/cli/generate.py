@@ -1,11 +1,11 @@
-"""``physx generate``: make samples."""
+"""``physx generate``: generate samples with an environment and store them in a session."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 
-from physx_core.cli.options import pipeline_from
+from physx_core.cli.pipeline_options import pipeline_from
 from physx_core.pipelines.data_generation import DataGeneration
 
 

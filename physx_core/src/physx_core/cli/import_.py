@@ -1,4 +1,4 @@
-"""``physx import``: a NumPy archive or an ordinary HDF5 file as a dataset."""
+"""``physx import``: import an npz or HDF5 file as a dataset."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli.dataset_report import counted
+from physx_core.cli.dataset_tables import counted
 from physx_core.dataset.exchange import import_file
 from physx_core.observers import ProgressBar
 

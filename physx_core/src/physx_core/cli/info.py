@@ -1,4 +1,4 @@
-"""``physx info``: what a session or dataset holds."""
+"""``physx info``: show a session or dataset: fields, units, samples, normalization, integrity."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from physx_core import checkpoint
-from physx_core.cli.dataset_report import print_dataset
+from physx_core.cli.dataset_tables import print_dataset
 from physx_core.errors import DatasetNotFoundError
 
 

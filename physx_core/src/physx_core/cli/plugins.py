@@ -1,4 +1,4 @@
-"""``physx plugins``: what is installed."""
+"""``physx plugins``: list the installed plugins, their components, and those that are broken."""
 
 from __future__ import annotations
 

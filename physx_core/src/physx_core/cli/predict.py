@@ -1,11 +1,11 @@
-"""``physx predict``: put a network into a running environment."""
+"""``physx predict``: run an environment with a session's network."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from physx_core.cli.options import pipeline_from
+from physx_core.cli.pipeline_options import pipeline_from
 from physx_core.pipelines.prediction import Prediction
 
 

@@ -1,4 +1,4 @@
-"""``physx replay``: look at stored samples once more."""
+"""``physx replay``: send stored samples through their environment, to view them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-from physx_core.cli.options import pipeline_from
+from physx_core.cli.pipeline_options import pipeline_from
 from physx_core.dataset import Dataset
 from physx_core.pipelines.replay import Replay, recorded_environment
 from physx_core.plugins import available

@@ -1,4 +1,4 @@
-"""``physx stats``: the numbers of a training."""
+"""``physx stats``: show the statistics of a training as a table, or in TensorBoard."""
 
 from __future__ import annotations
 

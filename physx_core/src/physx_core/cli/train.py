@@ -1,11 +1,11 @@
-"""``physx train``: train a network."""
+"""``physx train``: train a network on a dataset, or on samples that an environment generates."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-from physx_core.cli.options import pipeline_from
+from physx_core.cli.pipeline_options import pipeline_from
 from physx_core.pipelines.training import Training
 
 

@@ -1,4 +1,4 @@
-"""``physx verify``: whether the files of a dataset are sound."""
+"""``physx verify``: verify the files of a dataset, and repair them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli.dataset_report import counted
+from physx_core.cli.dataset_tables import counted
 from physx_core.dataset import Dataset
 from physx_core.errors import DatasetError, DatasetNotFoundError
 

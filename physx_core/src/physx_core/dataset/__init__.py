@@ -1,12 +1,12 @@
 """Datasets: samples in HDF5 partitions, written at the speed of the disk and safe at any moment.
 
-The format is described in `physx_core.dataset.layout` and `physx_core.dataset.manifest`.
+The format is described in `physx_core.dataset.store`: `partition_format` and `manifest`.
 """
 
 from __future__ import annotations
 
 from physx_core.dataset.dataset import Dataset
-from physx_core.dataset.episodes import Episode
-from physx_core.dataset.splits import Subset
+from physx_core.dataset.read.episodes import Episode
+from physx_core.dataset.read.splits import Subset
 
 __all__ = ["Dataset", "Episode", "Subset"]

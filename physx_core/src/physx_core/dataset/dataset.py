@@ -11,24 +11,25 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from physx_core.closing import Closing
-from physx_core.dataset import policy as policies
-from physx_core.dataset import recovery
-from physx_core.dataset.appender import Appender
-from physx_core.dataset.cache import ColumnCache
-from physx_core.dataset.coverage import statistics_of
-from physx_core.dataset.episodes import Episode, find_episodes
-from physx_core.dataset.manifest import Manifest
-from physx_core.dataset.opening import WriterOptions, create, extend
-from physx_core.dataset.reader import Reader
-from physx_core.dataset.report import find_problems, summarize
-from physx_core.dataset.sampling import Batches
-from physx_core.dataset.splits import Source, Subset, split
-from physx_core.dataset.views import ModeView
-from physx_core.dataset.writer import Writer
+from physx_core.dataset.read import strategy as policies
+from physx_core.dataset.read.cache import ColumnCache
+from physx_core.dataset.read.episodes import Episode, find_episodes
+from physx_core.dataset.read.reader import Reader
+from physx_core.dataset.read.sampling import Batches
+from physx_core.dataset.read.splits import Source, Subset, split
+from physx_core.dataset.read.views import ModeView
+from physx_core.dataset.repair import recovery
+from physx_core.dataset.repair.report import find_problems, summarize
+from physx_core.dataset.store.manifest import Manifest
+from physx_core.dataset.store.mode_statistics import statistics_of
+from physx_core.dataset.write.appender import Appender
+from physx_core.dataset.write.opening import WriterOptions, create, extend
+from physx_core.dataset.write.writer import Writer
 from physx_core.dataset.writing import Changes
 from physx_core.errors import UsageError
-from physx_core.fields import Batch, Field
+from physx_core.fields import Field
 from physx_core.statistics import Normalization
+from physx_core.typing import Batch
 
 MAX_FILE_SIZE = 0.25
 
@@ -242,8 +243,8 @@ class Dataset(Changes, Closing):
                 then valid until the next.
             normalize: Whether floating fields are normalized, in place, by the mean and deviation
                 of all samples of the mode; or the normalization to use.
-            policy: How samples are read, see `physx_core.dataset.policy`; ``auto``: as suits the
-                fields' sizes and the free memory.
+            policy: How samples are read, see `physx_core.dataset.read.strategy`; ``auto``: as
+                suits the fields' sizes and the free memory.
 
         Returns:
             An iterator over batches: field name to array of shape (samples, *field shape).

@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset import files, merging, recovery, repairing, updating
-from physx_core.dataset.appender import Appender
-from physx_core.dataset.cache import ColumnCache
-from physx_core.dataset.manifest import Manifest, plain_info
-from physx_core.dataset.reader import Reader
-from physx_core.dataset.writer import Writer
+from physx_core import files
+from physx_core.dataset.read.cache import ColumnCache
+from physx_core.dataset.read.reader import Reader
+from physx_core.dataset.repair import recovery, repairing
+from physx_core.dataset.store.manifest import Manifest, plain_info
+from physx_core.dataset.write import merging, updating
+from physx_core.dataset.write.appender import Appender
+from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from physx_core.components.visualizer import Observer
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import UnknownOptionError
-from physx_core.interfaces.visualizer import Observer
 from physx_core.plugins import resolve
 
 

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from physx_core.interfaces.visualizer import Observer
+from physx_core.components.visualizer import Observer
 
 
 class ProgressBar(Observer):

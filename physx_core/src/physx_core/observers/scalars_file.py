@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from physx_core.components.visualizer import Observer
 from physx_core.errors import SessionError
-from physx_core.interfaces.visualizer import Observer
 
 HEADER = ("timeline", "step", "name", "value")
 FLUSH_SECONDS = 0.2

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from physx_core.fields import Array
-from physx_core.interfaces.visualizer import Observer
-from physx_core.scene import Event
+from physx_core.components.scene import Event
+from physx_core.components.visualizer import Observer
+from physx_core.typing import Array
 
 
 class Observers(Observer):

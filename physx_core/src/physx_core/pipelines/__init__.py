@@ -1,1 +1,7 @@
-"""Pipelines: data generation, training and prediction, each a loop that a reader can see."""
+"""Pipelines: data generation, training, prediction, and replay."""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -10,12 +10,12 @@ from typing import ClassVar
 from physx_core.config import MODES, WRONG, DatasetConfig, EnvironmentConfig, at_least, options
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, listed
-from physx_core.fields import Batch
-from physx_core.pipelines.description import describe_dataset, describe_environment_config
 from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
+from physx_core.pipelines.run_description import describe_dataset, describe_environment_config
 from physx_core.pipelines.storage import describe_environment, open_own, recording_refused
 from physx_core.session import Session
 from physx_core.sources.source import Source
+from physx_core.typing import Batch
 
 
 @options

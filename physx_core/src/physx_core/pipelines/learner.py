@@ -8,16 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from physx_core import checkpoint
+from physx_core.components.group import Group
+from physx_core.components.network import Network
+from physx_core.components.optimization import Optimization
+from physx_core.components.transformation import Transformation
 from physx_core.config import NetworkConfig
 from physx_core.errors import ConfigError, MissingFieldError, UsageError
-from physx_core.fields import Array, Batch, Field
-from physx_core.interfaces.group import Group
-from physx_core.interfaces.network import Network
-from physx_core.interfaces.optimization import Optimization
-from physx_core.interfaces.transformation import Transformation
+from physx_core.fields import Field
 from physx_core.plugins import resolve
 from physx_core.plugins.networks import resolve_network
 from physx_core.statistics import Normalization
+from physx_core.typing import Array, Batch
 
 
 class Learner:

@@ -13,9 +13,9 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from physx_core.components.visualizer import Observer
 from physx_core.config import EnvironmentConfig, to_plain
 from physx_core.errors import UsageError
-from physx_core.interfaces.visualizer import Observer
 from physx_core.observers import Observers, ProgressBar, ScalarsFile
 from physx_core.pipelines.services import Predict, RunServices
 from physx_core.plugins import resolve
@@ -170,11 +170,11 @@ class Pipeline(ABC):
         services = RunServices(self.session.dataset_dir, self.observers, predict, replayed)
         source: Source
         if in_process or not config.as_tcp_ip_client:
-            from physx_core.sources.local import LocalSource
+            from physx_core.sources.local_source import LocalSource
 
             source = LocalSource(config, services, seed, accept_all=accept_all)
         else:
-            from physx_core.sources.clients import ClientSource
+            from physx_core.sources.client_source import ClientSource
 
             # A network that learns changes its answers; a row to replay is sent when it is due.
             ahead = None if predict is None and replayed is None else 0

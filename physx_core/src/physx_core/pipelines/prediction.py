@@ -11,11 +11,11 @@ from typing import ClassVar
 from physx_core import checkpoint
 from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, at_least, options
 from physx_core.dataset import Dataset
-from physx_core.fields import Batch, Field
-from physx_core.pipelines.description import describe_environment_config, describe_learner
+from physx_core.fields import Field
 from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.learner import Learner, restored
 from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
+from physx_core.pipelines.run_description import describe_environment_config, describe_learner
 from physx_core.pipelines.storage import (
     describe_environment,
     open_existing,
@@ -25,6 +25,7 @@ from physx_core.pipelines.storage import (
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.session import Session
 from physx_core.sources.source import Source
+from physx_core.typing import Batch
 
 
 @options

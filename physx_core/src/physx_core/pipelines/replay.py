@@ -10,12 +10,12 @@ from typing import Any, ClassVar
 from physx_core.config import DatasetConfig, EnvironmentConfig, at_least, from_plain, options
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError
-from physx_core.fields import Batch
 from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.session import Session
 from physx_core.sources.source import Source
+from physx_core.typing import Batch
 
 _RECORDED = ("environment", "env_kwargs", "num_clients", "simulations_per_step")
 

@@ -8,12 +8,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from physx_core.components.scene import Event
+from physx_core.components.visualizer import Observer
 from physx_core.errors import ConnectionRefusedByPeerError, DatasetError, UsageError
-from physx_core.fields import Batch, Sample
-from physx_core.interfaces.visualizer import Observer
+from physx_core.net.values import decode, encode
 from physx_core.pipelines.storage import PARAMETERS
-from physx_core.scene import Event
-from physx_core.transport.values import decode, encode
+from physx_core.typing import Batch, Sample
 
 Predict: TypeAlias = Callable[[Batch], Batch]
 """The network's prediction for a batch, both in physical units."""

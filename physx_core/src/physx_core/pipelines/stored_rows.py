@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from physx_core.dataset import Dataset
 from physx_core.errors import DatasetError, listed
-from physx_core.fields import Batch
+from physx_core.typing import Batch
 
 _AHEAD = 1 << 22
 

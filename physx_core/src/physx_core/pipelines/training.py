@@ -10,17 +10,16 @@ from typing import Any, ClassVar
 
 from physx_core import checkpoint
 from physx_core.checkpoint import Progress
+from physx_core.components.group import Group
+from physx_core.components.network import Network
 from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, at_least, options
 from physx_core.dataset import Dataset
-from physx_core.fields import Batch
-from physx_core.interfaces.group import Group
-from physx_core.interfaces.network import Network
 from physx_core.observers import statistics_observers
-from physx_core.pipelines.description import describe_training
 from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.learner import Learner
 from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
 from physx_core.pipelines.resuming import dataset_to_resume, last_checkpoint
+from physx_core.pipelines.run_description import describe_training
 from physx_core.pipelines.storage import (
     check_sources,
     copy_existing,
@@ -34,6 +33,7 @@ from physx_core.pipelines.training_record import BestEpoch, TrainingRecord
 from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
 from physx_core.sources.source import Source
+from physx_core.typing import Batch
 
 
 @options

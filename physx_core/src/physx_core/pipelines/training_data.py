@@ -9,13 +9,14 @@ import numpy as np
 
 from physx_core.config import DatasetConfig, EnvironmentConfig
 from physx_core.dataset import Dataset, Subset
-from physx_core.dataset.definitions import compare_fields
+from physx_core.dataset.write.definitions import compare_fields
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
-from physx_core.fields import RESERVED, Batch, Field
+from physx_core.fields import RESERVED, Field
 from physx_core.pipelines.storage import recording_refused
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.sources.source import Source
 from physx_core.statistics import Normalization
+from physx_core.typing import Batch
 
 
 class TrainingData:

@@ -9,6 +9,6 @@ from physx_core.plugins.hookspecs import Components, hookimpl
 def physx_launchers() -> Components:
     """Return the launchers; they are imported when clients are started."""
     return {
-        "subprocess": "physx_core.transport.launcher:SubprocessLauncher",
-        "manual": "physx_core.transport.launcher:ManualLauncher",
+        "subprocess": "physx_core.workers.processes.launchers:SubprocessLauncher",
+        "manual": "physx_core.workers.processes.launchers:ManualLauncher",
     }

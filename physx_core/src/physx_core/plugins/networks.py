@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from physx_core.components.network import Network
 from physx_core.errors import ConfigError
-from physx_core.interfaces.network import Network
 from physx_core.plugins.references import resolve
 from physx_core.plugins.registry import available, components_of, load, pip_line
 

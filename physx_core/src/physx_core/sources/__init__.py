@@ -1,1 +1,7 @@
-"""Sources: where a pipeline's samples come from, all behind one interface."""
+"""Sources of samples: environments in this process, or in clients over TCP."""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -8,7 +8,8 @@ from types import TracebackType
 from typing import Self
 
 from physx_core.errors import PhysxError, UsageError
-from physx_core.fields import Batch, Field
+from physx_core.fields import Field
+from physx_core.typing import Batch
 
 
 class Source(ABC):
@@ -58,7 +59,7 @@ class Source(ABC):
         They have the same fields as other rows and come by instance, then by step; a refused row
         belongs to the batch that holds the next accepted one of its instance. After a
         `WrongSamplesError` they are all those that were refused before it. An invalid one, for
-        example with NaN, is left out: see `physx_core.columns.Refused`. Empty without refused rows
+        example with NaN, is left out: see `physx_core.rows.Refused`. Empty without refused rows
         and where ``record_wrong_samples`` is off.
         """
 

@@ -12,7 +12,7 @@ import torch
 from physx_core import Field
 from physx_core.errors import ConfigError, FieldsMismatchError
 from physx_torch.choices import make_activation
-from physx_torch.network import TorchNetwork
+from physx_torch.networks.network import TorchNetwork
 
 
 class FC(TorchNetwork):

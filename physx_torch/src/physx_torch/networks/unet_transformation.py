@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from physx_core import Network
+from physx_core import Network, Normalization
 from physx_core.errors import ConfigError
-from physx_core.interfaces.network import Tensors
-from physx_core.statistics import Normalization
+from physx_core.typing import Tensors
 from physx_torch.networks.grid import crop, pad, to_grid
+from physx_torch.networks.transformation import TorchTransformation
 from physx_torch.networks.unet import UNet
-from physx_torch.transformation import TorchTransformation
 
 
 class UNetTransformation(TorchTransformation):

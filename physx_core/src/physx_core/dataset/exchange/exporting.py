@@ -8,7 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from physx_core.dataset.dataset import Dataset
-from physx_core.dataset.exchange import hdf5, minari_episodes, npz, parquet, zarr_groups
+from physx_core.dataset.exchange import hdf5_format as hdf5
+from physx_core.dataset.exchange import minari_format as minari_episodes
+from physx_core.dataset.exchange import npz_format as npz
+from physx_core.dataset.exchange import parquet_format as parquet
+from physx_core.dataset.exchange import zarr_format as zarr_groups
 from physx_core.dataset.exchange.table import Advance, Table
 from physx_core.errors import ConfigError, ExchangeError, PhysxError, listed, nearest
 

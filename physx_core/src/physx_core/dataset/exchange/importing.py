@@ -10,9 +10,10 @@ from pathlib import Path
 
 from physx_core.config import MODES
 from physx_core.dataset.dataset import Dataset
-from physx_core.dataset.exchange import hdf5, npz
+from physx_core.dataset.exchange import hdf5_format as hdf5
+from physx_core.dataset.exchange import npz_format as npz
 from physx_core.dataset.exchange.table import Advance, Column, Notes, rows_of
-from physx_core.dataset.recovery import holds_dataset
+from physx_core.dataset.repair.recovery import holds_dataset
 from physx_core.errors import ExchangeError, SampleError, listed
 from physx_core.fields import Field
 

@@ -10,9 +10,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from physx_core.dataset.views import ModeView
+from physx_core.dataset.read.views import ModeView
 from physx_core.errors import ConfigError, MissingLibraryError
-from physx_core.fields import RESERVED, Array, Batch, Field, Role
+from physx_core.fields import RESERVED, Field, Role
+from physx_core.typing import Array, Batch
 
 FORMAT = "physx export"
 VERSION = 1

@@ -1,0 +1,163 @@
+"""What a dataset holds, as text of 100 columns."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.dataset import Dataset
+from physx_core.dataset.read.episodes import episode_lengths
+from physx_core.errors import DatasetError
+from physx_core.statistics import Normalization
+from physx_core.typing import Array
+
+_WIDTH = 100
+_SMALL = 9
+"""Components up to which each is shown on a line of its own."""
+
+
+def print_dataset(place: Path, *, verify: bool) -> None:
+    """Print origin, fields, trajectories and normalization of each mode, and the integrity.
+
+    Args:
+        place: A session's or a dataset's folder.
+        verify: Whether every byte is checked, not only what the files say of themselves.
+
+    Raises:
+        DatasetNotFoundError: There is no dataset.
+        DatasetError: Its manifest cannot be read.
+    """
+    with Dataset.open(place) as dataset:
+        rows = dataset.describe()
+        total = sum(row["bytes"] for row in rows)
+        print(f"dataset {dataset.directory}: {size(total)}")
+        for line in _origin(dataset):
+            print(line)
+        for mode in dict.fromkeys(row["mode"] for row in rows):
+            print()
+            _print_mode(dataset, mode, [row for row in rows if row["mode"] == mode])
+        if not rows:
+            print("  no samples")
+        print()
+        _print_integrity(dataset, content=verify)
+
+
+def size(nbytes: float) -> str:
+    """Return a number of bytes for people."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if nbytes < 1000:
+            return f"{nbytes:.3g} {unit}"
+        nbytes /= 1000
+    return f"{nbytes:.3g} TB"
+
+
+def counted(number: int, what: str) -> str:
+    """Return a number of things for people."""
+    return f"{number:,} {what}" + ("" if number == 1 else "s")
+
+
+def _origin(dataset: Dataset) -> list[str]:
+    shown = ("environment", "env_kwargs", "num_clients", "seed", "imported_from")
+    lines = [
+        f"  {key}: {dataset.info[key]}" for key in shown if dataset.info.get(key) not in (None, {})
+    ]
+    versions = ", ".join(f"{name} {version}" for name, version in dataset.versions.items())
+    return [*lines, f"  made with: {versions}"]
+
+
+def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> None:
+    nbytes, partitions = sum(row["bytes"] for row in rows), rows[0]["partitions"]
+    samples, files = counted(rows[0]["samples"], "sample"), counted(partitions, "partition")
+    print(f"{mode}: {samples}, {size(nbytes)} in {files}")
+    try:
+        stored = dataset.num_samples(mode)
+        if stored:
+            print(f"  reading policy: {dataset.reading_policy(mode)}")
+            _print_episodes(dataset, mode, stored)
+    except DatasetError as error:
+        print(textwrap.fill(f"damaged: {error}", _WIDTH, initial_indent="  "))
+        stored = 0
+    _print_table(
+        ["field", "role", "type", "shape", "size", "unit"],
+        [
+            [
+                row["field"],
+                row["role"],
+                row["dtype"],
+                "open" if row["shape"] is None else str(row["shape"]),
+                size(row["bytes"]),
+                row["unit"],
+            ]
+            for row in rows
+        ],
+    )
+    if stored:
+        _print_normalization(dataset, mode)
+
+
+def _print_episodes(dataset: Dataset, mode: str, samples: int) -> None:
+    view = dataset[mode]
+    if "step" not in view and "episode" not in view:
+        return
+    lengths, instances = episode_lengths(view, samples)
+    least, most = lengths.min(), lengths.max()
+    steps = f"{least:,}" if least == most else f"{least:,} to {most:,}"
+    of = counted(instances, "instance")
+    print(f"  trajectories: {len(lengths):,} of {of}, {steps} samples each")
+
+
+def _print_normalization(dataset: Dataset, mode: str) -> None:
+    try:
+        found = dataset.normalization_of(mode)
+    except DatasetError as error:
+        print(textwrap.fill(f"normalization: {error}", _WIDTH, initial_indent="  "))
+        return
+    lines = [line for name, item in found.items() for line in _components(name, item)]
+    if lines:
+        print()
+        _print_table(["normalization", "component", "mean", "std", "min", "max"], lines)
+
+
+def _components(name: str, item: Normalization) -> list[list[str]]:
+    """Return the lines of a field: one for each component, or ranges over many."""
+    columns = [item.mean, item.std, item.minimum, item.maximum]
+    if item.mean.size > _SMALL:
+        return [[name, f"all {item.mean.size}", *(_range(column) for column in columns)]]
+    return [
+        [name, ", ".join(str(i) for i in place), *(_number(column, place) for column in columns)]
+        for place in np.ndindex(item.mean.shape)
+    ]
+
+
+def _number(values: Array | None, place: tuple[int, ...]) -> str:
+    return "?" if values is None else f"{values[place]:.4g}"
+
+
+def _range(values: Array | None) -> str:
+    return "?" if values is None else f"{values.min():.3g} … {values.max():.3g}"
+
+
+def _print_integrity(dataset: Dataset, *, content: bool) -> None:
+    problems = dataset.verify(content=content)
+    what = "every byte was checked" if content else "sizes and headers; --verify checks every byte"
+    found = counted(len(problems), "problem") if problems else "sound"
+    print(f"integrity: {found} ({what})")
+    for text in problems:
+        print(textwrap.fill(text, _WIDTH, initial_indent="  ", subsequent_indent="    "))
+
+
+def _print_table(names: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
+    """Print columns side by side; the last one is wrapped to what is left of the width."""
+    cells = [list(names), *(list(line) for line in lines)]
+    widths = [max(len(line[column]) for line in cells) for column in range(len(names))]
+    rest = max(12, _WIDTH - sum(widths[:-1]) - 2 * len(names))
+    for line in cells:
+        wrapped = textwrap.wrap(line[-1], rest) or [""]
+        for number, part in enumerate(wrapped):
+            shown = line[:-1] if number == 0 else [""] * (len(line) - 1)
+            parts = [f"{cell:{width}}" for cell, width in zip(shown, widths, strict=False)]
+            print("  " + "  ".join([*parts, part]).rstrip())

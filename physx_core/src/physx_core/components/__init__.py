@@ -1,0 +1,7 @@
+"""The components that a plugin implements and a pipeline uses."""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,15 @@
+"""The components that a plugin implements and a pipeline uses."""
+
+from .environment import Environment as Environment
+from .environment import Services as Services
+from .environment import options_of as options_of
+from .group import Group as Group
+from .launcher import ClientHandle as ClientHandle
+from .launcher import Launcher as Launcher
+from .network import Network as Network
+from .optimization import Optimization as Optimization
+from .scene import Event as Event
+from .scene import Factory as Factory
+from .transformation import Transformation as Transformation
+from .visualizer import Observer as Observer
+from .visualizer import Visualizer as Visualizer

@@ -1,0 +1,174 @@
+"""Network: what learns to predict fields from fields."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from physx_core.components.group import Group
+from physx_core.errors import ConfigError, FieldsMismatchError, UsageError, listed
+from physx_core.fields import Field
+from physx_core.typing import Batch, Tensors
+
+if TYPE_CHECKING:
+    from physx_core.components.transformation import Transformation
+
+
+class Network(ABC):
+    """Base of all networks; a plugin's base class implements it for one library.
+
+    Tensors are of the library's own type. Every dictionary of tensors has the sample axis first.
+
+    Attributes:
+        net_fields: Fields that the network reads.
+        opt_fields: Fields that the loss compares the prediction with.
+        pred_fields: Fields that the network predicts; the i-th has shape, unit and normalization
+            of the i-th of `opt_fields`.
+        parameters_file: Name of the file that `save_parameters` writes into a checkpoint.
+        default_optimization: Reference of the optimization used where none is configured.
+        default_transformation: Reference of the transformation used where none is configured.
+        export_forms: Forms that `export` writes.
+    """
+
+    parameters_file: ClassVar[str]
+    default_optimization: ClassVar[str]
+    default_transformation: ClassVar[str]
+    export_forms: ClassVar[Sequence[str]] = ()
+
+    net_fields: Sequence[str] = ("input",)
+    opt_fields: Sequence[str] = ("ground_truth",)
+    pred_fields: Sequence[str] = ("prediction",)
+
+    @classmethod  # noqa: B027
+    def set_seed(cls, seed: int) -> None:
+        """Seed the random numbers from which the library draws first parameters.
+
+        Args:
+            seed: Not negative.
+        """
+
+    @classmethod
+    def join_group(cls, device: str) -> Group:
+        """Join the processes that were started to train this network together.
+
+        Args:
+            device: As for `set_device`.
+
+        Raises:
+            ConfigError: There are several, but the network's library cannot work together, or not
+                on this device.
+        """
+        if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+            raise ConfigError(
+                f"{cls.__name__} cannot be trained by several processes: leave torchrun out."
+            )
+        return Group()
+
+    def bind(self, fields: Mapping[str, Field]) -> None:
+        """Learn the shapes of the fields in `net_fields` and `opt_fields` before the first batch.
+
+        Args:
+            fields: The dataset's or checkpoint's fields by name.
+
+        Raises:
+            FieldsMismatchError: A field is missing, or its shape is not what the network takes.
+        """
+        missing = {
+            name: f"not there; there are {listed(fields)}"
+            for name in (*self.net_fields, *self.opt_fields)
+            if name not in fields
+        }
+        if missing:
+            raise FieldsMismatchError(f"{type(self).__name__} needs other fields", missing)
+
+    @abstractmethod
+    def predict(self, data: Tensors) -> Tensors:
+        """Return ``{field: tensor}`` for `pred_fields` from the `net_fields` in `data`.
+
+        After `set_eval` no gradients are recorded.
+        """
+
+    def forward(self, *inputs: Any) -> Any:
+        """Return what the network makes of the tensors of `net_fields`, given in that order.
+
+        A library's own base class leaves this to its networks, and calls it in `predict`.
+        """
+        raise UsageError(f"{type(self).__name__} does not implement forward().")
+
+    @abstractmethod
+    def set_train(self) -> None:
+        """Get ready to be trained."""
+
+    @abstractmethod
+    def set_eval(self) -> None:
+        """Get ready to predict: no gradients are recorded."""
+
+    @abstractmethod
+    def set_device(self, device: str) -> None:
+        """Move to a device, ``"auto"``: the fastest that is there.
+
+        Raises:
+            ConfigError: The device does not exist on this machine.
+        """
+
+    @abstractmethod
+    def set_data_type(self, data_type: str) -> None:
+        """Compute in ``"float32"`` or ``"float64"``."""
+
+    @abstractmethod
+    def get_parameters(self) -> dict[str, Any]:
+        """Return the parameters by name."""
+
+    def get_gradients(self) -> dict[str, Any]:
+        """Return the gradients of the last step by parameter; empty where the library has none."""
+        return {}
+
+    @abstractmethod
+    def nb_parameters(self) -> int:
+        """Return how many numbers the parameters hold."""
+
+    @abstractmethod
+    def save_parameters(self, path: Path) -> None:
+        """Write the parameters to a file that can be read without running code."""
+
+    @abstractmethod
+    def load_parameters(self, path: Path) -> None:
+        """Read parameters that `save_parameters` wrote.
+
+        Raises:
+            CheckpointError: The file is missing, damaged or of another architecture.
+        """
+
+    def export(
+        self, path: Path, form: str, transformation: Transformation, fields: Mapping[str, Field]
+    ) -> None:
+        """Write network and transformation into one file that other programs run.
+
+        It reads `net_fields` and gives `pred_fields`, both in physical units and by these names,
+        for any number of samples.
+
+        Args:
+            path: The file; an existing one is replaced.
+            form: One of `export_forms`.
+            transformation: What the network is used with.
+            fields: The fields that the network was bound to.
+
+        Raises:
+            ConfigError: The network cannot be written in this form.
+            MissingLibraryError: A library that the form needs is not installed.
+        """
+        raise ConfigError(
+            f'{type(self).__name__} cannot be exported as "{form}". '
+            f"Forms: {listed(self.export_forms)}."
+        )
+
+    @abstractmethod
+    def numpy_to_tensor(self, batch: Batch) -> Tensors:
+        """Return arrays as tensors of the network's type and device; shares memory if it can."""
+
+    @abstractmethod
+    def tensor_to_numpy(self, tensors: Tensors) -> Batch:
+        """Return tensors as arrays on the processor's side."""

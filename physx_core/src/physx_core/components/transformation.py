@@ -1,0 +1,54 @@
+"""Transformation: what happens to tensors between dataset, network and environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from physx_core.components.network import Network
+from physx_core.statistics import Normalization
+from physx_core.typing import Tensors
+
+
+class Transformation:
+    """Identity; plugins derive their own.
+
+    Attributes:
+        normalization: Mean and standard deviation by field; empty where nothing is normalized.
+            They travel with the checkpoint.
+    """
+
+    def __init__(self) -> None:
+        self.normalization: dict[str, Normalization] = {}
+
+    def set_normalization(
+        self, normalization: Mapping[str, Normalization], network: Network
+    ) -> None:
+        """Keep the coefficients; called before the first batch and whenever they change."""
+        self.normalization = dict(normalization)
+
+    def transform_before_prediction(self, data: Tensors) -> Tensors:
+        """Return what the network reads, from data in physical units.
+
+        Args:
+            data: The network's `net_fields`.
+        """
+        return data
+
+    def transform_before_loss(
+        self, prediction: Tensors, targets: Tensors
+    ) -> tuple[Tensors, Tensors]:
+        """Return prediction and targets as the loss compares them.
+
+        Args:
+            prediction: As the network gave it.
+            targets: The network's `opt_fields` in physical units.
+        """
+        return prediction, targets
+
+    def transform_before_apply(self, prediction: Tensors) -> Tensors:
+        """Return the prediction as the environment gets it, in physical units.
+
+        Args:
+            prediction: As the network gave it.
+        """
+        return prediction

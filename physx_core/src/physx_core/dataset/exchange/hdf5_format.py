@@ -1,0 +1,154 @@
+"""One ordinary HDF5 file: ``/<mode>/<field>``, with units and roles as attributes."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator, Sequence
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+
+from physx_core.dataset.exchange.table import Column, Notes, Table, describe, rows_of
+from physx_core.errors import ExchangeError
+from physx_core.typing import Array
+
+COMPRESSIONS = {"none": None, "gzip": "gzip", "lzf": "lzf"}
+_CHUNK = 2**20
+_ATTRIBUTE = 60000
+"""Bytes that fit into an attribute."""
+
+
+def write(tables: Sequence[Table], out: Path, compression: str) -> None:
+    """Write the modes as groups of datasets.
+
+    Args:
+        tables: The modes.
+        out: The file.
+        compression: One of `COMPRESSIONS`; "none" stores each dataset in one piece, which can be
+            mapped into memory.
+    """
+    import h5py
+
+    with _Sink(out, "w+") as sink:
+        with h5py.File(sink, "w") as file:
+            file.attrs["physx"] = describe(tables, _ATTRIBUTE)
+            for table in tables:
+                group = file.create_group(table.mode)
+                for name in table.fields:
+                    _write_field(group, table, name, COMPRESSIONS[compression], sink)
+        sink.check()
+
+
+class _Sink(io.FileIO):
+    """A file that keeps the first error of writing to itself until it is asked.
+
+    HDF5 ends the process when a write fails, so none ever fails for it.
+    """
+
+    _error: OSError | None = None
+
+    def write(self, content: Any) -> int:
+        """Write all of the content; after an error, nothing more."""
+        view = memoryview(content).cast("B")
+        count = len(view)
+        try:
+            while view and self._error is None:
+                view = view[super().write(view) :]
+        except OSError as error:
+            self._error = error
+        return count
+
+    def truncate(self, size: int | None = None, /) -> int:
+        """Set the length of the file, unless there was an error."""
+        try:
+            return super().truncate(size) if self._error is None else 0
+        except OSError as error:
+            self._error = error
+            return 0
+
+    def check(self) -> None:
+        """Raise the first error of writing."""
+        if self._error is not None:
+            raise self._error
+
+
+def _write_field(group: Any, table: Table, name: str, compression: str | None, sink: _Sink) -> None:
+    field = table.fields[name]
+    shape, options = (table.rows, *(field.shape or ())), {}
+    if compression and 0 not in shape:
+        rows = min(table.rows, rows_of(field.nbytes, _CHUNK))
+        options = {"compression": compression, "shuffle": True, "chunks": (rows, *shape[1:])}
+    stored = group.create_dataset(name, shape, np.dtype(field.dtype), **options)
+    stored.attrs["unit"], stored.attrs["role"] = field.unit, field.role
+    for start, block in table.column(name, rows_of(field.nbytes)):
+        stored[start : start + len(block)] = block
+        sink.check()
+
+
+class Hdf5Column:
+    """A dataset of an HDF5 file; see `Column`."""
+
+    def __init__(self, place: str, dataset: Any) -> None:
+        self.shape: tuple[int, ...] = dataset.shape or ()
+        self.dtype: np.dtype[Any] = dataset.dtype
+        unit = dataset.attrs.get("unit", dataset.attrs.get("units", ""))
+        self.unit = unit if isinstance(unit, str) else ""
+        self._place, self._dataset = place, dataset
+
+    def read(self, start: int, count: int) -> Array:
+        """Return rows."""
+        try:
+            rows: Array = self._dataset[start : start + count]
+        except (OSError, RuntimeError) as error:
+            raise ExchangeError(f"{self._place} cannot be read: {error}.") from error
+        return rows
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[tuple[dict[str, Column], Notes]]:
+    """Open a file; give its datasets by their paths, and what its attributes say.
+
+    Raises:
+        ExchangeError: It is no HDF5 file, is damaged, or refers to other files.
+    """
+    import h5py
+
+    with contextlib.ExitStack() as files:
+        try:
+            file = files.enter_context(h5py.File(path, "r"))
+            columns = _columns(path, file, "", set())
+            notes = Notes.read(file.attrs.get("physx", "{}"))
+        except (OSError, RuntimeError, KeyError) as error:
+            raise ExchangeError(f"{path} cannot be read as HDF5: {error}.") from error
+        yield columns, notes
+
+
+def _columns(path: Path, group: Any, prefix: str, seen: set[Any]) -> dict[str, Column]:
+    """Return the datasets below a group; what leads out of the file is refused, not followed."""
+    import h5py
+
+    columns: dict[str, Column] = {}
+    for name in group:
+        place = f'"{prefix}{name}" of {path}'
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise ExchangeError(f"{place} is a link, which is not followed.")
+        item = group[name]
+        if isinstance(item, h5py.Dataset):
+            if _is_elsewhere(item):
+                raise ExchangeError(f"{place} has its values in files of another folder.")
+            columns[f"{prefix}{name}"] = Hdf5Column(place, item)
+        elif isinstance(item, h5py.Group):
+            address = h5py.h5o.get_info(item.id).addr
+            if address in seen:
+                raise ExchangeError(f"{place} is a group that holds itself.")
+            columns |= _columns(path, item, f"{prefix}{name}/", {*seen, address})
+    return columns
+
+
+def _is_elsewhere(dataset: Any) -> bool:
+    if dataset.is_virtual:
+        names = [source.file_name for source in dataset.virtual_sources()]
+        return any(PurePath(name).name != name for name in names)
+    return bool(dataset.external)

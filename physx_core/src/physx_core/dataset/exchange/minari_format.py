@@ -1,0 +1,193 @@
+"""Minari: the trajectories of a mode as episodes for offline reinforcement learning.
+
+Minari's episode of n steps has n + 1 observations: row i of a trajectory is observation i, and its
+action and reward belong to the step to row i + 1. So a trajectory of n + 1 rows becomes n steps;
+the action and the reward of its last row, which lead nowhere, are kept in ``infos/last``.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.dataset.exchange.table import Table, describe, library
+from physx_core.dataset.read.episodes import Episode, find_episodes
+from physx_core.errors import ConfigError, ExchangeError, listed, nearest
+from physx_core.fields import Field
+from physx_core.typing import Batch
+
+_PURPOSE = "Exporting to Minari"
+_OVERHEAD = 6000
+"""Bytes that an array of an episode takes besides its values, at most."""
+_OWN_ARRAYS = 4
+"""Arrays that Minari adds to each episode: actions, rewards, terminations, truncations."""
+_NAME = re.compile(r"[-_\w]+-v\d+")
+
+
+@dataclass(frozen=True)
+class Roles:
+    """What the fields of a mode are in an episode; the others are its infos.
+
+    Attributes:
+        observations: One field that is the observation itself, or several that are its entries.
+        actions: The same for the actions; none: there is only one action, doing nothing.
+        rewards: Field that is the reward, one number; None: it is 0.
+        entries: Whether the observation is a dictionary though it is one field.
+    """
+
+    observations: Sequence[str]
+    actions: Sequence[str]
+    rewards: str | None
+    entries: bool
+
+    @classmethod
+    def of(
+        cls, table: Table, observations: Sequence[str], actions: Sequence[str], rewards: str | None
+    ) -> Roles:
+        """Complete what a user chose.
+
+        Raises:
+            ConfigError: A field does not exist, is chosen twice, or the reward is no number.
+        """
+        chosen = [*observations, *actions, *([] if rewards is None else [rewards])]
+        for name in chosen:
+            if name not in table.fields:
+                raise ConfigError(
+                    f'Mode "{table.mode}" has no field "{name}".{nearest(name, table.fields)} '
+                    f"Fields: {listed(table.fields)}."
+                )
+            if chosen.count(name) > 1:
+                raise ConfigError(f'The field "{name}" is chosen more than once.')
+        if rewards is not None and table.fields[rewards].shape != ():
+            raise ConfigError(f'The reward "{rewards}" is not one number.')
+        rest = [n for n, f in table.fields.items() if f.role == "training" and n not in chosen]
+        if not observations and not rest:
+            raise ConfigError("No field is left for the observations.")
+        return cls(observations or rest, actions, rewards, not observations)
+
+
+def write(table: Table, out: Path, roles: Roles) -> int:
+    """Write the trajectories of a mode as a Minari dataset in HDF5.
+
+    ``minari.MinariDataset(out / "data")`` opens it; ``minari.load_dataset(name)`` does, too, if the
+    folder has a name such as ``arm-v0`` and lies in the folder ``MINARI_DATASETS_PATH``.
+
+    Args:
+        table: The mode.
+        out: The folder.
+        roles: What the fields are.
+
+    Returns:
+        How many rows are in no episode, because each is a trajectory of its own.
+
+    Raises:
+        MissingLibraryError: Minari is not installed.
+        ExchangeError: A field does not fit, or no trajectory has two rows.
+    """
+    minari = library("minari", _PURPOSE, "minari")
+    storages = library("minari.dataset.minari_storage", _PURPOSE, "minari")
+    buffers = library("minari.data_collector", _PURPOSE, "minari")
+    library("PIL", _PURPOSE, "minari")  # what its HDF5 storage imports
+    episodes = [e for e in find_episodes(table.view, table.rows) if len(e.rows) > 1]
+    if not episodes:
+        raise ExchangeError(
+            f'No trajectory of mode "{table.mode}" has two samples, which an episode of Minari '
+            "needs. A trajectory ends where an environment calls new_episode(), and where "
+            "check_sample() refuses a sample."
+        )
+    _check_space(table, out, len(episodes))
+    out.mkdir()
+    storage = storages.MinariStorage.new(
+        out / "data",
+        observation_space=_space(table.fields, roles.observations, entries=roles.entries),
+        action_space=_space(table.fields, roles.actions, entries=False),
+        jpeg_encoding=False,
+    )
+    storage.update_episodes(
+        buffers.EpisodeBuffer(**_episode(table, roles, episode)) for episode in episodes
+    )
+    name = out.name if _NAME.fullmatch(out.name) else "physx-v0"
+    storage.update_metadata(
+        {
+            "dataset_id": name,
+            "minari_version": minari.__version__,
+            "physx": json.loads(describe([table])),
+        }
+    )
+    return table.rows - sum(len(episode.rows) for episode in episodes)
+
+
+def _check_space(table: Table, out: Path, episodes: int) -> None:
+    """Check that the disk has room: HDF5, which Minari writes with, crashes where it has not."""
+    arrays = episodes * (len(table.fields) + _OWN_ARRAYS)
+    needed, free = table.nbytes + arrays * _OVERHEAD, shutil.disk_usage(out.parent).free
+    if needed > free:
+        raise ExchangeError(
+            f"{len(table.fields)} fields in {episodes} episodes take up to {needed / 1e6:.1f} MB, "
+            f"but the disk has {free / 1e6:.1f} MB left."
+        )
+
+
+def _episode(table: Table, roles: Roles, episode: Episode) -> dict[str, Any]:
+    rows: Batch = {name: table.view[name][episode.rows] for name in table.fields}
+    table.advance(sum(array.nbytes for array in rows.values()))
+    steps = len(episode.rows) - 1
+    last = {name: rows[name][steps:] for name in (*roles.actions, *_given(roles.rewards))}
+    used = {*roles.observations, *last}
+    infos: dict[str, Any] = {name: array for name, array in rows.items() if name not in used}
+    if last:
+        infos["last"] = last
+    truncations = np.zeros(steps, np.bool_)
+    truncations[-1] = True
+    observed = {name: rows[name] for name in roles.observations}
+    acted = {name: rows[name][:steps] for name in roles.actions}
+    return {
+        "observations": observed if roles.entries else _single(observed),
+        "actions": _single(acted) if acted else np.zeros(steps, np.int64),
+        "rewards": rows[roles.rewards][:steps] if roles.rewards else np.zeros(steps),
+        "terminations": np.zeros(steps, np.bool_),
+        "truncations": truncations,
+        "infos": infos or None,
+    }
+
+
+def _given(name: str | None) -> list[str]:
+    return [] if name is None else [name]
+
+
+def _single(arrays: Batch) -> Any:
+    return next(iter(arrays.values())) if len(arrays) == 1 else arrays
+
+
+def _space(fields: Mapping[str, Field], names: Sequence[str], *, entries: bool) -> Any:
+    from gymnasium import spaces
+
+    if not names:
+        return spaces.Discrete(1)
+    boxes = {name: _box(fields[name]) for name in names}
+    return boxes[names[0]] if len(names) == 1 and not entries else spaces.Dict(boxes)
+
+
+def _box(field: Field) -> Any:
+    from gymnasium import spaces
+
+    dtype = np.dtype(field.dtype)
+    if dtype.kind == "c" or 0 in (field.shape or ()):
+        raise ExchangeError(
+            f'Minari has no space for the field "{field.name}" of type {dtype} and shape '
+            f"{field.shape}."
+        )
+    low: Any = -np.inf
+    high: Any = np.inf
+    if dtype.kind == "b":
+        low, high = 0, 1
+    elif dtype.kind in "iu":
+        low, high = np.iinfo(dtype).min, np.iinfo(dtype).max
+    return spaces.Box(low, high, field.shape or (), dtype.type)

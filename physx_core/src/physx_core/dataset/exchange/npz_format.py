@@ -1,0 +1,130 @@
+"""NumPy's ``.npz``: a zip archive with one array for each field; nothing in it is ever unpickled.
+
+The archive's comment holds units, roles and modes, where `numpy.load` does not see them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.lib import format as npy
+
+from physx_core.dataset.exchange.table import Column, Notes, Table, describe, rows_of
+from physx_core.errors import ExchangeError
+from physx_core.typing import Array
+
+COMPRESSIONS = {"none": zipfile.ZIP_STORED, "deflate": zipfile.ZIP_DEFLATED}
+_COMMENT = 2**16 - 1
+_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
+
+
+def write(tables: Sequence[Table], out: Path, compression: str) -> None:
+    """Write the fields as ``<field>``, or as ``<mode>/<field>`` where there are several modes.
+
+    Args:
+        tables: The modes.
+        out: The file.
+        compression: One of `COMPRESSIONS`.
+    """
+    with zipfile.ZipFile(out, "w", COMPRESSIONS[compression]) as archive:
+        for table in tables:
+            prefix = f"{table.mode}/" if len(tables) > 1 else ""
+            for name in table.fields:
+                with archive.open(f"{prefix}{name}.npy", "w", force_zip64=True) as file:
+                    _write_array(table, name, file)
+        archive.comment = describe(tables, _COMMENT).encode()
+
+
+def _write_array(table: Table, name: str, file: IO[bytes]) -> None:
+    field = table.fields[name]
+    header = {
+        "descr": npy.dtype_to_descr(np.dtype(field.dtype)),
+        "fortran_order": False,
+        "shape": (table.rows, *(field.shape or ())),
+    }
+    npy.write_array_header_1_0(file, header)
+    for _, block in table.column(name, rows_of(field.nbytes)):
+        file.write(block.tobytes())
+
+
+class NpzColumn:
+    """An array of an archive, read from its beginning to its end; see `Column`."""
+
+    unit = ""
+
+    def __init__(self, path: Path, name: str, file: IO[bytes], size: int) -> None:
+        """Read the array's header.
+
+        Args:
+            path: The archive, for messages.
+            name: Name of the array.
+            file: Its bytes.
+            size: How many they are, if the archive says the truth.
+
+        Raises:
+            ExchangeError: The header is damaged, or promises more than there is.
+        """
+        self._place, self._file = f'The array "{name}" of {path}', file
+        try:
+            version = npy.read_magic(file)
+            read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
+            self.shape, fortran, self.dtype = read(file)
+        except (ValueError, KeyError, *_DAMAGE) as error:
+            raise ExchangeError(f"{self._place} has no header that can be read.") from error
+        self._whole: Array | None = None
+        if self.dtype.kind not in "biufc" or not self.shape:
+            return  # it cannot be taken, which is said where it is asked for
+        self._row = math.prod(self.shape[1:]) * self.dtype.itemsize
+        if min(self.shape) < 0 or size - file.tell() != self.shape[0] * self._row:
+            raise ExchangeError(f"{self._place} is not as long as its header says.")
+        if fortran:  # its rows do not lie one behind the other
+            flat = np.frombuffer(self._take(self.shape[0]), self.dtype)
+            self._whole = flat.reshape(self.shape, order="F")
+
+    def read(self, start: int, count: int) -> Array:
+        """Return the next rows."""
+        if self._whole is not None:
+            return self._whole[start : start + count]
+        shape = (count, *self.shape[1:])
+        return np.frombuffer(self._take(count), self.dtype).reshape(shape)
+
+    def _take(self, count: int) -> bytes:
+        try:
+            content = self._file.read(count * self._row)
+        except _DAMAGE as error:
+            raise ExchangeError(f"{self._place} is damaged: {error}.") from error
+        if len(content) != count * self._row:
+            raise ExchangeError(f"{self._place} is cut off.")
+        return content
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[tuple[dict[str, Column], Notes]]:
+    """Open an archive; give its arrays by name, and what its comment says.
+
+    Raises:
+        ExchangeError: It is no archive of arrays, or is damaged.
+    """
+    columns: dict[str, Column] = {}
+    with contextlib.ExitStack() as files:
+        try:
+            archive = files.enter_context(zipfile.ZipFile(path))
+            damaged = archive.testzip()  # before anything of it is stored
+            if damaged is not None:
+                raise zipfile.BadZipFile(f"{damaged} is not what was written")
+            for item in archive.infolist():
+                if item.filename.endswith(".npy"):
+                    name = item.filename.removesuffix(".npy")
+                    file = files.enter_context(archive.open(item))
+                    columns[name] = NpzColumn(path, name, file, item.file_size)
+            notes = Notes.read(archive.comment)
+        except _DAMAGE as error:
+            raise ExchangeError(f"{path} is no sound npz archive: {error}.") from error
+        yield columns, notes

@@ -1,0 +1,168 @@
+"""Mapping: the rows of a field in all its partitions as one array, read by the system when used."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import math
+import mmap
+import os
+import weakref
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physx_core import files
+from physx_core.dataset.read.reader import Segment
+from physx_core.dataset.store.partition_format import cannot_open, truncated
+from physx_core.errors import DatasetError
+from physx_core.fields import Field
+from physx_core.typing import Array
+
+_FIXED = 0x10  # MAP_FIXED, which the module mmap does not name
+_ANONYMOUS = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
+
+
+class _Mapped(NamedTuple):
+    path: str
+    inode: tuple[int, int]
+    start: int
+    end: int
+
+
+class MappedColumn:
+    """A field on the disk whose partitions lie side by side in the address space.
+
+    A row is taken from the array at its number plus a shift that each partition has, so that a
+    batch is one gather however many partitions there are. Several processes that map the same
+    files share the system's memory for them.
+
+    Attributes:
+        shape: (rows, *field shape).
+        dtype: Type of the rows.
+    """
+
+    def __init__(self, segments: Sequence[Segment], field: Field) -> None:
+        """Map the partitions.
+
+        Raises:
+            DatasetError: A partition is missing, truncated or damaged, or cannot be mapped.
+        """
+        self.shape: tuple[int, ...] = (
+            sum(segment.rows for segment in segments),
+            *(field.shape or ()),
+        )
+        self.dtype = np.dtype(field.dtype)
+        self._row_nbytes = field.nbytes
+        self._mapped: list[_Mapped] = []
+        self._starts = np.array([segment.start for segment in segments], np.intp)
+        self._shifts, slots = _places(segments, field.nbytes)
+        if field.nbytes and slots:
+            content = self._map(segments, slots * field.nbytes)
+            self._array = content.view(self.dtype).reshape(slots, *self.shape[1:])
+        else:
+            self._array = np.empty((slots, *self.shape[1:]), self.dtype)
+
+    def gather(self, index: NDArray[np.intp], out: Array) -> None:
+        """Copy the rows of an index array, all in range, into `out` of the field's own type."""
+        if len(self._starts) > 1:
+            index = index + self._shifts[self._starts.searchsorted(index, "right") - 1]
+        self._array.take(index, 0, out, "clip")
+
+    def check(self) -> None:
+        """Check that no file became shorter: the system ends a process that reads beyond the end.
+
+        Raises:
+            DatasetError: A file is truncated or gone.
+        """
+        for part in self._mapped:
+            try:
+                now = os.stat(part.path)  # noqa: PTH116 (quicker, and this is done often)
+            except FileNotFoundError:
+                continue  # a file that was removed or replaced stays what it is while mapped
+            if now.st_size < part.end and (now.st_dev, now.st_ino) == part.inode:
+                path, size = Path(part.path), self._row_nbytes
+                raise truncated(path, now.st_size, part.end, part.start, size)
+
+    def _map(self, segments: Sequence[Segment], nbytes: int) -> NDArray[np.uint8]:
+        base = _reserve(nbytes)
+        weakref.finalize(self, _libc().munmap, base, nbytes).atexit = False
+        for segment, shift in zip(segments, self._shifts, strict=True):
+            address = base + int(segment.start + shift) * self._row_nbytes
+            file, offset = segment.open(self._row_nbytes)
+            with file:
+                count = segment.rows * self._row_nbytes
+                try:
+                    _place(address, count, file.fileno(), offset)
+                except OSError as error:
+                    raise cannot_open(segment.path, error) from error
+                status = os.fstat(file.fileno())
+            inode = status.st_dev, status.st_ino
+            self._mapped.append(_Mapped(str(segment.path), inode, offset, offset + count))
+        content = np.frombuffer(_bytes_at(base, nbytes), np.uint8)
+        content.flags.writeable = False
+        return content
+
+
+def _places(segments: Sequence[Segment], row_nbytes: int) -> tuple[NDArray[np.intp], int]:
+    """Return how far each segment's rows lie behind their numbers, and the places in all.
+
+    Each segment begins at the start of a page, and at a whole number of rows.
+    """
+    step = mmap.PAGESIZE // math.gcd(mmap.PAGESIZE, max(1, row_nbytes))
+    shifts, end = [], 0
+    for segment in segments:
+        end = -(-end // step) * step
+        shifts.append(end - segment.start)
+        end += segment.rows
+    return np.array(shifts, np.intp), end
+
+
+def _place(address: int, count: int, descriptor: int, offset: int) -> None:
+    """Map `count` bytes of a file to an address; copy them where they do not begin with a page."""
+    if offset % mmap.PAGESIZE == 0:
+        _mmap(address, count, mmap.PROT_READ, mmap.MAP_SHARED | _FIXED, descriptor, offset)
+        return
+    _mmap(address, count, mmap.PROT_READ | mmap.PROT_WRITE, _ANONYMOUS | _FIXED, -1, 0)
+    if not files.read_at(descriptor, _bytes_at(address, count), offset):
+        raise OSError(0, "it became shorter while it was read")
+
+
+def _bytes_at(address: int, count: int) -> memoryview:
+    return memoryview((ctypes.c_ubyte * count).from_address(address)).cast("B")
+
+
+def _reserve(nbytes: int) -> int:
+    """Take addresses without memory behind them."""
+    noreserve = getattr(mmap, "MAP_NORESERVE", 0)
+    try:
+        return _mmap(None, nbytes, mmap.PROT_READ, _ANONYMOUS | noreserve, -1, 0)
+    except OSError as error:
+        raise DatasetError(
+            f"Rows cannot be mapped: {error.strerror}. {nbytes} bytes of addresses are needed. "
+            "Raise the limit of addresses (ulimit -v), or read fewer fields."
+        ) from error
+
+
+def _mmap(
+    address: int | None, nbytes: int, protection: int, flags: int, descriptor: int, offset: int
+) -> int:
+    found = _libc().mmap(address, nbytes, protection, flags, descriptor, offset)
+    if found is None or found == ctypes.c_void_p(-1).value:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+    return int(found)
+
+
+@functools.cache
+def _libc() -> Any:
+    library = ctypes.CDLL(None, use_errno=True)
+    library.mmap.restype = ctypes.c_void_p
+    library.mmap.argtypes = [
+        ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int, ctypes.c_int, ctypes.c_int, ctypes.c_int64,
+    ]  # fmt: skip
+    library.munmap.argtypes = [ctypes.c_void_p, ctypes.c_size_t]
+    return library

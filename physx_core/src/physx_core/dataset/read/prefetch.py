@@ -1,0 +1,100 @@
+"""Exact shuffling of rows on the disk: the system reads ahead what comes next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from physx_core.dataset.read import strategy as policy
+from physx_core.dataset.read.cache import ColumnCache, Index, MemoryColumn
+from physx_core.dataset.read.disk import DiskColumn
+from physx_core.typing import Batch
+
+_AHEAD = 2**24  # bytes that the system is asked to read ahead
+
+
+class ExactEpoch:
+    """A pass over rows on the disk, in the same permutation as in memory.
+
+    Fields of small rows are read into memory as long as they fit there beside the others.
+
+    Attributes:
+        rows: How many rows there are.
+    """
+
+    def __init__(
+        self,
+        columns: ColumnCache,
+        mode: str,
+        names: Sequence[str],
+        dtype: np.dtype[Any] | None,
+        random: np.random.Generator,
+        subset: Index | None = None,
+    ) -> None:
+        """Draw the permutation and ask for the first rows.
+
+        Args:
+            columns: Columns in memory, and the reader of the others.
+            mode: Name of the mode.
+            names: Names of the fields.
+            dtype: Type that floating fields are converted to; None: each keeps its own.
+            random: Draws the permutation.
+            subset: The only rows to give; None: all.
+
+        Raises:
+            DatasetError: A partition is missing, truncated or damaged.
+        """
+        self._order = random.permutation(columns.reader.rows(mode) if subset is None else subset)
+        self.rows = len(self._order)
+        small = _small(columns, mode, names, dtype)
+        self._columns: list[MemoryColumn | DiskColumn] = [
+            columns.load(mode, name, dtype)
+            if name in small
+            else DiskColumn(columns.reader, mode, name, dtype)
+            for name in names
+        ]
+        self._disk = [column for column in self._columns if isinstance(column, DiskColumn)]
+        row_nbytes = sum(column.row_nbytes for column in self._disk)
+        self._ahead = max(1, _AHEAD // max(1, row_nbytes))
+        self._announced = 0
+
+    def fill(self, start: int, batch: Batch) -> None:
+        """Copy the next rows: see `Epoch`.
+
+        Raises:
+            DatasetError: A partition is missing, truncated or damaged, or the disk fails.
+        """
+        outs = list(batch.values())
+        stop = start + len(outs[0])
+        for first in range(start, stop, self._ahead):
+            last = min(first + self._ahead, stop)
+            self._announce(last + self._ahead)
+            index = self._order[first:last]
+            for column, out in zip(self._columns, outs, strict=True):
+                column.gather(index, out[first - start : last - start])
+
+    def close(self) -> None:
+        """Close the files."""
+        for column in self._disk:
+            column.close()
+
+    def _announce(self, stop: int) -> None:
+        """Ask the system for the rows up to `stop` of the permutation."""
+        for row in self._order[self._announced : stop].tolist():
+            for column in self._disk:
+                column.announce(row)
+        self._announced = max(self._announced, min(stop, self.rows))
+
+
+def _small(
+    columns: ColumnCache, mode: str, names: Sequence[str], dtype: np.dtype[Any] | None
+) -> set[str]:
+    """Return the fields of small rows that fit into memory together, the smallest first."""
+    left, found = policy.budget(), set()
+    for size, name in sorted((columns.missing(mode, name, dtype), name) for name in names):
+        if size <= left and columns.reader.field(mode, name).nbytes < policy.LARGE_ROW:
+            left -= size
+            found.add(name)
+    return found

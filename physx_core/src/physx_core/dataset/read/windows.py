@@ -1,0 +1,117 @@
+"""Reading blocks of rows from the disk, and shuffling within a window of many blocks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physx_core.dataset.read.cache import Index
+from physx_core.dataset.read.disk import DiskColumn
+from physx_core.typing import Batch
+
+# The order depends on these sizes, but never on the free memory: a seed gives it again anywhere.
+_BLOCK = 2**19
+_WINDOW_BLOCKS = 64
+
+
+class WindowedEpoch:
+    """A pass over rows on the disk, block by block.
+
+    The blocks of consecutive rows, half a megabyte each, come in random order; the rows of 64 of
+    them at a time lie in memory and are shuffled. So each row comes once, and a batch draws from 64
+    places of the dataset. The order depends on the seed and on the fields that are read. Without
+    random numbers, the rows come in the order of writing.
+
+    Attributes:
+        rows: How many rows there are.
+    """
+
+    def __init__(
+        self,
+        columns: list[DiskColumn],
+        random: np.random.Generator | None,
+        subset: Index | None = None,
+    ) -> None:
+        """Draw the order of the blocks and ask for the first ones.
+
+        Args:
+            columns: The fields.
+            random: Draws the order; None: that of writing.
+            subset: The only rows to give, rising; None: all.
+
+        Raises:
+            DatasetError: A partition is missing, truncated or damaged.
+        """
+        self._total = columns[0].shape[0]
+        self.rows = self._total if subset is None else len(subset)
+        self._columns, self._random, self._subset = columns, random, subset
+        row_nbytes = sum(column.row_nbytes for column in columns)
+        self._block = max(1, _BLOCK // max(1, row_nbytes))
+        number = -(-self._total // self._block)
+        self._blocks = np.arange(number) if random is None else random.permutation(number)
+        if random is None:  # nothing is shuffled: a window of few megabytes will do
+            self._window_blocks = max(1, 8 * _BLOCK // max(1, self._block * row_nbytes))
+        else:
+            self._window_blocks = _WINDOW_BLOCKS
+        most = min(self._total, self._window_blocks * self._block)
+        self._windows = [np.empty((most, *c.shape[1:]), c.dtype) for c in columns]
+        self._order: Index | None = None
+        self._next_block, self._used, self._held = 0, 0, 0
+        self._announce()
+
+    def fill(self, start: int, batch: Batch) -> None:
+        """Copy the next rows: see `Epoch`.
+
+        Raises:
+            DatasetError: A partition is missing, truncated or damaged, or the disk fails.
+        """
+        outs = list(batch.values())
+        done, count = 0, len(outs[0])
+        while done < count:
+            while self._used == self._held:
+                self._read_window()
+            first, part = self._used, min(count - done, self._held - self._used)
+            for window, out in zip(self._windows, outs, strict=True):
+                target = out[done : done + part]
+                if self._order is None:
+                    target[...] = window[first : first + part]
+                else:
+                    window.take(self._order[first : first + part], 0, target, "clip")
+            self._used, done = first + part, done + part
+
+    def close(self) -> None:
+        """Close the files."""
+        for column in self._columns:
+            column.close()
+
+    def _read_window(self) -> None:
+        """Read the next window, and ask the system for the one after it."""
+        held = 0
+        for start, count in self._next_window():
+            for column, window in zip(self._columns, self._windows, strict=True):
+                column.slice(start, window[held : held + count])
+            held += count if self._subset is None else self._keep(start, count, held)
+        self._next_block += self._window_blocks
+        self._announce()
+        self._used, self._held = 0, held
+        if self._random is not None:
+            self._order = self._random.permutation(held)
+
+    def _keep(self, start: int, count: int, held: int) -> int:
+        """Move the block's rows of the subset to its front and return how many there are."""
+        subset = self._subset if self._subset is not None else np.arange(0)
+        first, last = np.searchsorted(subset, (start, start + count))
+        kept = subset[first:last] - start
+        for window in self._windows:
+            window[held : held + len(kept)] = window[held : held + count][kept]
+        return len(kept)
+
+    def _announce(self) -> None:
+        for start, count in self._next_window():
+            for column in self._columns:
+                column.announce(start, count)
+
+    def _next_window(self) -> list[tuple[int, int]]:
+        """Return first row and number of rows of each block of the next window."""
+        blocks = self._blocks[self._next_block : self._next_block + self._window_blocks]
+        starts = (blocks * self._block).tolist()
+        return [(start, min(self._block, self._total - start)) for start in starts]

@@ -1,0 +1,1 @@
+"""Recovery after crashes, verification, and repair."""

@@ -1,0 +1,1 @@
+"""Files of a dataset: partitions, manifest, virtual index."""

@@ -1,0 +1,246 @@
+"""What a dataset knows besides its rows: modes, fields, partitions, statistics, and its origin.
+
+`physx_core.dataset.store.manifest_file` stores it as ``dataset.json``.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.dataset.store.partition_format import Identity, partition_file
+from physx_core.errors import ConfigError, DatasetError
+from physx_core.fields import RESERVED, Field
+from physx_core.statistics import RunningStatistics
+
+
+@dataclass
+class Partition:
+    """Consecutive rows of one mode: one file for each field.
+
+    Attributes:
+        session: Session that wrote it.
+        index: Its number in the session and mode, counted from 0.
+        first_row: Row of the mode that was its first when it was begun; it orders the partitions.
+        rows: Committed rows, the same in all fields.
+        sealed: Whether it is complete: every file has exactly these rows.
+        offsets: Place of the first row in the file, by field.
+        checksums: CRC-32 of the rows, by field; empty until it is sealed, and while rows are
+            updated in place.
+        counted: Whether the mode's statistics hold its rows.
+        writing: Whether this process writes it, so that `offsets` are right though not sealed.
+        running: Statistics of its first rows while it is not counted, by field; not stored.
+    """
+
+    session: str
+    index: int
+    first_row: int
+    rows: int = 0
+    sealed: bool = False
+    offsets: dict[str, int] = field(default_factory=dict)
+    checksums: dict[str, int] = field(default_factory=dict)
+    counted: bool = False
+    writing: bool = False
+    running: dict[str, RunningStatistics] = field(default_factory=dict, compare=False)
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """What tells it from the other partitions of its mode."""
+        return self.session, self.index
+
+    def file_name(self, mode: str, name: str) -> str:
+        """Return the name of a field's file."""
+        return partition_file(self.session, mode, name, self.index)
+
+    def identity(self, mode: str, of: Field) -> Identity:
+        """Return what a field's file is part of."""
+        return Identity(self.session, mode, of, self.index, self.first_row)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON; an unfinished partition's rows are only in its files."""
+        plain: dict[str, Any] = {
+            "session": self.session,
+            "index": self.index,
+            "first_row": self.first_row,
+            "sealed": self.sealed,
+            "offsets": self.offsets,
+        }
+        if self.sealed:
+            crc32 = {name: f"{value:08x}" for name, value in self.checksums.items()}
+            plain |= {"rows": self.rows, "crc32": crc32, "counted": self.counted}
+        return plain
+
+
+@dataclass
+class Mode:
+    """The rows of one mode.
+
+    Attributes:
+        fields: The fields by name; shapes are None until the first rows tell them.
+        partitions: In the order of the rows.
+        statistics: Statistics of floating fields, over the rows of all counted partitions.
+        dropped: Partitions that are no part of the mode though their files may be there: they are
+            being removed, or copied from another dataset.
+    """
+
+    fields: dict[str, Field]
+    partitions: list[Partition] = field(default_factory=list)
+    statistics: dict[str, RunningStatistics] = field(default_factory=dict)
+    dropped: list[Partition] = field(default_factory=list)
+
+    @property
+    def rows(self) -> int:
+        """Committed rows."""
+        return sum(partition.rows for partition in self.partitions)
+
+    @property
+    def next_row(self) -> int:
+        """First row of the next partition, larger than that of any before."""
+        before = (p.first_row + max(1, p.rows) for p in (*self.partitions, *self.dropped))
+        return max(self.rows, *before, 0)
+
+    @property
+    def counted_fields(self) -> dict[str, Field]:
+        """The fields that have statistics."""
+        return {name: of for name, of in self.fields.items() if has_statistics(of)}
+
+    def place(self, partition: Partition) -> int:
+        """Return where in the order a partition is, whatever became of it meanwhile."""
+        return [p.key for p in self.partitions].index(partition.key)
+
+    def start(self, partition: Partition) -> int:
+        """Return the row of the mode that is a partition's first now."""
+        return sum(before.rows for before in self.partitions[: self.place(partition)])
+
+    def swap(self, partition: Partition) -> None:
+        """Put a partition in the place of its earlier state."""
+        self.partitions[self.place(partition)] = partition
+
+    def forget_statistics(self) -> None:
+        """Let the statistics be computed anew from all rows."""
+        self.statistics = {}
+        for place, partition in enumerate(self.partitions):
+            partition.running = {}
+            if partition.counted:
+                self.partitions[place] = replace(partition, counted=False)
+
+    def continues(self, earlier: Mode) -> bool:
+        """Return whether all rows of an earlier state are still here, at the same places."""
+        before = [p for p in earlier.partitions if p.rows]
+        now = [p for p in self.partitions if p.rows]
+        grown = all(
+            old.key == new.key
+            and (old.rows == new.rows or old is before[-1])
+            and (old.checksums == new.checksums or not old.sealed)
+            for old, new in zip(before, now, strict=False)
+        )
+        return grown and len(now) >= len(before) and self.rows >= earlier.rows
+
+    def copy(self) -> Mode:
+        """Return a mode that can be changed while this one stays; partitions are shared."""
+        return Mode(
+            dict(self.fields), list(self.partitions), dict(self.statistics), list(self.dropped)
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        plain: dict[str, Any] = {
+            "fields": [of.to_dict() for of in self.fields.values()],
+            "partitions": [partition.to_dict() for partition in self.partitions],
+            "normalization": {name: s.to_dict() for name, s in self.statistics.items() if s.count},
+        }
+        if self.dropped:
+            plain["dropped"] = [partition.to_dict() for partition in self.dropped]
+        return plain
+
+
+def has_statistics(of: Field) -> bool:
+    """Return whether statistics of a field are kept: of floating ones that users define."""
+    return of.name not in RESERVED and np.dtype(of.dtype).kind == "f"
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what writes datasets."""
+    packages = ("physx-core", "numpy", "h5py")
+    return {"python": platform.python_version()} | {
+        package: metadata.version(package) for package in packages
+    }
+
+
+@dataclass
+class Manifest:
+    """Everything that a dataset knows besides its rows.
+
+    Attributes:
+        modes: The modes by name.
+        info: Where the data came from: environment, its keyword arguments, seed and the like.
+        versions: Versions of Python and of the packages that made the dataset.
+        problems: Modes whose rows cannot be counted, and why; not stored.
+    """
+
+    modes: dict[str, Mode] = field(default_factory=dict)
+    info: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=versions)
+    problems: dict[str, DatasetError] = field(default_factory=dict)
+
+    @property
+    def sessions(self) -> list[str]:
+        """Names of the sessions that wrote rows, in their order."""
+        found = [p.session for mode in self.modes.values() for p in mode.partitions]
+        return list(dict.fromkeys(found))
+
+    @property
+    def file_names(self) -> set[str]:
+        """Names of all partition files, also of dropped ones."""
+        return {
+            partition.file_name(name, of)
+            for name, mode in self.modes.items()
+            for partition in (*mode.partitions, *mode.dropped)
+            for of in mode.fields
+        }
+
+    def copy(self) -> Manifest:
+        """Return a manifest that can be changed while this one stays; partitions are shared."""
+        modes = {name: mode.copy() for name, mode in self.modes.items()}
+        return Manifest(modes, dict(self.info), dict(self.versions), dict(self.problems))
+
+    def take(self, other: Manifest) -> bool:
+        """Become what `other` is; return whether rows known before are now at other places."""
+        moved = any(
+            name not in other.modes or not other.modes[name].continues(mode)
+            for name, mode in self.modes.items()
+            if name not in self.problems
+        )
+        self.modes, self.info = other.modes, other.info
+        self.versions, self.problems = other.versions, other.problems
+        return moved
+
+
+def plain_info(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values as the manifest will give them back: tuples and arrays become lists.
+
+    Raises:
+        ConfigError: A value is nothing that JSON can hold.
+    """
+
+    def convert(value: Any) -> Any:
+        if isinstance(value, (np.ndarray, np.generic)):
+            return value.tolist()
+        if isinstance(value, Path):
+            return str(value)
+        if isinstance(value, type):
+            return f"{value.__module__}:{value.__qualname__}"
+        raise TypeError(f"{value!r} is nothing that JSON can hold")
+
+    try:
+        plain: dict[str, Any] = json.loads(json.dumps(dict(values), default=convert))
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"The dataset's info cannot be stored: {error}.") from error
+    return plain

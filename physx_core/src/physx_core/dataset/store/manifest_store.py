@@ -1,0 +1,70 @@
+"""The ledger: the manifest in memory and on the disk, changed in whole steps."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from physx_core import files
+from physx_core.dataset.store import manifest_file
+from physx_core.dataset.store.manifest import Manifest, Mode
+
+
+@dataclass
+class Ledger:
+    """The manifest of a dataset that is written, by one writer or by several.
+
+    Where several writers share a dataset, they take turns: each step begins with what the others
+    have stored. The partitions that this process writes stay its own all the while.
+
+    Attributes:
+        directory: The dataset's folder.
+        manifest: What the dataset holds, as far as this process knows.
+        shared: Whether other processes write to it too.
+        moved: Whether rows that were known before have been changed or are at other places now;
+            whoever keeps rows in memory sets it back.
+    """
+
+    directory: Path
+    manifest: Manifest
+    shared: bool = False
+    moved: bool = False
+
+    @contextlib.contextmanager
+    def changing(self) -> Iterator[Manifest]:
+        """Give the manifest to be changed, and store it at the end; or leave all as it was.
+
+        Raises:
+            OSError: It cannot be stored.
+        """
+        with files.turn(self.directory) if self.shared else contextlib.nullcontext():
+            if self.shared:
+                self.reload(manifest_file.load(self.directory))
+            before = self.manifest.copy()
+            try:
+                yield self.manifest
+                manifest_file.save(self.directory, self.manifest)
+            except BaseException:
+                self.manifest.take(before)
+                raise
+
+    def reload(self, now: Manifest) -> None:
+        """Take over what other writers have stored."""
+        for name, mode in self.manifest.modes.items():
+            if name in now.modes:
+                _keep_known(now.modes[name], mode)
+        self.moved |= self.manifest.take(now)
+
+
+def _keep_known(mode: Mode, before: Mode) -> None:
+    """Keep own partitions as they are, and the rows that others were known to have."""
+    known = {partition.key: partition for partition in before.partitions}
+    for place, partition in enumerate(mode.partitions):
+        earlier = known.get(partition.key)
+        if earlier is not None and earlier.writing:
+            mode.partitions[place] = earlier
+        elif earlier is not None and not partition.sealed:
+            partition.rows = max(partition.rows, earlier.rows)
+            partition.running = earlier.running

@@ -1,0 +1,204 @@
+"""One field's file of the partition that is being written."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+from physx_core import files
+from physx_core.dataset.store.checksums import crc32
+from physx_core.dataset.store.partition_format import Header, Identity, make_header
+from physx_core.typing import Array
+
+_SMALLEST_STEP = 2**20
+_LARGEST_STEP = 2**26
+_COPY = 2**23
+
+
+class PartitionFile:
+    """Writes rows to their places and commits them with the row count.
+
+    Attributes:
+        identity: What the file is part of.
+        data_offset: Place of the first row.
+    """
+
+    def __init__(self, path: Path, identity: Identity, header: Header, descriptor: int) -> None:
+        self.identity = identity
+        self.data_offset = header.data_offset
+        self._path = path
+        self._row_nbytes = identity.field.nbytes
+        self._rows_offset = header.rows_offset
+        self._size = header.size
+        self._reserved = len(header.content)
+        self._descriptor = descriptor
+
+    @classmethod
+    def create(cls, directory: Path, identity: Identity, capacity: int) -> PartitionFile:
+        """Write an empty partition file under a temporary name.
+
+        Args:
+            directory: The dataset's folder.
+            identity: What the file is part of.
+            capacity: How many rows fit in.
+
+        Raises:
+            OSError: The file cannot be written; nothing of it is left.
+        """
+        header = make_header(identity, capacity)
+        path = directory / identity.file_name
+        return cls(path, identity, header, _write_header(files.temporary(path), header))
+
+    def publish(self) -> None:
+        """Give the file its name."""
+        files.temporary(self._path).rename(self._path)
+
+    def discard(self) -> None:
+        """Close the file and remove it, whether it has its name or not."""
+        self.close()
+        files.temporary(self._path).unlink(missing_ok=True)
+        self._path.unlink(missing_ok=True)
+
+    def reserve(self, rows: int) -> None:
+        """Take the space on the disk for the first `rows` rows, and for some more.
+
+        Raises:
+            OSError: The disk is full; nothing was changed.
+        """
+        needed = self.data_offset + rows * self._row_nbytes
+        if needed <= self._reserved:
+            return
+        step = min(max(self._reserved, _SMALLEST_STEP), _LARGEST_STEP)
+        ample = min(max(needed, self._reserved + step), self._size)
+        try:
+            self._allocate(ample)
+        except OSError as error:
+            if error.errno in (errno.EOPNOTSUPP, errno.EINVAL):  # nothing can be reserved here
+                self._reserved = self._size
+            elif error.errno in files.FULL:
+                self._allocate(needed)
+            else:
+                raise
+
+    def write(self, row: int, block: Array) -> None:
+        """Write rows, not yet committed.
+
+        Args:
+            row: Place of the first one.
+            block: Contiguous rows of the field's own type, shape (count, *field shape).
+        """
+        if self._row_nbytes:
+            offset = self.data_offset + row * self._row_nbytes
+            files.write_at(self._descriptor, files.raw(block), offset)
+
+    def commit(self, rows: int) -> None:
+        """Make the first `rows` rows part of the dataset."""
+        files.write_at(self._descriptor, rows.to_bytes(8, "little"), self._rows_offset)
+
+    @property
+    def descriptor(self) -> int:
+        """The open file."""
+        return self._descriptor
+
+    def sync(self) -> None:
+        """Wait until everything written is on the disk."""
+        os.fdatasync(self._descriptor)
+
+    def close(self) -> None:
+        """Close the file; calling it again does nothing."""
+        if self._descriptor >= 0:
+            os.close(self.hand_over())
+
+    def hand_over(self) -> int:
+        """Return the open file to somebody else, who closes it."""
+        descriptor, self._descriptor = self._descriptor, -1
+        return descriptor
+
+    def _allocate(self, end: int) -> None:
+        os.posix_fallocate(self._descriptor, self._reserved, end - self._reserved)
+        self._reserved = end
+
+
+def rewrite(path: Path, identity: Identity, rows: int, data_offset: int) -> int:
+    """Replace a partition file by one that holds exactly its first `rows` rows.
+
+    Args:
+        path: The file.
+        identity: What it is part of.
+        rows: How many rows it keeps.
+        data_offset: Where they begin in the present file.
+
+    Returns:
+        Where they begin in the new file.
+
+    Raises:
+        OSError: The new file cannot be written; the present one is left as it is.
+    """
+    return copy(path, data_offset, path, identity, rows)[0]
+
+
+def copy(
+    source: Path, source_offset: int, path: Path, identity: Identity, rows: int
+) -> tuple[int, int]:
+    """Make a partition file of the rows of another; it has its name when it is complete.
+
+    Args:
+        source: The other file.
+        source_offset: Where its rows begin.
+        path: The file to make; one of this name is replaced.
+        identity: What it is part of.
+        rows: How many rows it gets.
+
+    Returns:
+        Where they begin in the file, and their CRC-32.
+
+    Raises:
+        OSError: The file cannot be written; nothing was changed.
+    """
+    header = make_header(identity, rows, rows)
+    draft = files.temporary(path)
+    descriptor = _write_header(draft, header)
+    try:
+        try:
+            count = rows * identity.field.nbytes
+            crc = _copy(source, source_offset, descriptor, header.data_offset, count)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        draft.replace(path)
+    except OSError:
+        draft.unlink(missing_ok=True)
+        raise
+    return header.data_offset, crc
+
+
+def _write_header(path: Path, header: Header) -> int:
+    descriptor = files.create_new(path)
+    try:
+        os.ftruncate(descriptor, header.size)
+        files.write_at(descriptor, header.content, 0)
+    except OSError:
+        os.close(descriptor)
+        path.unlink(missing_ok=True)
+        raise
+    return descriptor
+
+
+def _copy(source: Path, source_offset: int, target: int, target_offset: int, count: int) -> int:
+    buffer, done, crc = memoryview(bytearray(min(count, _COPY))), 0, 0
+    origin = files.open_regular(source)
+    try:
+        while done < count:
+            part = buffer[: count - done]
+            here, there = source_offset + done, target_offset + done
+            shared = files.copied(origin, here, target, there, len(part))
+            descriptor, offset = (target, there) if shared else (origin, here)
+            if not files.read_at(descriptor, part, offset):
+                raise OSError(errno.EIO, f"{source} became shorter while it was read")
+            if not shared:
+                files.write_at(target, part, there)
+            crc, done = crc32(part, crc), done + len(part)
+    finally:
+        os.close(origin)
+    return crc

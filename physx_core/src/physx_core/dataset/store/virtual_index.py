@@ -1,0 +1,66 @@
+"""The virtual index ``<session>.h5``: all sealed rows of a dataset in one file for other tools.
+
+Where several sessions wrote a dataset, the index under the name of each of them shows all rows.
+It holds ``/<mode>/<field>`` as virtual datasets that refer to the partitions beside it. physx
+itself never reads it.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core import files
+from physx_core.dataset.store.manifest import Manifest, Mode
+from physx_core.fields import Field
+
+FORMAT = "physx index"
+
+
+def write_index(directory: Path, session: str, manifest: Manifest) -> None:
+    """Write the index of everything that is sealed so far.
+
+    Args:
+        directory: The dataset's folder.
+        session: Session that writes it; it gets an index even if it has no rows yet.
+        manifest: What the dataset holds.
+
+    Raises:
+        OSError: The index cannot be written; an old one is still there.
+    """
+    import h5py
+
+    image = io.BytesIO()
+    with h5py.File(image, "w") as file:
+        file.attrs["format"], file.attrs["format_version"] = FORMAT, 1
+        for name, mode in manifest.modes.items():
+            group = file.create_group(name)
+            for field in mode.fields.values():
+                if field.shape is not None:
+                    _add(group, name, mode, field)
+    for name in {session, *manifest.sessions}:
+        files.replace(directory / f"{name}.h5", image.getvalue(), sync=False)
+
+
+def _add(group: Any, mode_name: str, mode: Mode, field: Field) -> None:
+    import h5py
+
+    sealed = [partition for partition in mode.partitions if partition.sealed]
+    rows = sum(partition.rows for partition in sealed)
+    shape, dtype = (rows, *(field.shape or ())), np.dtype(field.dtype)
+    if not rows or not field.nbytes:
+        entry = group.create_dataset(field.name, shape, dtype)
+    else:
+        layout, start = h5py.VirtualLayout(shape, dtype), 0
+        for partition in sealed:
+            source_shape = (partition.rows, *shape[1:])
+            source_file = partition.file_name(mode_name, field.name)
+            source = h5py.VirtualSource(source_file, "data", source_shape, dtype)
+            layout[start : start + partition.rows] = source
+            start += partition.rows
+        missing = np.nan if dtype.kind == "f" else None  # what rows of a lost partition read as
+        entry = group.create_virtual_dataset(field.name, layout, fillvalue=missing)
+    entry.attrs["unit"], entry.attrs["role"] = field.unit, field.role

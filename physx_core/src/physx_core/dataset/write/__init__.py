@@ -1,0 +1,1 @@
+"""Appending, updating, and merging rows."""

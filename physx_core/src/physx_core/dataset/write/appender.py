@@ -1,0 +1,91 @@
+"""Rows and single samples on their way into a dataset: defined, checked, buffered, stored."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from physx_core import files
+from physx_core.dataset.store.manifest import Mode
+from physx_core.dataset.write.checks import RowBuffer, check_rows, infer_fields
+from physx_core.dataset.write.definitions import compare_fields, complete_shapes, shapes_of_rows
+from physx_core.dataset.write.writer import Writer
+from physx_core.errors import ConfigError
+from physx_core.fields import Field
+from physx_core.typing import Batch
+
+
+class Appender:
+    """Brings what users give into the form that the writer stores; see `Dataset` for the calls.
+
+    Attributes:
+        writer: Stores the rows.
+    """
+
+    def __init__(self, writer: Writer) -> None:
+        self._ledger, self._manifest = writer.ledger, writer.ledger.manifest
+        self.writer = writer
+        self._buffers: dict[str, RowBuffer] = {}
+
+    def define_fields(self, mode: str, fields: Iterable[Field]) -> None:
+        """Define the fields of a mode: see `Dataset.define_fields`."""
+        given = {field.name: field for field in fields}
+        if not mode.isidentifier() or not given:
+            names = sorted(given) or "no fields"
+            raise ConfigError(f"A mode needs an identifier and fields, not {mode!r} with {names}.")
+        known = self._manifest.modes.get(mode)
+        if known is not None and _completed(mode, known, given) == known.fields:
+            return
+        with files.storing(f"The fields of mode {mode!r}"), self._ledger.changing() as manifest:
+            known = manifest.modes.setdefault(mode, Mode(given))
+            known.fields = _completed(mode, known, given)
+
+    def append(self, mode: str, rows: Mapping[str, Any]) -> None:
+        """Store and commit rows: see `Dataset.append`."""
+        known = self._manifest.modes.get(mode)
+        fields = known.fields if known else {field.name: field for field in infer_fields(rows)}
+        checked, count = check_rows(fields, rows)
+        self._flush(mode)
+        self._settle(mode, fields, checked)
+        self.writer.append(mode, checked, count)
+
+    def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
+        """Store one sample, soon: see `Dataset.append_sample`."""
+        buffer = self._buffers.get(mode)
+        if buffer is None:
+            buffer = self._buffer(mode, sample)
+        buffer.put(sample)
+        if buffer.full:
+            self._flush(mode)
+
+    def flush(self) -> None:
+        """Commit the samples that wait: see `Dataset.flush`."""
+        for mode in self._buffers:
+            self._flush(mode)
+
+    def _buffer(self, mode: str, sample: Mapping[str, Any]) -> RowBuffer:
+        """Make the buffer of a mode, from whose first sample the fields may become known."""
+        known = self._manifest.modes.get(mode)
+        rows = {name: [value] for name, value in sample.items()}
+        fields = known.fields if known else {field.name: field for field in infer_fields(rows)}
+        checked, _ = check_rows(fields, rows)
+        self._settle(mode, fields, checked)
+        buffer = self._buffers[mode] = RowBuffer(self._manifest.modes[mode].fields)
+        return buffer
+
+    def _flush(self, mode: str) -> None:
+        buffer = self._buffers.get(mode)
+        if buffer is not None and buffer.count:
+            count = buffer.count
+            self.writer.append(mode, buffer.take(), count)
+
+    def _settle(self, mode: str, fields: Mapping[str, Field], rows: Batch) -> None:
+        """Add the mode, if it is new, and complete shapes that the first rows tell."""
+        known = self._manifest.modes.get(mode)
+        if known is None or any(field.shape is None for field in known.fields.values()):
+            self.define_fields(mode, shapes_of_rows(fields, rows).values())
+
+
+def _completed(mode: str, known: Mode, given: Mapping[str, Field]) -> dict[str, Field]:
+    compare_fields(f'Mode "{mode}" of the dataset', known.fields, given)
+    return complete_shapes(known.fields, given)

@@ -1,0 +1,62 @@
+"""Comparing the fields of a mode with those that are given, and completing their shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from physx_core.errors import FieldsMismatchError
+from physx_core.fields import Field
+from physx_core.typing import Batch
+
+
+def compare_fields(what: str, known: Mapping[str, Field], given: Mapping[str, Field]) -> None:
+    """Check that two sets of fields are the same; a shape of None fits any.
+
+    Args:
+        what: What has the known fields, for the error's text.
+        known: Fields that are there.
+        given: Fields that are to be there.
+
+    Raises:
+        FieldsMismatchError: They differ; names each difference.
+    """
+    differences = dict.fromkeys(given.keys() - known.keys(), "is not one of its fields")
+    differences |= dict.fromkeys(known.keys() - given.keys(), "is missing")
+    for name in known.keys() & given.keys():
+        difference = _difference(known[name], given[name])
+        if difference:
+            differences[name] = difference
+    if differences:
+        raise FieldsMismatchError(f"{what} has other fields", dict(sorted(differences.items())))
+
+
+def complete_shapes(known: Mapping[str, Field], given: Mapping[str, Field]) -> dict[str, Field]:
+    """Return the known fields, with shapes that are not known yet taken from those given."""
+    return {
+        name: replace(field, shape=given[name].shape) if field.shape is None else field
+        for name, field in known.items()
+    }
+
+
+def shapes_of_rows(fields: Mapping[str, Field], rows: Batch) -> dict[str, Field]:
+    """Return the fields, with shapes that are not known yet taken from rows."""
+    return {
+        name: replace(field, shape=rows[name].shape[1:]) if field.shape is None else field
+        for name, field in fields.items()
+    }
+
+
+def _difference(known: Field, given: Field) -> str:
+    parts = []
+    if None not in (known.shape, given.shape) and known.shape != given.shape:
+        parts.append(f"shape {known.shape}, not {given.shape}")
+    if known.dtype != given.dtype:
+        parts.append(f"type {np.dtype(known.dtype)}, not {np.dtype(given.dtype)}")
+    if known.unit != given.unit:
+        parts.append(f"unit {known.unit!r}, not {given.unit!r}")
+    if known.role != given.role:
+        parts.append(f"role {known.role}, not {given.role}")
+    return f"has {'; '.join(parts)}" if parts else ""

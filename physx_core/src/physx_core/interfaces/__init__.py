@@ -1,1 +1,0 @@
-"""The interfaces that plugins implement and pipelines rely on."""

@@ -1,8 +1,0 @@
-"""Motors: from commands to joint torques, the same on every engine."""
-
-from __future__ import annotations
-
-from physx_core.motors.description import Motor, with_rotors
-from physx_core.motors.motors import Motors, MotorState
-
-__all__ = ["Motor", "MotorState", "Motors", "with_rotors"]

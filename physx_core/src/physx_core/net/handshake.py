@@ -1,0 +1,133 @@
+"""Handshake: both sides prove that they know the token before anything else is read.
+
+Each side sends 32 random bytes; the other answers with their HMAC-SHA256 under the token. The
+token itself never travels. What follows is neither encrypted nor signed: across a network that
+others can write to, use a tunnel.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import socket
+import struct
+
+from physx_core.errors import ConnectionRefusedByPeerError, UnansweredError
+from physx_core.net.frames import MAX_PAYLOAD, Frame, FrameReader, Kind, pack
+
+TOKEN_VARIABLE = "PHYSX_TOKEN"
+"""Environment variable that holds the token of a run."""
+
+VERSION = 1
+"""Version of what client and server say to each other."""
+
+HANDSHAKE_LIMIT = 256
+"""Longest payload in bytes that is taken from a stranger."""
+
+_OPENING = struct.Struct("<8sI32s")
+_MAGIC = b"physxtcp"
+_PROOF_SIZE = 32
+
+
+def _proof(token: str, side: bytes, first: bytes, second: bytes, instance: int = 0) -> bytes:
+    message = b"|".join([side, struct.pack("<IQ", VERSION, instance), first, second])
+    return hmac.new(token.encode(), message, "sha256").digest()
+
+
+class ServerHandshake:
+    """The server's part of one handshake.
+
+    Attributes:
+        instance_id: Instance that the client wants to run, 0 for any; None until it is trusted.
+    """
+
+    def __init__(self, token: str) -> None:
+        """Draw a challenge.
+
+        Args:
+            token: What the client must know.
+        """
+        self.instance_id: int | None = None
+        self._token = token
+        self._own = secrets.token_bytes(32)
+        self._other: bytes | None = None
+
+    def answer(self, frame: Frame) -> bytes:
+        """Return what to send back; `instance_id` is set once the client is trusted.
+
+        Raises:
+            ConnectionRefusedByPeerError: The client spoke nonsense or does not know the token.
+        """
+        if frame.kind is Kind.HELLO and self._other is None:
+            magic, version, self._other = _opening(frame.payload)
+            if magic != _MAGIC:
+                raise ConnectionRefusedByPeerError("A stranger connected that is no physx client.")
+            opening = _OPENING.pack(_MAGIC, VERSION, self._own)
+            if version != VERSION:  # the client says what is wrong: it knows both versions now
+                return pack(Kind.CHALLENGE, opening + bytes(_PROOF_SIZE))
+            proof = _proof(self._token, b"server", self._other, self._own)
+            return pack(Kind.CHALLENGE, opening + proof)
+        if frame.kind is Kind.PROOF and self._other is not None:
+            wanted = _proof(self._token, b"client", self._own, self._other, frame.number)
+            if hmac.compare_digest(wanted, bytes(frame.payload)):
+                self.instance_id = frame.number
+                return b""
+        raise ConnectionRefusedByPeerError("A client connected that does not know the token.")
+
+
+def introduce(connection: socket.socket, token: str, instance: int) -> FrameReader:
+    """Prove to a server that this client knows the token, and have it prove the same.
+
+    Args:
+        connection: Blocking socket, with a timeout.
+        token: The run's token.
+        instance: Number of the instance to run, 0 for any that is free.
+
+    Returns:
+        The reader for what the server sends next.
+
+    Raises:
+        UnansweredError: The server does not answer, or ended the connection.
+        ConnectionRefusedByPeerError: The server is of another version, knows another token, or is
+            no server of physx.
+    """
+    reader = FrameReader(HANDSHAKE_LIMIT)
+    own = secrets.token_bytes(32)
+    try:
+        connection.sendall(pack(Kind.HELLO, _OPENING.pack(_MAGIC, VERSION, own)))
+        frame = reader.read(connection)
+    except (EOFError, OSError) as error:
+        raise UnansweredError(
+            f"The server ended the connection or did not answer ({error})."
+        ) from error
+    if frame is None or frame.kind is not Kind.CHALLENGE:
+        raise ConnectionRefusedByPeerError("What answers at that address is no physx server.")
+    magic, version, other = _opening(frame.payload[:-_PROOF_SIZE])
+    if magic != _MAGIC or version != VERSION:
+        raise ConnectionRefusedByPeerError(
+            f"The server speaks version {version} of the protocol, this client version {VERSION}. "
+            "Install the same version of physx-core on both sides."
+        )
+    if not hmac.compare_digest(
+        _proof(token, b"server", own, other), bytes(frame.payload[-_PROOF_SIZE:])
+    ):
+        raise ConnectionRefusedByPeerError(
+            "The server does not know this client's token. Set the environment variable "
+            f"{TOKEN_VARIABLE} to the token of the run that the client shall join, or name the "
+            "file that holds it with --token-file."
+        )
+    proof = _proof(token, b"client", other, own, instance)
+    try:
+        connection.sendall(pack(Kind.PROOF, proof, instance))
+    except OSError as error:
+        raise UnansweredError(f"The server ended the connection ({error}).") from error
+    reader.limit = MAX_PAYLOAD
+    return reader
+
+
+def _opening(payload: bytearray) -> tuple[bytes, int, bytes]:
+    try:
+        magic, version, challenge = _OPENING.unpack(payload)
+    except struct.error:
+        raise ConnectionRefusedByPeerError("A stranger sent no proper greeting.") from None
+    return magic, version, challenge

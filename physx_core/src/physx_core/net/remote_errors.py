@@ -1,0 +1,74 @@
+"""Failures: errors of physx as plain values, and back as the same classes."""
+
+from __future__ import annotations
+
+import traceback
+from typing import Any
+
+from physx_core import errors
+from physx_core.errors import ConnectionRefusedByPeerError, PhysxError, UsageError
+from physx_core.net.values import decode, encode
+
+_PARTS = {"classes": list, "message": str, "attributes": dict, "traceback": str}
+
+
+class RemoteTraceback(Exception):  # noqa: N818 - it is the cause of an error, not an error itself
+    """The traceback of an error as text, as it was in the process that raised it."""
+
+    def __str__(self) -> str:
+        """Return the text, set apart from the line in front of it."""
+        return f"\n{self.args[0]}"
+
+
+def encode_error(error: PhysxError) -> bytes:
+    """Return an error with its attributes, notes and traceback as bytes."""
+    attributes = {name: kept for name, kept in vars(error).items() if _is_plain(kept)}
+    return encode(
+        {
+            "classes": [cls.__name__ for cls in type(error).__mro__],
+            "message": str(error),
+            "attributes": attributes,
+            "traceback": "".join(traceback.format_exception(error)),
+        }
+    )
+
+
+def decode_error(payload: bytes | bytearray) -> PhysxError:
+    """Return the error that `encode_error` was given.
+
+    Its class is found by name among those of `physx_core.errors` only; an error class of a plugin
+    comes back as the nearest of them that it derives from.
+
+    Raises:
+        ConnectionRefusedByPeerError: The bytes were not made by `encode_error`.
+    """
+    plain: dict[str, Any] = decode(payload)
+    if not _is_error(plain):
+        raise ConnectionRefusedByPeerError("What was received as an error describes none.")
+    cls = next((c for c in map(_error_class, plain["classes"]) if c is not None), PhysxError)
+    error = cls.__new__(cls)
+    Exception.__init__(error, plain["message"])
+    vars(error).update(plain["attributes"])
+    error.__cause__ = RemoteTraceback(plain["traceback"])
+    return error
+
+
+def _error_class(name: str) -> type[PhysxError] | None:
+    found = getattr(errors, name, None)
+    return found if isinstance(found, type) and issubclass(found, PhysxError) else None
+
+
+def _is_error(plain: Any) -> bool:
+    if not isinstance(plain, dict) or {k: type(value) for k, value in plain.items()} != _PARTS:
+        return False
+    notes = plain["attributes"].get("__notes__", [])
+    texts = [*plain["classes"], *plain["attributes"], *(notes if type(notes) is list else [None])]
+    return all(type(text) is str for text in texts)
+
+
+def _is_plain(value: Any) -> bool:
+    try:
+        encode(value)
+    except UsageError:
+        return False
+    return True

@@ -1,0 +1,102 @@
+"""Tokens: the secret of a run, where it comes from and who may read it."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import secrets
+import socket
+from pathlib import Path
+
+from physx_core.config import EnvironmentConfig
+from physx_core.errors import ConfigError
+from physx_core.net.handshake import TOKEN_VARIABLE
+
+_SHORTEST = 16
+_OTHERS = 0o077
+
+
+def given_token(token_file: str | None) -> str | None:
+    """Return the token that the user gave, None for none.
+
+    Args:
+        token_file: File that holds it; None: it is in the environment variable ``PHYSX_TOKEN``.
+
+    Raises:
+        ConfigError: The file cannot be read, others may read it, or the token is too short.
+    """
+    if token_file is None:
+        token, place = os.environ.get(TOKEN_VARIABLE), TOKEN_VARIABLE
+    else:
+        token, place = _read(token_file), token_file
+    return None if token is None else checked_token(token, place)
+
+
+def checked_token(token: str, place: str) -> str:
+    """Return a token that is long enough.
+
+    Args:
+        token: The token.
+        place: Where it is from, for messages.
+
+    Raises:
+        ConfigError: It is too short.
+    """
+    if len(token) < _SHORTEST:
+        raise ConfigError(
+            f"The token in {place} has {len(token)} characters: it must have at least {_SHORTEST}, "
+            "so that nobody finds it by trying."
+        )
+    return token
+
+
+def run_token(config: EnvironmentConfig, by_hand: bool) -> str:
+    """Return the token of a run: the one that the user gave, or a random one.
+
+    Args:
+        config: Where the server listens, and the file with the token, if there is one.
+        by_hand: Whether clients are started by hand, by somebody who has to know the token.
+
+    Raises:
+        ConfigError: The user has to give a token and did not, or gave one that is unfit.
+    """
+    token = given_token(config.token_file)
+    if token is not None:
+        return token
+    how = (
+        f"set {TOKEN_VARIABLE}, at least {_SHORTEST} characters, for the server and for each "
+        "client; or write it into a file that only you can read, and name it with "
+        "EnvironmentConfig.token_file and with physx client --token-file."
+    )
+    if by_hand:
+        raise ConfigError(f"Clients that are started by hand need a secret: {how}")
+    if not _is_loopback(config.ip_address):
+        raise ConfigError(
+            f"Others can reach the server at {config.ip_address}, so its clients need a secret: "
+            f"{how}"
+        )
+    return secrets.token_hex(32)
+
+
+def _read(token_file: str) -> str:
+    try:
+        with Path(token_file).open(encoding="utf-8") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            text = "" if mode & _OTHERS else file.read(1 << 16)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"The token file {token_file} cannot be read: {error}.") from error
+    if mode & _OTHERS:
+        raise ConfigError(
+            f"Others than you may read or write the token file {token_file}: "
+            f"chmod 600 {token_file}, and choose another token."
+        )
+    return text.strip()
+
+
+def _is_loopback(host: str) -> bool:
+    """Return whether a server there is reached from its own machine only."""
+    try:
+        found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
+        return all(ipaddress.ip_address(entry[4][0]).is_loopback for entry in found)
+    except (OSError, ValueError):  # the server says what is wrong with it, once it has a token
+        return False

@@ -1,0 +1,267 @@
+"""Values: plain Python and NumPy values as bytes and back, each of the same type and bits.
+
+The bytes are a JSON text and, behind it, the raw bytes of arrays. In the JSON text None, booleans,
+strings, lists, finite floats and integers below 2**63 stand for themselves; everything else is an
+object with one key, its tag. Flat dictionaries take a shorter way: see `flat`. Nothing that is
+decoded can run code.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import reprlib
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.errors import ConnectionRefusedByPeerError, UsageError
+from physx_core.net.flat import (
+    LENGTH,
+    LONGEST_TEXT,
+    OPENING,
+    checked,
+    flat_bytes,
+    flat_prefix,
+    flat_value,
+    plain_dtype,
+    plain_shape,
+)
+from physx_core.net.frames import Kind, header, pack
+from physx_core.typing import Array
+
+_JSON = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
+_PLAIN_KINDS = "biufcSUmM"
+_SMALL = 1 << 63
+_MAX_TEXT = 1 << 26
+
+
+def encode(value: Any, what: str = "value") -> bytes:
+    """Return a value as bytes.
+
+    Args:
+        value: None, bool, int, float, complex, str, bytes, path, NumPy array or number of a plain
+            type, or lists, tuples and dictionaries of those.
+        what: Name of the value for error messages.
+
+    Raises:
+        UsageError: Something in it has another type, and the message says where; or there is more
+            text in it than can travel.
+    """
+    if type(value) is dict:
+        prefix, _ = flat_prefix(value)
+        if prefix:
+            return flat_bytes(prefix, value)
+    return _tree_bytes(value, what)
+
+
+def pack_value(kind: Kind, value: Any, what: str, number: int = 0) -> bytes:
+    """Return a message whose payload is a value as the bytes to send.
+
+    Args:
+        kind: What the message says.
+        value: See `encode`.
+        what: Name of the value for error messages.
+        number: A number whose meaning depends on the kind.
+
+    Raises:
+        UsageError: See `encode`; or the message is too long.
+    """
+    if type(value) is dict:
+        prefix, length = flat_prefix(value)
+        if prefix:
+            return flat_bytes(header(kind, length, number) + prefix, value)
+    return pack(kind, _tree_bytes(value, what), number)
+
+
+def _tree_bytes(value: Any, what: str) -> bytes:
+    """Return the bytes of a value that is not flat."""
+    blobs: list[bytes] = []
+    try:
+        text = _JSON.encode(_tree(value, what, blobs)).encode("ascii")
+    except RecursionError:
+        raise UsageError(f"{what} is nested too deeply to travel to another process.") from None
+    if len(text) > _MAX_TEXT:
+        raise UsageError(
+            f"{what} holds so many separate values that they are {len(text)} bytes of text, and "
+            f"{_MAX_TEXT} can travel to another process. Pass NumPy arrays instead of long lists."
+        )
+    return b"".join([LENGTH.pack(len(text)), text, *blobs])
+
+
+def decode(payload: bytes | bytearray | memoryview) -> Any:
+    """Return the value that `encode` was given; arrays are new and writable.
+
+    Args:
+        payload: The bytes; where it is a bytearray, arrays may be views of it.
+
+    Raises:
+        ConnectionRefusedByPeerError: The bytes were not made by `encode`.
+    """
+    try:
+        (length,) = LENGTH.unpack_from(payload)
+        if length > _MAX_TEXT:
+            raise ValueError(f"it has {length} bytes of text")
+        start = LENGTH.size + length
+        text = bytes(payload[LENGTH.size : start])
+        if length <= LONGEST_TEXT and text.startswith(OPENING):
+            own = payload if isinstance(payload, bytearray) else bytearray(payload)
+            return flat_value(text, own)
+        return _value(json.loads(text), _Blobs(payload, start))
+    except _DAMAGE as error:
+        raise ConnectionRefusedByPeerError(
+            f"What was received or stored as values is damaged: {str(error)[:200]}."
+        ) from error
+
+
+def _tree(value: Any, where: str, blobs: list[bytes]) -> Any:
+    """Return what JSON shall hold for a value; raw bytes go to the end of `blobs`."""
+    convert = _ENCODERS.get(type(value))
+    if convert is not None:
+        return convert(value, where, blobs)
+    if isinstance(value, np.generic):
+        return {"s": _array_parts(np.asarray(value), where, blobs)}
+    if isinstance(value, Path):
+        return {"p": str(value)}
+    raise UsageError(
+        f"{where} is {reprlib.repr(value)} ({type(value).__name__}), which cannot travel to "
+        "another process. Use numbers, texts, bytes, paths, NumPy arrays, and lists, tuples and "
+        "dictionaries of those; or run with as_tcp_ip_client=False."
+    )
+
+
+def _itself(value: Any, where: str, blobs: list[bytes]) -> Any:
+    return value
+
+
+def _str_tree(value: str, where: str, blobs: list[bytes]) -> Any:
+    try:
+        value.encode()
+    except UnicodeEncodeError:  # lone surrogates, two of which JSON would take for a pair
+        return {"w": _blob(value.encode("utf-8", "surrogatepass"), blobs)}
+    return value
+
+
+def _int_tree(value: int, where: str, blobs: list[bytes]) -> Any:
+    return value if -_SMALL <= value < _SMALL else {"i": hex(value)}
+
+
+def _float_tree(value: float, where: str, blobs: list[bytes]) -> Any:
+    return value if math.isfinite(value) else {"f": _bits(value)}
+
+
+def _items(value: Any, where: str, blobs: list[bytes]) -> list[Any]:
+    return [_tree(item, f"{where}[{i}]", blobs) for i, item in enumerate(value)]
+
+
+def _dict_tree(value: dict[Any, Any], where: str, blobs: list[bytes]) -> Any:
+    return {
+        "d": [
+            [_tree(key, f"a key of {where}", blobs), _tree(item, f"{where}[{key!r}]", blobs)]
+            for key, item in value.items()
+        ]
+    }
+
+
+def _array_parts(value: Array, where: str, blobs: list[bytes]) -> list[Any]:
+    if value.dtype.kind not in _PLAIN_KINDS:
+        raise UsageError(
+            f"{where} is an array of {value.dtype}, which cannot travel to another process: "
+            "its elements have no fixed plain layout."
+        )
+    return [value.dtype.str, list(value.shape), _blob(value.tobytes(), blobs)]
+
+
+def _blob(data: bytes, blobs: list[bytes]) -> int:
+    blobs.append(data)
+    return len(data)
+
+
+_ENCODERS: dict[type[Any], Callable[[Any, str, list[bytes]], Any]] = {
+    type(None): _itself,
+    bool: _itself,
+    str: _str_tree,
+    int: _int_tree,
+    float: _float_tree,
+    complex: lambda value, where, blobs: {"c": [_bits(value.real), _bits(value.imag)]},
+    bytes: lambda value, where, blobs: {"b": _blob(value, blobs)},
+    list: _items,
+    tuple: lambda value, where, blobs: {"t": _items(value, where, blobs)},
+    dict: _dict_tree,
+    np.ndarray: lambda value, where, blobs: {"a": _array_parts(value, where, blobs)},
+    np.str_: lambda value, where, blobs: {"u": _str_tree(str.__str__(value), where, blobs)},
+    np.bytes_: lambda value, where, blobs: {"y": _blob(bytes(value), blobs)},
+}
+
+
+class _Blobs:
+    """The raw bytes behind the JSON text, read in their order."""
+
+    def __init__(self, payload: bytes | bytearray | memoryview, start: int) -> None:
+        self._view = memoryview(payload)
+        self._start = start
+
+    def take(self, length: Any) -> memoryview:
+        if type(length) is not int:
+            raise ValueError(f"{str(length)[:50]!r} is no length")
+        end = self._start + length
+        if not self._start <= end <= len(self._view):
+            raise ValueError("there are fewer raw bytes than announced")
+        taken, self._start = self._view[self._start : end], end
+        return taken
+
+
+_DAMAGE = (
+    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError),
+    *(struct.error, RecursionError, MemoryError),
+)
+
+
+def _value(tree: Any, blobs: _Blobs) -> Any:
+    """Return the value that JSON held."""
+    if isinstance(tree, list):
+        return [_value(item, blobs) for item in tree]
+    if isinstance(tree, dict):
+        ((tag, content),) = tree.items()
+        return _DECODERS[tag](content, blobs)
+    return tree
+
+
+def _array_of(content: Any, blobs: _Blobs) -> Array:
+    kind, sizes, length = content
+    dtype, shape = plain_dtype(kind), plain_shape(sizes)
+    data = blobs.take(length)
+    if math.prod(shape) * max(1, dtype.itemsize) != length:
+        raise ValueError(f"{length} bytes are no array of {kind} and shape {shape}")
+    array = np.empty(shape, dtype)
+    if length:
+        array.reshape(-1).view(np.uint8)[:] = data
+    return checked(array)
+
+
+_DECODERS: dict[str, Callable[[Any, _Blobs], Any]] = {
+    "i": lambda content, blobs: int(content, 16),
+    "f": lambda content, blobs: _float_of(content),
+    "c": lambda content, blobs: complex(_float_of(content[0]), _float_of(content[1])),
+    "b": lambda content, blobs: bytes(blobs.take(content)),
+    "w": lambda content, blobs: str(blobs.take(content), "utf-8", "surrogatepass"),
+    "t": lambda content, blobs: tuple(_value(item, blobs) for item in content),
+    "d": lambda content, blobs: {_value(key, blobs): _value(item, blobs) for key, item in content},
+    "a": _array_of,
+    "s": lambda content, blobs: _array_of(content, blobs)[()],
+    "u": lambda content, blobs: np.str_(_value(content, blobs)),
+    "y": lambda content, blobs: np.bytes_(bytes(blobs.take(content))),
+    "p": lambda content, blobs: Path(content),
+}
+
+
+def _bits(value: float) -> str:
+    return struct.pack("<d", value).hex()
+
+
+def _float_of(bits: str) -> float:
+    (value,) = struct.unpack("<d", bytes.fromhex(bits))
+    return float(value)

@@ -1,0 +1,9 @@
+"""Pipelines: data generation, training, prediction, and replay."""
+
+from .data_generation import DataGeneration as DataGeneration
+from .learner import Learner as Learner
+from .learner import restored as restored
+from .pipeline import Pipeline as Pipeline
+from .prediction import Prediction as Prediction
+from .replay import Replay as Replay
+from .training import Training as Training

@@ -1,1 +1,0 @@
-"""Clients: environments that run in another process, driven from here."""

@@ -1,1 +1,0 @@
-"""The wire protocols that physx brings, one module each."""

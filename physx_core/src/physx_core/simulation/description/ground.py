@@ -1,0 +1,148 @@
+"""What a world stands on: a plane, stairs, or a field of heights. It never moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physx_core import checks
+from physx_core.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Ground:
+    """An endless plane; its upper side points along `normal`.
+
+    Attributes:
+        friction: Coefficient of friction.
+        restitution: Coefficient of restitution.
+        height: Of the plane above the world's origin along the normal, in m.
+        normal: Direction away from the ground, of any length.
+    """
+
+    friction: float = 1.0
+    restitution: float = 0.0
+    height: float = 0.0
+    normal: tuple[float, ...] = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        """Check the values, and bring the normal to length 1.
+
+        Raises:
+            ConfigError: A value cannot be.
+        """
+        checks.options(checks.not_negative, "Ground.", self, "friction", "restitution")
+        checks.finite("Ground.height", self.height)
+        normal = checks.vector("Ground.normal", self.normal, 3)
+        length = float(np.linalg.norm(normal))
+        if not length > 0:
+            raise ConfigError("Ground.normal has no direction: it is 0.")
+        object.__setattr__(self, "normal", tuple(part / length for part in normal))
+
+
+@dataclass(frozen=True)
+class Stairs:
+    """A plane at height 0 with stairs that climb along x, and a landing behind the last step.
+
+    Attributes:
+        steps: How many steps there are.
+        rise: Height of each step, in m.
+        run: Length of each step along x, in m.
+        width: Of the stairs along y, centered at y = 0, in m.
+        begin: Where along x the first step begins, in m.
+        landing: Length of the last step beyond `run`, in m.
+        friction: Coefficient of friction.
+        restitution: Coefficient of restitution.
+    """
+
+    steps: int = 5
+    rise: float = 0.1
+    run: float = 0.3
+    width: float = 4.0
+    begin: float = 1.0
+    landing: float = 2.0
+    friction: float = 1.0
+    restitution: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ConfigError: A value cannot be.
+        """
+        checks.options(checks.not_negative, "Stairs.", self, "friction", "restitution")
+        if not isinstance(self.steps, int) or self.steps < 1:
+            raise ConfigError(f"Stairs.steps is {self.steps!r} but must be an integer from 1.")
+        checks.options(checks.positive, "Stairs.", self, "rise", "run", "width")
+        checks.finite("Stairs.begin", self.begin)
+        checks.not_negative("Stairs.landing", self.landing)
+
+    def boxes(self) -> list[tuple[tuple[float, float, float], tuple[float, float, float]]]:
+        """Return center and full size, in m, of the box under each step; they stand at 0."""
+        found = []
+        for step in range(self.steps):
+            last = self.landing if step == self.steps - 1 else 0.0
+            length, height = self.run + last, (step + 1) * self.rise
+            x = self.begin + step * self.run + 0.5 * length
+            found.append(((x, 0.0, 0.5 * height), (length, self.width, height)))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class HeightField:
+    """Ground whose height is given at the points of a grid.
+
+    Each cell of the grid is two triangles, cut along the diagonal from its corner at the lowest x
+    and y. Beyond the grid there is no ground.
+
+    Attributes:
+        heights: In m, shape (nx, ny), at least 2 each; kept read-only.
+        spacing: Distance of neighboring points along x and along y, in m.
+        origin: x and y of the point ``heights[0, 0]``, in m; None: the grid's middle is at 0, 0.
+        friction: Coefficient of friction.
+        restitution: Coefficient of restitution.
+    """
+
+    heights: NDArray[np.float64]
+    spacing: tuple[float, ...] = (0.1, 0.1)
+    origin: tuple[float, ...] | None = None
+    friction: float = 1.0
+    restitution: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the values, and copy the heights.
+
+        Raises:
+            ConfigError: A value cannot be.
+        """
+        checks.options(checks.not_negative, "HeightField.", self, "friction", "restitution")
+        try:
+            heights = np.array(self.heights, np.float64)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise ConfigError(f"HeightField.heights are no numbers: {error}.") from error
+        if heights.ndim != 2 or min(heights.shape) < 2 or not np.isfinite(heights).all():
+            raise ConfigError(
+                f"HeightField.heights has the shape {heights.shape} but needs two axes of 2 or "
+                "more finite numbers."
+            )
+        heights.flags.writeable = False
+        object.__setattr__(self, "heights", heights)
+        spacing = checks.vector("HeightField.spacing", self.spacing, 2)
+        for distance in spacing:
+            checks.positive("HeightField.spacing", distance)
+        origin = self.origin
+        if origin is None:
+            extent = (np.array(heights.shape) - 1) * spacing
+            origin = tuple(-0.5 * extent)
+        object.__setattr__(self, "spacing", spacing)
+        object.__setattr__(self, "origin", checks.vector("HeightField.origin", origin, 2))
+
+    def corner(self) -> tuple[float, float]:
+        """Return x and y of the point ``heights[0, 0]``, in m."""
+        x, y = self.origin or (0.0, 0.0)
+        return x, y
+
+
+Terrain = Ground | Stairs | HeightField

@@ -1,0 +1,138 @@
+"""Objects that lie about in a world: single bodies of one shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from physx_core import checks
+from physx_core.errors import ConfigError
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldObject:
+    """What all objects have. The shape's center is its center of mass.
+
+    Attributes:
+        name: Name of the object in the world, and of its body in the state.
+        mass: In kg, spread evenly.
+        static: Whether it never moves; then its mass does not matter.
+        position: Of its center at first, in m.
+        orientation: Quaternion x, y, z, w.
+        friction: Coefficient of friction.
+        restitution: Coefficient of restitution.
+    """
+
+    lengths: ClassVar[tuple[str, ...]] = ()
+    """Names of the options that are positive lengths."""
+
+    name: str
+    mass: float = 1.0
+    static: bool = False
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)
+    orientation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+    friction: float = 1.0
+    restitution: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ConfigError: A value cannot be.
+        """
+        kind = type(self).__name__
+        checks.name(kind.lower(), self.name)
+        where = f'{kind} "{self.name}": '
+        checks.options(checks.positive, where, self, "mass", *self.lengths)
+        object.__setattr__(self, "position", checks.vector(f"{where}position", self.position, 3))
+        orientation = checks.unit_quaternion(f"{where}orientation", self.orientation)
+        object.__setattr__(self, "orientation", orientation)
+        checks.options(checks.not_negative, where, self, "friction", "restitution")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Box(WorldObject):
+    """A box.
+
+    Attributes:
+        size: Full lengths of its edges, in m.
+    """
+
+    size: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ConfigError: A value cannot be.
+        """
+        super().__post_init__()
+        size = checks.vector(f'Box "{self.name}": size', self.size, 3)
+        for length in size:
+            checks.positive(f'Box "{self.name}": size', length)
+        object.__setattr__(self, "size", size)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sphere(WorldObject):
+    """A sphere.
+
+    Attributes:
+        radius: In m.
+    """
+
+    lengths: ClassVar[tuple[str, ...]] = ("radius",)
+    radius: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Capsule(WorldObject):
+    """A cylinder along the object's z axis with a half sphere at either end.
+
+    Attributes:
+        radius: In m.
+        length: Of the cylinder alone, in m.
+    """
+
+    lengths: ClassVar[tuple[str, ...]] = ("radius", "length")
+    radius: float
+    length: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cylinder(WorldObject):
+    """A cylinder along the object's z axis.
+
+    Attributes:
+        radius: In m.
+        length: In m.
+    """
+
+    lengths: ClassVar[tuple[str, ...]] = ("radius", "length")
+    radius: float
+    length: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mesh(WorldObject):
+    """A triangle mesh from a file; its moments of inertia are those of its bounding box.
+
+    Attributes:
+        path: Of a file in one of the formats stl, obj and dae. Its origin is the object's center.
+        scale: Factor of its lengths.
+    """
+
+    lengths: ClassVar[tuple[str, ...]] = ("scale",)
+    path: str | Path
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ConfigError: A value cannot be.
+        """
+        super().__post_init__()
+        if not isinstance(self.path, (str, Path)):
+            raise ConfigError(f'Mesh "{self.name}": path is {self.path!r} but must be a path.')

@@ -1,0 +1,117 @@
+"""Robots: a URDF file, and what a world adds to it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, get_args
+
+from physx_core import checks
+from physx_core.errors import ConfigError, UnknownOptionError
+
+Mode = Literal["force", "servo", "velocity", "position"]
+Collisions = Literal["shapes", "boxes", "capsules", "none"]
+
+
+@dataclass(frozen=True)
+class JointSettings:
+    """How a joint is driven, and what resists it. None: what the URDF file says.
+
+    Attributes:
+        mode: What a command to the joint means. ``"force"``: a torque, in N m or N.
+            ``"servo"``: a velocity, in rad/s or m/s, that the joint's motor reaches as far as its
+            torque limit allows. ``"velocity"``: a velocity that the joint has whatever it takes.
+            ``"position"``: a position, in rad or m, that a servo approaches.
+        gain: In the mode ``"position"``, the servo's velocity for each unit of position error, in
+            1/s, cut at the velocity limit; at most 1 / period.
+        damping: Torque against the motion for each unit of velocity, in N m s/rad or N s/m.
+        friction: Coulomb friction, in N m or N.
+        stiffness: Of a spring between the links, in N m/rad or N/m.
+        rest: Position at which the spring is slack, in rad or m.
+        armature: Inertia of the motor's rotor as the joint sees it, in kg m² or kg.
+    """
+
+    mode: Mode = "force"
+    gain: float = 20.0
+    damping: float | None = None
+    friction: float | None = None
+    stiffness: float = 0.0
+    rest: float = 0.0
+    armature: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ConfigError: The mode does not exist, or a value cannot be.
+        """
+        if self.mode not in get_args(Mode):
+            raise UnknownOptionError("JointSettings.mode", [str(self.mode)], get_args(Mode))
+        checks.positive("JointSettings.gain", self.gain)
+        checks.finite("JointSettings.rest", self.rest)
+        for option in ("damping", "friction", "stiffness", "armature"):
+            value = getattr(self, option)
+            if value is not None:
+                checks.not_negative(f"JointSettings.{option}", value)
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A robot from a URDF file.
+
+    Attributes:
+        urdf: Path of the URDF file.
+        name: Name of the robot in the world.
+        fixed_base: Whether the root link is welded to the world; otherwise it floats freely.
+        package_dirs: Folder of each package that mesh names ``package://<name>/...`` begin with.
+        position: Where the root link is at first, in m; for good, if the base is fixed.
+        orientation: How it is turned there: quaternion x, y, z, w.
+        collisions: What touches other things: ``"shapes"``, the collision shapes of the file;
+            ``"boxes"`` or ``"capsules"``, the same with each mesh replaced by its bounding box or
+            a capsule around it, which is many times faster; ``"none"``.
+        self_collisions: Whether links that no joint connects touch each other.
+        feet: Links that touch the world with a sphere around their origin instead of their own
+            shapes: the radius of each, in m.
+        friction: Coefficient of friction of all links.
+        restitution: Coefficient of restitution of all links.
+        joints: Settings of joints, by their name in the URDF file.
+    """
+
+    urdf: str | Path
+    name: str = "robot"
+    fixed_base: bool = True
+    package_dirs: Mapping[str, str | Path] = field(default_factory=dict)
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)
+    orientation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+    collisions: Collisions = "shapes"
+    self_collisions: bool = False
+    feet: Mapping[str, float] = field(default_factory=dict)
+    friction: float = 1.0
+    restitution: float = 0.0
+    joints: Mapping[str, JointSettings] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check the values; whether links and joints of these names exist is seen when building.
+
+        Raises:
+            ConfigError: A value cannot be.
+        """
+        checks.name("robot", self.name)
+        where = f'Robot "{self.name}": '
+        if not isinstance(self.urdf, (str, Path)):
+            raise ConfigError(f"{where}urdf is {self.urdf!r} but must be a path.")
+        if self.collisions not in get_args(Collisions):
+            known = get_args(Collisions)
+            raise UnknownOptionError(f"{where}collisions", [str(self.collisions)], known)
+        position = checks.vector(f"{where}position", self.position, 3)
+        object.__setattr__(self, "position", position)
+        orientation = checks.unit_quaternion(f"{where}orientation", self.orientation)
+        object.__setattr__(self, "orientation", orientation)
+        for link, radius in self.feet.items():
+            checks.positive(f'{where}feet["{link}"]', radius)
+        checks.not_negative(f"{where}friction", self.friction)
+        checks.not_negative(f"{where}restitution", self.restitution)
+        for joint, settings in self.joints.items():
+            if not isinstance(settings, JointSettings):
+                raise ConfigError(f'{where}joints["{joint}"] must be JointSettings(...).')

@@ -1,0 +1,77 @@
+"""The world: robots and objects on a ground, and how they are to be simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from physx_core import checks
+from physx_core.errors import ConfigError, UnknownOptionError
+from physx_core.simulation.description.ground import Ground, HeightField, Stairs
+from physx_core.simulation.description.objects import WorldObject
+from physx_core.simulation.description.robot import Robot
+
+Contacts = Literal["all", "static", "none"]
+Integrator = Literal["euler", "rk4"]
+
+
+@dataclass(frozen=True)
+class World:
+    """Everything that a simulation is built from.
+
+    Attributes:
+        robots: The robots.
+        period: Length of one physics step, in s.
+        gravity: Acceleration of free fall in the world frame, in m/s².
+        objects: Boxes, spheres and the like; their names differ from each other and the robots'.
+        ground: What they stand on: `Ground`, `Stairs` or `HeightField`; None: nothing.
+        contacts: What touches: ``"all"``; ``"static"``, only what moves with what does not;
+            ``"none"``.
+        integrator: ``"euler"``, semi-implicit, which every engine has, or ``"rk4"``, of fourth
+            order, for robots without contacts, limits and friction.
+        detector: The engine's collision detector by name; None: the engine's usual one.
+        solver: The engine's contact solver by name; None: the engine's usual one.
+    """
+
+    robots: Sequence[Robot] = ()
+    period: float = 1e-3
+    gravity: tuple[float, ...] = (0.0, 0.0, -9.81)
+    objects: Sequence[WorldObject] = ()
+    ground: Ground | Stairs | HeightField | None = None
+    contacts: Contacts = "all"
+    integrator: Integrator = "euler"
+    detector: str | None = None
+    solver: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check that the description makes sense.
+
+        Raises:
+            ConfigError: Nothing moves in it, two things have one name, or a value cannot be.
+        """
+        kinds: tuple[tuple[type, Sequence[object]], ...]
+        kinds = ((Robot, self.robots), (WorldObject, self.objects))
+        for kind, things in kinds:
+            wrong = [thing for thing in things if not isinstance(thing, kind)]
+            if wrong:
+                raise ConfigError(f"World: {wrong[0]!r} is no {kind.__name__}.")
+        names = [robot.name for robot in self.robots] + [thing.name for thing in self.objects]
+        if len(set(names)) != len(names) or "ground" in names:
+            raise ConfigError(
+                f"A world needs robots and objects with names that differ, not {names}; "
+                'the name "ground" is taken.'
+            )
+        if not self.robots and all(thing.static for thing in self.objects):
+            raise ConfigError("A world needs a robot, or an object that moves.")
+        if self.ground is not None and not isinstance(self.ground, (Ground, Stairs, HeightField)):
+            raise ConfigError(f"World.ground is {self.ground!r}, not Ground, Stairs, HeightField.")
+        checks.positive("World.period", self.period)
+        object.__setattr__(self, "gravity", checks.vector("World.gravity", self.gravity, 3))
+        for option, known in (
+            ("contacts", ("all", "static", "none")),
+            ("integrator", ("euler", "rk4")),
+        ):
+            value = getattr(self, option)
+            if value not in known:
+                raise UnknownOptionError(f"World.{option}", [str(value)], known)

@@ -1,0 +1,106 @@
+"""Forces from outside on a body: held, for a while, or along a profile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physx_core import checks
+from physx_core.errors import ConfigError, UnknownOptionError
+
+Frame = Literal["world", "body"]
+
+
+@dataclass(frozen=True, eq=False)
+class Wrench:
+    """A force and a torque on a body.
+
+    Without `duration` and `times` it is held until it is removed; with `duration` it is an impulse;
+    with `times` it follows a profile, linear between its points and 0 after the last.
+
+    Attributes:
+        body: Name of the link or object.
+        force: In N, shape (3,), or (k, 3) along a profile.
+        torque: In N m, likewise.
+        point: Where the force acts, in the body's frame, in m.
+        frame: Axes of force and torque: the world's, or the body's own.
+        duration: How long it acts from when it is applied, in s, as a whole number of physics
+            steps, at least one; None: until it is removed, or to the profile's end.
+        times: Of the profile's points from when it is applied, in s, shape (k,), growing.
+    """
+
+    body: str
+    force: NDArray[np.float64] | tuple[float, ...] = (0.0, 0.0, 0.0)
+    torque: NDArray[np.float64] | tuple[float, ...] = (0.0, 0.0, 0.0)
+    point: tuple[float, ...] = (0.0, 0.0, 0.0)
+    frame: Frame = "world"
+    duration: float | None = None
+    times: NDArray[np.float64] | tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values, and copy the arrays.
+
+        Raises:
+            ConfigError: A value cannot be.
+        """
+        where = f"Wrench on {self.body!r}: "
+        if not isinstance(self.body, str):
+            raise ConfigError(f"{where}body must be a name.")
+        if self.frame not in ("world", "body"):
+            raise UnknownOptionError(f"{where}frame", [str(self.frame)], ("world", "body"))
+        object.__setattr__(self, "point", checks.vector(f"{where}point", self.point, 3))
+        if self.duration is not None:
+            checks.positive(f"{where}duration", self.duration)
+        shape: tuple[int, ...] = (3,)
+        if self.times is not None:
+            times = _array(f"{where}times", self.times)
+            if times.ndim != 1 or len(times) < 1 or (np.diff(times) <= 0).any():
+                raise ConfigError(f"{where}times must be one axis of growing numbers.")
+            object.__setattr__(self, "times", times)
+            shape = (len(times), 3)
+        for option in ("force", "torque"):
+            values = _array(where + option, getattr(self, option))
+            if self.times is not None and values.shape == (3,):
+                values = np.tile(values, (shape[0], 1))
+            if values.shape != shape:
+                raise ConfigError(f"{where}{option} has the shape {values.shape}, wanted {shape}.")
+            object.__setattr__(self, option, values)
+
+    def at(self, time: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return force and torque, shape (3,) each, at a time in s since it was applied."""
+        force, torque = np.asarray(self.force), np.asarray(self.torque)
+        if self.times is None:
+            return force, torque
+        times = np.asarray(self.times)
+        if not times[0] <= time <= times[-1]:
+            return np.zeros(3), np.zeros(3)
+        after = min(max(int(np.searchsorted(times, time)), 1), len(times) - 1)
+        if len(times) == 1:
+            return force[0], torque[0]
+        share = (time - times[after - 1]) / (times[after] - times[after - 1])
+        return (
+            force[after - 1] + share * (force[after] - force[after - 1]),
+            torque[after - 1] + share * (torque[after] - torque[after - 1]),
+        )
+
+    def steps(self, period: float) -> int | None:
+        """Return for how many physics steps it acts; None: until it is removed."""
+        if self.duration is not None:
+            return max(1, round(self.duration / period))
+        if self.times is not None:
+            return int(np.floor(float(self.times[-1]) / period * (1 + 1e-12))) + 1
+        return None
+
+
+def _array(option: str, values: Any) -> NDArray[np.float64]:
+    try:
+        array = np.array(values, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ConfigError(f"{option}: no numbers: {error}.") from error
+    if not np.isfinite(array).all():
+        raise ConfigError(f"{option} must be finite numbers.")
+    array.flags.writeable = False
+    return array

@@ -1,0 +1,145 @@
+"""Where everything is in a simulation's state, and the plain arrays that it returns.
+
+The state has one convention for every engine, that of Pinocchio: first the robots in the world's
+order, then the objects that move. In each robot a floating base comes first (position x, y, z in m
+and quaternion x, y, z, w; velocity as the base's twist in its own frame: linear in m/s, then
+angular in rad/s), then the joints in the order of the model file's tree. Every joint of one degree
+of freedom is one number, continuous ones too. An object is like a floating base without joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from physx_core.simulation.description import Wrench
+from physx_core.typing import Vector
+
+CONTACT = np.dtype(
+    [
+        ("body_a", np.int32),
+        ("body_b", np.int32),
+        ("point", np.float64, (3,)),
+        ("force", np.float64, (3,)),
+        ("normal", np.float64, (3,)),
+        ("depth", np.float64),
+    ]
+)
+"""A contact: which bodies (places in `Layout.names`, `body_a` before `body_b`, so that what never
+moves is `body_b`); the point, in m; the force on `body_a`, in N (on `body_b` it is the opposite);
+the normal, of length 1, from `body_b` to `body_a`; how deep they are in each other, in m. All in
+the world frame."""
+
+RAY_HIT = np.dtype(
+    [
+        ("hit", np.bool_),
+        ("body", np.int32),
+        ("point", np.float64, (3,)),
+        ("normal", np.float64, (3,)),
+        ("fraction", np.float64),
+    ]
+)
+"""What a ray meets first: whether anything; the body (place in `Layout.names`, -1: none), the point
+in m and the surface's normal there, in the world frame; where along the ray, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Place of one robot, or of one object that moves, in the state.
+
+    Attributes:
+        name: Name of the robot or object.
+        floating: Whether it begins with a floating base.
+        positions: Its part of the positions.
+        velocities: Its part of the velocities.
+        joints: Its part of the joints, and so of the commands.
+        bodies: Its part of the bodies.
+    """
+
+    name: str
+    floating: bool
+    positions: slice
+    velocities: slice
+    joints: slice
+    bodies: slice
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Names and places of everything in the state; fixed when the simulation is built.
+
+    Attributes:
+        joints: Names of the joints of one degree of freedom, in the state's order. With several
+            robots each name begins with the robot's name and ``/``.
+        bodies: Names of the links, likewise, and of the objects that move.
+        position_index: Place of each joint in the positions, by joint name.
+        velocity_index: Place of each joint in velocities and torques, by joint name.
+        nq: Length of the positions: 7 for each floating base and object, 1 for each joint.
+        nv: Length of velocities and torques: 6 for each floating base and object, 1 for each joint.
+        lower: Lower limits of the joints' positions, shape (joints,), in rad or m; -inf: none.
+        upper: Upper limits, likewise.
+        max_velocity: Limits of the joints' velocities, shape (joints,), in rad/s or m/s.
+        max_torque: Limits of the joints' torques, shape (joints,), in N m or N.
+        parts: Place of each robot and moving object, by name.
+        statics: Names of what never moves: ``"ground"``, then the static objects.
+        modes: What a command to each joint means, as in `JointSettings`.
+    """
+
+    joints: tuple[str, ...]
+    bodies: tuple[str, ...]
+    position_index: dict[str, int]
+    velocity_index: dict[str, int]
+    nq: int
+    nv: int
+    lower: Vector
+    upper: Vector
+    max_velocity: Vector
+    max_torque: Vector
+    parts: Mapping[str, Part] = field(default_factory=dict)
+    statics: tuple[str, ...] = ()
+    modes: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all that can be touched: the bodies, then what never moves."""
+        return (*self.bodies, *self.statics)
+
+
+@dataclass(frozen=True)
+class AppliedWrench:
+    """A wrench that acts on the world.
+
+    Attributes:
+        number: What `Simulation.remove_wrench` takes.
+        begin: Frame in which it was applied.
+        wrench: The wrench.
+    """
+
+    number: int
+    begin: int
+    wrench: Wrench
+
+
+@dataclass(frozen=True)
+class State:
+    """A snapshot of a simulation; plain and picklable.
+
+    Attributes:
+        positions: Shape (nq,).
+        velocities: Shape (nv,).
+        commands: The held commands, shape (joints,).
+        frame: Number of physics steps since the simulation was built.
+        wrenches: Those that act.
+        engine: Name of the engine that it is from.
+        native: What the engine carries over besides, or in other numbers.
+    """
+
+    positions: Vector
+    velocities: Vector
+    commands: Vector
+    frame: int
+    wrenches: tuple[AppliedWrench, ...] = ()
+    engine: str = ""
+    native: tuple[Vector, ...] = ()

@@ -1,0 +1,220 @@
+"""What sensors would measure if they were perfect: one class for each kind, for all of its kind.
+
+Each writes its sensors' components from nothing but the contract of `Simulation`, so that they are
+the same on every engine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from physx_core.errors import ConfigError, FeatureNotSupportedError
+from physx_core.simulation.backend import Simulation
+from physx_core.simulation.description import World
+from physx_core.simulation.devices import as_slice, places_of
+from physx_core.simulation.rotations import cross, product, turned, turned_back
+from physx_core.simulation.sensors.sensor import (
+    ContactSensor,
+    EffortSensor,
+    Encoder,
+    ForceTorqueSensor,
+    Imu,
+    Sensor,
+)
+from physx_core.typing import Vector
+
+_AHEAD = (0.0, 0.0, 0.0, 1.0)
+"""Quaternion of no rotation."""
+
+
+class Truth(Protocol):
+    """Measures all sensors of one kind without errors."""
+
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write the components to `out`, shape (sensors, width)."""
+
+
+class EncoderTruth:
+    """Positions and velocities of joints."""
+
+    def __init__(self, sensors: Sequence[Encoder], simulation: Simulation) -> None:
+        joints = [sensor.joint for sensor in sensors]
+        self._q = as_slice(places_of("joint", joints, simulation.layout.position_index))
+        self._v = as_slice(places_of("joint", joints, simulation.layout.velocity_index))
+        reduction = np.array([sensor.reduction for sensor in sensors])[:, None]
+        self._reduction = None if (reduction == 1).all() else reduction
+
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write position and velocity."""
+        out[:, 0] = simulation.positions()[self._q]
+        out[:, 1] = simulation.velocities()[self._v]
+        if self._reduction is not None:
+            out *= self._reduction
+
+
+class ImuTruth:
+    """Orientation, angular velocity and acceleration of places on bodies."""
+
+    def __init__(self, sensors: Sequence[Imu], simulation: Simulation, world: World) -> None:
+        _needs("accelerations", simulation, "An Imu")
+        self._bodies = [sensor.body for sensor in sensors]
+        places_of("body", self._bodies, simulation.layout.names)
+        self._arms = [_unless(sensor.position, (0.0, 0.0, 0.0)) for sensor in sensors]
+        self._rotations = [_unless(sensor.rotation, _AHEAD) for sensor in sensors]
+        self._gravity = tuple(float(part) for part in world.gravity)
+        layout = simulation.layout
+        floating = [part for part in layout.parts.values() if part.floating]
+        bases = {layout.bodies[part.bodies.start]: part for part in floating}
+        self._bases = [bases[body] for body in self._bodies if body in bases]
+
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write orientation, angular velocity and acceleration."""
+        if len(self._bases) == len(out):
+            self._measure_bases(simulation, out)
+            return
+        motions = simulation.body_motions(self._bodies).tolist()
+        for row, motion in enumerate(motions):
+            out[row] = self._measured(motion, self._arms[row], self._rotations[row])
+
+    def _measure_bases(self, simulation: Simulation, out: Vector) -> None:
+        """Do so where all are on bases that float, whose motion is a part of the state."""
+        state = simulation.positions(), simulation.velocities(), simulation.accelerations()
+        for row, base in enumerate(self._bases):
+            first = base.velocities.start
+            x, y, z, w = state[0][base.positions][3:7].tolist()
+            attitude: Sequence[float] = (x, y, z, w) if w >= 0 else (-x, -y, -z, -w)
+            g, h, o, p, q, r = state[1][first : first + 6].tolist()
+            a, b, c, d, e, f = state[2][first : first + 6].tolist()
+            # The velocity is along axes that turn themselves.
+            i, j, k = turned_back(attitude, *self._gravity)
+            s, t, u = cross(p, q, r, g, h, o)
+            a, b, c = a + s - i, b + t - j, c + u - k
+            arm, rotation = self._arms[row], self._rotations[row]
+            if arm is not None:
+                i, j, k = cross(d, e, f, *arm)
+                s, t, u = cross(p, q, r, *cross(p, q, r, *arm))
+                a, b, c = a + i + s, b + j + t, c + k + u
+            if rotation is not None:
+                attitude = product(attitude, rotation)
+                p, q, r = turned_back(rotation, p, q, r)
+                a, b, c = turned_back(rotation, a, b, c)
+            out[row] = (*attitude, p, q, r, a, b, c)
+
+    def _measured(
+        self, motion: list[float], arm: Sequence[float] | None, rotation: Sequence[float] | None
+    ) -> tuple[float, ...]:
+        """Return the components of one sensor from a row of `Simulation.body_motions`."""
+        attitude: Sequence[float] = motion[3:7]
+        p, q, r, x, y, z, a, b, c = motion[10:]
+        if arm is not None:
+            i, j, k = turned(attitude, *arm)
+            s, t, u = cross(p, q, r, i, j, k)
+            s, t, u = cross(p, q, r, s, t, u)
+            i, j, k = cross(a, b, c, i, j, k)
+            x, y, z = x + i + s, y + j + t, z + k + u
+        if rotation is not None:
+            attitude = product(attitude, rotation)
+        i, j, k = self._gravity
+        return (
+            *attitude,
+            *turned_back(attitude, p, q, r),
+            *turned_back(attitude, x - i, y - j, z - k),
+        )
+
+
+class ContactTruth:
+    """Forces of contacts on bodies."""
+
+    def __init__(self, sensors: Sequence[ContactSensor], simulation: Simulation) -> None:
+        _needs("contacts", simulation, "A ContactSensor")
+        bodies = [sensor.body for sensor in sensors]
+        self._rows: dict[int, list[int]] = {}
+        for row, place in enumerate(places_of("body", bodies, simulation.layout.names).tolist()):
+            self._rows.setdefault(place, []).append(row)
+
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write touching, normal force and force."""
+        sums = [[0.0] * 5 for _ in out]
+        for first, second, _, (x, y, z), (a, b, c), _ in simulation.contacts().tolist():
+            for place, sign in ((first, 1.0), (second, -1.0)):
+                for row in self._rows.get(place, ()):
+                    mine = sums[row]
+                    mine[0] = 1.0
+                    mine[1] += x * a + y * b + z * c
+                    mine[2] += sign * x
+                    mine[3] += sign * y
+                    mine[4] += sign * z
+        out[:] = sums
+
+
+class ForceTorqueTruth:
+    """Wrenches that joints carry."""
+
+    def __init__(self, sensors: Sequence[ForceTorqueSensor], simulation: Simulation) -> None:
+        _needs("joint_wrenches", simulation, "A ForceTorqueSensor")
+        joints = [sensor.joint for sensor in sensors]
+        self._joints = as_slice(places_of("joint", joints, simulation.layout.joints))
+
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write force and torque."""
+        out[:] = simulation.joint_wrenches()[self._joints]
+
+
+class EffortTruth:
+    """Torques that drive joints."""
+
+    def __init__(self, sensors: Sequence[EffortSensor], simulation: Simulation) -> None:
+        layout = simulation.layout
+        joints = [sensor.joint for sensor in sensors]
+        places = places_of("joint", joints, layout.joints)
+        for sensor, place in zip(sensors, places, strict=True):
+            if layout.modes and layout.modes[place] != "force":
+                raise ConfigError(
+                    f'EffortSensor "{sensor.name}": the joint "{sensor.joint}" has the mode '
+                    f'"{layout.modes[place]}", so its torque is not known.'
+                )
+        self._joints = as_slice(places)
+
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write the torque."""
+        out[:, 0] = simulation.commands()[self._joints]
+
+
+def truth_of(
+    kind: type[Sensor], sensors: Sequence[Any], simulation: Simulation, world: World
+) -> Truth:
+    """Return what measures sensors of one kind.
+
+    Raises:
+        ComponentNotFoundError: A joint or body is not in the simulation.
+        ConfigError: The kind is unknown, or a joint's torque is not known.
+        FeatureNotSupportedError: The engine lacks what the kind needs.
+    """
+    if kind is Imu:
+        return ImuTruth(sensors, simulation, world)
+    kinds: dict[type[Sensor], Any] = {
+        Encoder: EncoderTruth,
+        ContactSensor: ContactTruth,
+        ForceTorqueSensor: ForceTorqueTruth,
+        EffortSensor: EffortTruth,
+    }
+    if kind not in kinds:
+        raise ConfigError(f"{kind.__name__} is no kind of sensor that is known.")
+    found: Truth = kinds[kind](sensors, simulation)
+    return found
+
+
+def _needs(feature: str, simulation: Simulation, what: str) -> None:
+    if feature not in simulation.features:
+        raise FeatureNotSupportedError(
+            simulation.engine, feature, simulation.features, f"{what} needs it."
+        )
+
+
+def _unless(values: Sequence[float], nothing: Sequence[float]) -> tuple[float, ...] | None:
+    """Return values, None where they are nothing."""
+    found = tuple(float(value) for value in values)
+    return None if found == tuple(nothing) else found

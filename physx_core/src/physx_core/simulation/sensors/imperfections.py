@@ -1,0 +1,183 @@
+"""What is wrong with sensors: delay, jitter, bias, random walk and noise, of all at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physx_core.simulation.sensors.attitudes import between, from_rotation_vectors, product
+from physx_core.simulation.sensors.sensor import Sensor
+from physx_core.typing import Vector
+
+Mask = NDArray[np.bool_]
+
+
+class Places:
+    """Where the components and errors of sensors are in their flat vectors.
+
+    Attributes:
+        components: Number of all components.
+        owners: Sensor of each component.
+        attitudes: Components of the orientations, shape (n, 4).
+        switches: Components that are 0 or 1.
+        errors: Number of all errors.
+        error_owners: Sensor of each error.
+        added: Component that each additive error is added to.
+        adding: Additive errors.
+        turning: Errors of the orientations, shape (n, 3).
+    """
+
+    def __init__(self, sensors: Sequence[Sensor]) -> None:
+        owners: list[int] = []
+        error_owners: list[int] = []
+        attitudes, switches, added, adding, turning = [], [], [], [], []
+        for owner, sensor in enumerate(sensors):
+            widths = sensor.error_widths()
+            for name, width in sensor.quantities.items():
+                components = [*range(len(owners), len(owners) + width)]
+                errors = [*range(len(error_owners), len(error_owners) + widths.get(name, 0))]
+                owners += [owner] * width
+                error_owners += [owner] * len(errors)
+                if name == "orientation":
+                    attitudes.append(components)
+                    turning.append(errors)
+                elif errors:
+                    added += components
+                    adding += errors
+                else:
+                    switches += components
+        self.components, self.errors = len(owners), len(error_owners)
+        self.owners, self.error_owners = np.array(owners), np.array(error_owners)
+        self.attitudes = np.array(attitudes, np.intp).reshape(-1, 4)
+        self.turning = np.array(turning, np.intp).reshape(-1, 3)
+        self.switches = np.array(switches, np.intp)
+        self.added, self.adding = np.array(added, np.intp), np.array(adding, np.intp)
+
+
+class Delays:
+    """What sensors saw a while ago.
+
+    Attributes:
+        acts: Whether any sensor has a delay.
+        past: The last true values, shape (kept, components), each component in turn.
+        counts: How many values of each sensor there were, shape (sensors,).
+    """
+
+    def __init__(self, sensors: Sequence[Sensor], places: Places, periods: Vector) -> None:
+        self._places = places
+        self._lag = np.array([sensor.delay for sensor in sensors]) / periods
+        self._jitter = np.array([sensor.jitter for sensor in sensors]) / periods
+        self._shaken = np.flatnonzero(self._jitter)
+        self._linear = np.array([sensor.interpolation for sensor in sensors]) == 1
+        longest = float((self._lag + self._jitter).max())
+        self.acts = longest > 0
+        self.draws = bool(len(self._shaken))
+        self._kept = int(np.ceil(longest)) + 2 if self.acts else 1
+        self._column = np.arange(places.components)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the past."""
+        self.past = np.zeros((self._kept, self._places.components))
+        self.past[:, self._places.attitudes[:, 3]] = 1.0
+        self.counts = np.zeros(len(self._lag), np.int64)
+
+    def delayed(self, truth: Vector, due: Mask, rng: np.random.Generator | None) -> Vector:
+        """Keep the true values of the sensors that are due; return what they see.
+
+        Args:
+            truth: Shape (components,).
+            due: Shape (sensors,); what others see has no meaning.
+            rng: For the jitter.
+        """
+        owners = self._places.owners
+        mine = due[owners]
+        slots = self.counts[owners] % self._kept
+        self.past[slots[mine], self._column[mine]] = truth[mine]
+        lag = self._lag
+        if self.draws and rng is not None:
+            lag = lag.copy()
+            lag[self._shaken] += rng.random(len(self._shaken)) * self._jitter[self._shaken]
+        lag = np.minimum(lag, self.counts)  # before the first value there was the first value
+        nearest = np.rint(lag)
+        lag = np.where(np.abs(lag - nearest) < 1e-9 * (1 + lag), nearest, lag)
+        whole = np.where(self._linear, np.floor(lag), np.ceil(lag)).astype(np.int64)
+        share = np.where(self._linear, lag - whole, 0.0)[owners]
+        later: Vector = self.past[(self.counts - whole)[owners] % self._kept, self._column]
+        seen = later
+        if share.any():
+            earlier = self.past[(self.counts - whole - 1)[owners] % self._kept, self._column]
+            seen = self._mixed(later, earlier, share)
+        self.counts = self.counts + due
+        return seen
+
+    def _mixed(self, later: Vector, earlier: Vector, share: Vector) -> Vector:
+        seen: Vector = later + share * (earlier - later)
+        at = self._places.attitudes
+        if at.size:
+            seen[at] = between(later[at], earlier[at], share[at[:, :1]])
+        switches = self._places.switches
+        seen[switches] = seen[switches] >= 0.5
+        return seen
+
+
+class Errors:
+    """Bias, random walk and noise.
+
+    Attributes:
+        bias: The errors that stay, those drawn at the beginning included, shape (errors,).
+        walk: The errors that wander, likewise.
+    """
+
+    def __init__(self, sensors: Sequence[Sensor], places: Places, periods: Vector) -> None:
+        self._places = places
+
+        def column(option: str) -> Vector:
+            amounts = [value for sensor in sensors for value in sensor.amounts(option)]
+            return np.array(amounts, np.float64)
+
+        self._noise, self._given = column("noise"), column("bias")
+        self._deviation = column("bias_deviation")
+        self._stride = column("random_walk") * np.sqrt(periods[places.error_owners])
+        self._noisy, self._walking = np.flatnonzero(self._noise), np.flatnonzero(self._stride)
+        self._varied = np.flatnonzero(self._deviation)
+        self.acts = any(each.any() for each in (self._noise, self._given, self._deviation))
+        self.acts = self.acts or bool(len(self._walking))
+        self.draws = bool(len(self._noisy) or len(self._walking) or len(self._varied))
+        self.bias, self.walk = self._given.copy(), np.zeros(places.errors)
+
+    def begin(self, rng: np.random.Generator | None) -> None:
+        """Draw the biases, and end all wandering."""
+        self.bias, self.walk = self._given.copy(), np.zeros(self._places.errors)
+        if len(self._varied) and rng is not None:
+            drawn = rng.standard_normal(len(self._varied))
+            self.bias[self._varied] += self._deviation[self._varied] * drawn
+
+    def added(self, seen: Vector, due: Mask, rng: np.random.Generator | None) -> Vector:
+        """Return values with the errors of this measurement; what is not due does not wander.
+
+        Args:
+            seen: Shape (components,).
+            due: Shape (sensors,).
+            rng: For walk and noise.
+        """
+        error = self.bias
+        if len(self._walking) and rng is not None:
+            at = self._walking
+            strides = self._stride[at] * rng.standard_normal(len(at))
+            self.walk = self.walk.copy()
+            self.walk[at] += np.where(due[self._places.error_owners[at]], strides, 0.0)
+            error = error + self.walk
+        if len(self._noisy) and rng is not None:
+            at = self._noisy
+            error = error.copy()
+            error[at] += self._noise[at] * rng.standard_normal(len(at))
+        places = self._places
+        found = seen.copy()
+        found[places.added] += error[places.adding]
+        if places.attitudes.size:
+            turns = from_rotation_vectors(error[places.turning])
+            found[places.attitudes] = product(seen[places.attitudes], turns)
+        return found

@@ -1,0 +1,83 @@
+"""Checks of the arrays that callers give to a simulation; each error names the array."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from physx_core.errors import SimulationError
+from physx_core.typing import Vector
+
+LARGEST = 1e100
+"""Length of vectors from which their products overflow."""
+_LARGEST_SQUARE = LARGEST**2
+_FLOAT = np.dtype(np.float64)
+
+
+def finite_vector(name: str, given: Any, length: int) -> Vector:
+    """Return finite numbers as a new vector of a length.
+
+    Raises:
+        SimulationError: They are none.
+    """
+    plain = type(given) is np.ndarray and given.dtype is _FLOAT
+    numbers = given.copy() if plain else _numbers(name, given)
+    if numbers.shape != (length,):
+        raise SimulationError(f"{name} have the shape {numbers.shape} but need ({length},).")
+    if not numbers.dot(numbers) < _LARGEST_SQUARE:
+        raise SimulationError(f"{name} must be finite numbers below {LARGEST:g}, not {numbers}.")
+    return numbers
+
+
+def finite_rows(name: str, given: ArrayLike, width: int) -> Vector:
+    """Return finite numbers as a new array of shape (any, width).
+
+    Raises:
+        SimulationError: They are none.
+    """
+    numbers = _numbers(name, given)
+    fits = numbers.ndim == 2 and numbers.shape[1] == width
+    if not fits or not (np.abs(numbers) < LARGEST).all():
+        raise SimulationError(
+            f"{name} have the shape {numbers.shape} but need (n, {width}), finite numbers."
+        )
+    return numbers
+
+
+def _numbers(name: str, given: ArrayLike) -> Vector:
+    try:
+        return np.array(given, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise SimulationError(f"{name} are no numbers: {error}.") from error
+
+
+def overwrite(name: str, target: Vector, given: Any) -> None:
+    """Write finite numbers into a vector, which stays as it is where they are none.
+
+    Raises:
+        SimulationError: They are none, or not as many as the vector has.
+    """
+    fits = type(given) is np.ndarray and given.dtype is _FLOAT and given.shape == target.shape
+    if fits and given.dot(given) < _LARGEST_SQUARE:
+        target[:] = given
+    else:
+        target[:] = finite_vector(name, given, len(target))
+
+
+def written(whole: Vector, out: Vector) -> Vector:
+    """Return `out` with a vector written into it.
+
+    Raises:
+        SimulationError: `out` does not fit.
+    """
+    if not isinstance(out, np.ndarray):
+        raise SimulationError(f"out is {type(out).__name__} but must be a NumPy array.")
+    if out.shape != whole.shape or out.dtype != _FLOAT or not out.flags.writeable:
+        raise SimulationError(
+            f"out has the shape {out.shape} and type {out.dtype} but needs {whole.shape} and "
+            "float64, writeable."
+        )
+    out[:] = whole
+    return out

@@ -1,0 +1,290 @@
+"""ClientSource: each instance of the environment in a process of its own, over TCP."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import TracebackType
+
+import numpy as np
+
+from physx_core.components.environment import Services
+from physx_core.config import EnvironmentConfig
+from physx_core.errors import (
+    FieldShapeError,
+    FieldsMismatchError,
+    UsageError,
+    WrongSamplesError,
+)
+from physx_core.fields import Field
+from physx_core.net.frames import Kind, pack
+from physx_core.net.values import encode
+from physx_core.rows import ROW_FIELDS, joined
+from physx_core.sources.source import Source, check_stored
+from physx_core.typing import Batch
+from physx_core.workers.row_codec import row_bytes
+from physx_core.workers.server.client_group import ClientGroup
+
+_AHEAD_BYTES = 4 << 20
+_AHEAD_ROWS = 1 << 16
+
+
+class ClientSource(Source):
+    """Has clients make rows, and puts each row where its instance and step say it belongs.
+
+    Rows are the same as those of `LocalSource`, bit for bit. Requests of the environments are
+    answered while a batch is waited for. Where the services have a method
+    ``predict_batch(batch) -> batch``, predictions are made once every instance that is at work asks
+    for one, all of them as one batch in the order of the instances: with ``run_ahead=0`` the same
+    batches in every run. Such a network may round other than for single samples.
+    """
+
+    def __init__(
+        self,
+        config: EnvironmentConfig,
+        services: Services,
+        seed: Sequence[int],
+        *,
+        run_ahead: int | None = None,
+        total: int | None = None,
+        accept_all: bool = False,
+    ) -> None:
+        """Keep what the clients are started with.
+
+        Args:
+            config: Which environment, and how many clients.
+            services: What the environments may ask of the run.
+            seed: Seed of all instances.
+            run_ahead: How many rows each client may make before they are asked for; None: as many
+                as fit in 4 MB. 0: a row is made only once it is asked for, as it must be where
+                rows depend on a network that is trained, or on predictions that are applied.
+            total: How many rows will ever be asked for; no client makes rows beyond. None: nobody
+                knows.
+            accept_all: Whether samples that `check_sample` refuses count like the others.
+        """
+        self.instance_nb = config.num_clients
+        self.fields = []
+        self._group = ClientGroup(config, services, seed, accept_all=accept_all)
+        self._refusals = 0
+        if config.record_wrong_samples:
+            self._refusals = config.max_wrong_samples_per_step + 1
+        self._failed_row: int | None = None
+        self._run_ahead, self._total = run_ahead, total
+        self._asked = 0
+        self._taken = [0] * self.instance_nb
+        self._first = 0
+        self._table: list[Field] = []
+        self._out: Batch = {}
+        self._capacity = 0
+        self._failed = self._closed = False
+
+    def open(self) -> None:
+        """Bring the instances to life: see `Source.open`."""
+        try:
+            self._group.open()
+            first = self._group.peer(1).fields
+            for number in range(2, self.instance_nb + 1):
+                self._agree(number, first, self._group.peer(number).fields)
+        except BaseException:
+            self._failed = True
+            raise
+        self.fields = [*first, *ROW_FIELDS]
+
+    def batch(self, size: int, stored: Batch | None = None) -> Batch:
+        """Return the next rows: see `Source.batch`.
+
+        Raises:
+            UsageError: Stored rows are given, but the clients run ahead of what is asked for.
+        """
+        if size < 1:
+            raise UsageError(f"A batch has at least one row, not {size}.")
+        if not self.fields or self._closed:
+            raise UsageError("This source is not open: use it in a with statement.")
+        if stored is not None:
+            check_stored(stored, size)
+            if self._run_ahead != 0:
+                raise UsageError("Stored rows need ClientSource(run_ahead=0).")
+        self.take_refused()
+        self._first, self._asked = self._asked, self._asked + size
+        try:
+            if stored is not None:
+                self._send_shares(Kind.STORED, stored, "a stored row", at_once=True)
+            self._grant()
+            if not self._table:
+                self._group.wait(self._without_table)
+                self._grant()
+            if self._capacity < size:
+                self._capacity = size
+                self._out = {
+                    field.name: np.empty((size, *(field.shape or ())), field.dtype)
+                    for field in self._table
+                }
+            self._group.wait(self._without_rows)
+        except BaseException:
+            self._failed = True
+            raise
+        return {name: array[:size] for name, array in self._out.items()}
+
+    def apply(self, prediction: Batch, *, at_once: bool = True) -> None:
+        """Give predictions to the instances: see `Source.apply`.
+
+        An error that an environment raises here is raised by the next call of `batch` or `close`.
+
+        Args:
+            prediction: See `Source.apply`.
+            at_once: Whether the instances get them now; otherwise with the next call of `batch`,
+                which costs less.
+
+        Raises:
+            UsageError: The clients run ahead, so they are no longer at the rows of the last batch.
+        """
+        if self._run_ahead != 0:
+            raise UsageError("apply() needs ClientSource(run_ahead=0).")
+        self._send_shares(Kind.APPLY, prediction, "the prediction", at_once)
+
+    def take_refused(self) -> Batch:
+        """Return what was refused: see `Source.take_refused`."""
+        blocks: list[Batch] = []
+        for number, peer in sorted(self._group.server.peers.items()) if self._refusals else ():
+            if self._table and peer.row_fields == self._table:
+                blocks += peer.refused.take(self._end_of_refused(number))
+        return joined(blocks)
+
+    def close(self) -> None:
+        """Close the environments and end the clients: see `Source.close`."""
+        if self._closed:
+            return
+        self._closed = True
+        self._group.close(orderly=not self._failed)
+        if self._failed:
+            return
+        for number, peer in sorted(self._group.server.peers.items()):
+            if peer.failure is not None and (
+                self._run_ahead == 0 or peer.failed_row < self._wanted(number, self._asked)
+            ):
+                raise peer.failure
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the source; after an error the clients are not waited for."""
+        self._failed = self._failed or kind is not None
+        super().__exit__(kind, error, trace)
+
+    def _send_shares(self, kind: Kind, batch: Batch, what: str, at_once: bool) -> None:
+        """Send each instance those rows that are for its rows of the last batch."""
+        size = self._asked - self._first
+        for number in range(1, self.instance_nb + 1):
+            # The position of the instance's first row in the batch.
+            start = (number - 1 - self._first) % self.instance_nb
+            rows = {
+                name: np.asarray(values)[start : size : self.instance_nb]
+                for name, values in batch.items()
+            }
+            count = len(range(start, size, self.instance_nb))
+            if count:
+                peer, message = self._group.peer(number), pack(kind, encode(rows, what), count)
+                if at_once:
+                    peer.send(message)
+                else:
+                    peer.send_with_next(message)
+
+    def _end_of_refused(self, number: int) -> int | None:
+        """Return the step before which an instance's refused rows belong to the last batch.
+
+        None: all that there are, as its last row could not be made.
+        """
+        end = self._asked if self._failed_row is None else self._failed_row
+        if self._failed_row is not None and self._failed_row % self.instance_nb == number - 1:
+            return None
+        last = (self._wanted(number, end) - 1) * self.instance_nb + number - 1 - self._first
+        return int(self._out["step"][last]) if last >= 0 else 0
+
+    def _wanted(self, number: int, rows: int) -> int:
+        """Return how many of the first `rows` rows belong to an instance."""
+        return (rows - number + self.instance_nb) // self.instance_nb
+
+    def _grant(self) -> None:
+        """Let the clients make what is asked for, and what they may make ahead."""
+        ahead = self._run_ahead
+        if ahead is None:
+            size = row_bytes(self._table) or _AHEAD_BYTES
+            ahead = min(max(1, _AHEAD_BYTES // size), _AHEAD_ROWS) if self._table else 0
+        for number in range(1, self.instance_nb + 1):
+            peer = self._group.peer(number)
+            needed = self._wanted(number, self._asked)
+            allowed = needed + ahead
+            if self._total is not None:
+                allowed = max(needed, min(allowed, self._wanted(number, self._total)))
+            if peer.granted < needed or allowed - peer.granted > ahead // 4:
+                peer.granted = allowed
+                peer.refusable = allowed * self._refusals
+                peer.send(pack(Kind.CREDIT, number=allowed))
+
+    def _without_table(self) -> list[int]:
+        """Return the first instance as long as its fields are not known; it has the first row."""
+        peer = self._group.peer(1)
+        if peer.row_fields:
+            self._table = self.fields = peer.row_fields
+            return []
+        if peer.failure is not None:
+            raise peer.failure
+        return [1]
+
+    def _without_rows(self) -> list[int]:
+        """Move rows that arrived into the batch; return the instances that owe some."""
+        owing, failed = [], {}
+        for number in range(1, self.instance_nb + 1):
+            peer, taken = self._group.peer(number), self._taken[number - 1]
+            missing = self._wanted(number, self._asked) - taken
+            if not missing:
+                continue
+            if peer.rows.count:
+                if not taken:
+                    self._agree(number, self._table, peer.row_fields)
+                start = taken * self.instance_nb + number - 1 - self._first
+                moved = peer.rows.take(missing, self._out, start, self.instance_nb)
+                self._taken[number - 1] += moved
+                missing -= moved
+            if missing and peer.failure is not None and not peer.rows.count:
+                failed[self._next_row(number)] = peer.failure
+            elif missing:
+                owing.append(number)
+        if failed:
+            row = min(failed)
+            earlier = [number for number in owing if self._next_row(number) < row]
+            if not (earlier and self._refusals and isinstance(failed[row], WrongSamplesError)):
+                self._failed_row = row
+                raise failed[row]
+            return earlier  # what was refused before it is wanted too
+        return owing
+
+    def _next_row(self, number: int) -> int:
+        """Return the number of the row that an instance makes next, among those of all."""
+        return self._taken[number - 1] * self.instance_nb + number - 1
+
+    def _agree(self, number: int, first: Sequence[Field], other: Sequence[Field]) -> None:
+        """Check that an instance has the same fields as the first one."""
+        if list(first) == list(other):
+            return
+        mine, theirs = ({field.name: field for field in fields} for fields in (first, other))
+        for name in mine.keys() & theirs.keys() if self._table else ():
+            if mine[name].shape != theirs[name].shape:
+                raise FieldShapeError(
+                    f'field "{name}" has shape {theirs[name].shape} but is defined as '
+                    f"{mine[name].shape}.",
+                    field=name,
+                    instance_id=number,
+                    step=0,
+                )
+        names = [*mine, *(name for name in theirs if name not in mine)]
+        raise FieldsMismatchError(
+            f"Instances 1 and {number} define different fields",
+            {
+                name: f"{mine.get(name, 'not defined')} and {theirs.get(name, 'not defined')}"
+                for name in names
+                if mine.get(name) != theirs.get(name)
+            },
+        )

@@ -1,0 +1,111 @@
+"""LocalSource: all instances of the environment in this process."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+
+from physx_core.components.environment import Services
+from physx_core.config import EnvironmentConfig
+from physx_core.errors import UsageError
+from physx_core.rows import ROW_FIELDS, Columns, joined, row_of, shaped_by
+from physx_core.sources.source import Source, check_stored
+from physx_core.typing import Batch
+from physx_core.workers.instance import Instance
+
+
+class LocalSource(Source):
+    """Steps the instances one after the other; no serialization, no copy but that into the row."""
+
+    def __init__(
+        self,
+        config: EnvironmentConfig,
+        services: Services,
+        seed: Sequence[int],
+        *,
+        accept_all: bool = False,
+    ) -> None:
+        """Keep what the instances are made from.
+
+        Args:
+            config: Which environment, and how many instances.
+            services: What the environments may ask of the run.
+            seed: Seed of all instances.
+            accept_all: Whether samples that `check_sample` refuses count like the others.
+        """
+        self.instance_nb = config.num_clients
+        self.fields = []
+        self._services = services
+        self._config = config
+        self._instances = [
+            Instance(
+                config.environment,
+                config.env_kwargs,
+                instance_id=number,
+                instance_nb=self.instance_nb,
+                seed=seed,
+                simulations_per_step=config.simulations_per_step,
+                max_wrong_samples=config.max_wrong_samples_per_step,
+                record_wrong=config.record_wrong_samples,
+                accept_all=accept_all,
+            )
+            for number in range(1, self.instance_nb + 1)
+        ]
+        self._columns: Columns | None = None
+        self._next = 0
+        self._last = range(0)
+
+    def open(self) -> None:
+        """Bring the instances to life: see `Source.open`."""
+        for instance in self._instances:
+            instance.open(self._services, draw=self._config.visualizer is not None)
+        self.fields = [*self._instances[0].fields, *ROW_FIELDS]
+
+    def batch(self, size: int, stored: Batch | None = None) -> Batch:
+        """Return the next rows: see `Source.batch`."""
+        if stored is not None:
+            check_stored(stored, size)
+        if self._config.record_wrong_samples:
+            self.take_refused()
+        columns = self._columns
+        if columns is not None and columns.capacity < size:
+            columns = self._columns = Columns(columns.fields[: -len(ROW_FIELDS)], size)
+        instances, count = self._instances, self.instance_nb
+        self._last = range(self._next, self._next + size)
+        for row in range(size):
+            instance = instances[self._next % count]
+            sample = instance.step(None if stored is None else row_of(stored, row))
+            if columns is None:
+                columns = self._columns = Columns(shaped_by(instance.fields, sample), size)
+                self.fields = columns.fields
+            columns.put(
+                row, sample, instance.instance_id, instance.last_episode, instance.last_step
+            )
+            self._next += 1
+        if columns is None:
+            raise UsageError(f"A batch has at least one row, not {size}.")
+        return columns.rows(size)
+
+    def take_refused(self) -> Batch:
+        """Return what was refused: see `Source.take_refused`."""
+        blocks = []
+        for instance in self._instances:
+            if instance.refused is not None:
+                if self._columns is None:
+                    fields = instance.refused.shaped(instance.fields)
+                else:
+                    fields = self._columns.fields[: -len(ROW_FIELDS)]
+                blocks.append(instance.refused.take(fields, instance.instance_id))
+        return joined(blocks)
+
+    def apply(self, prediction: Batch) -> None:
+        """Give predictions to the instances: see `Source.apply`."""
+        for row, number in enumerate(self._last):
+            sample = {name: values[row] for name, values in prediction.items()}
+            self._instances[number % self.instance_nb].apply(sample)
+
+    def close(self) -> None:
+        """Close the environments; the first error is raised once all of them are closed."""
+        with contextlib.ExitStack() as stack:
+            for instance in self._instances:
+                stack.callback(instance.close)

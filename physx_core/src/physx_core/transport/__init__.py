@@ -1,1 +1,0 @@
-"""Transport: environments in processes of their own, spoken to over TCP."""

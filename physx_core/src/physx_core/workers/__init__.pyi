@@ -1,0 +1,3 @@
+"""Environments in processes of their own, stepped over TCP."""
+
+from .instance import Instance as Instance

@@ -1,0 +1,41 @@
+"""The process of a client that a server started: ``python -m physx_core.workers``."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import faulthandler
+import os
+import signal
+import sys
+
+from physx_core.errors import PhysxError
+from physx_core.net.handshake import TOKEN_VARIABLE
+from physx_core.workers.client.client import run_client
+from physx_core.workers.processes.descendants import kill_descendants
+
+
+def main() -> int:
+    """Run the client that the command line describes; return its exit status."""
+    parser = argparse.ArgumentParser(prog="python -m physx_core.workers", description=__doc__)
+    parser.add_argument("--connect", metavar="HOST:PORT", required=True, help="the server")
+    parser.add_argument("--instance", type=int, help="number of the instance; any by default")
+    options = parser.parse_args()
+    faulthandler.enable()  # a crash of an engine says in which step it happened
+    faulthandler.register(signal.SIGTERM, all_threads=False, chain=True)  # a hang, where
+    token = os.environ.pop(TOKEN_VARIABLE, "")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server decides when a run ends
+    if hasattr(os, "SCHED_BATCH"):  # a client that is woken lets the server wake the others first
+        with contextlib.suppress(OSError):  # not every container lets it choose
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    try:
+        return run_client(options.connect, token, options.instance)
+    except PhysxError as error:
+        sys.stderr.write(f"physx client: {error}\n")
+        return 1
+    finally:
+        kill_descendants()  # where the server is gone too, nobody else does
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The client side: one environment in a worker process."""

@@ -1,0 +1,173 @@
+"""Client: one instance of the environment in this process, for a server elsewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from physx_core.components.scene import Event
+from physx_core.errors import PhysxError
+from physx_core.net.frames import Kind, pack
+from physx_core.net.remote_errors import encode_error
+from physx_core.net.spin_wait import has_core_for_each
+from physx_core.net.values import encode
+from physx_core.typing import Sample
+from physx_core.workers.client.joining import PATIENCE, join
+from physx_core.workers.client.link import Link, RunEnded, ServerGone
+from physx_core.workers.client.producer import Producer
+from physx_core.workers.instance import Instance
+from physx_core.workers.processes.launchers import CLIENT_VARIABLE
+
+
+def run_client(
+    address: str,
+    token: str,
+    instance: int | None = None,
+    *,
+    patience: float = PATIENCE,
+    say: Callable[[str], None] = lambda text: None,
+) -> int:
+    """Run one instance of the environment for a server until it ends the run.
+
+    Args:
+        address: The server's ``HOST:PORT``.
+        token: Token of the run.
+        instance: Number of the instance to run, counted from 1; None: any that is free.
+        patience: Time in s for which to try again where nothing listens.
+        say: Is told what happens.
+
+    Returns:
+        Exit status of the process: 0 once the run has ended, 1 where the environment failed or the
+        server is gone; the server knows why.
+
+    Raises:
+        ConnectionRefusedByPeerError: Nothing answers at the address, not a server with this token,
+            or the server has no place for the instance.
+    """
+    say(f"looks for the server at {address}")
+    link, setup = join(address, token, instance or 0, patience)
+    try:
+        return _serve(link, setup, say)
+    except RunEnded:
+        say("the server is gone")
+        return 1
+    finally:
+        link.close()
+
+
+def _serve(link: Link, setup: dict[str, Any], say: Callable[[str], None]) -> int:
+    os.environ[CLIENT_VARIABLE] = "1"
+    draw, skip = setup.pop("draw"), setup.pop("skip")
+    _take_place(setup.pop("path"), setup.pop("directory"))
+    say(
+        f"runs {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"
+        + (f"; {skip['rows']} rows are there and are made again" if skip["rows"] else "")
+    )
+    link.waits_awake = has_core_for_each(setup["instance_nb"])
+    client = _Client(link, Instance(**setup), skip)
+    try:
+        client.live(draw)
+    finally:
+        client.close()
+    if client.is_forsaken:
+        raise ServerGone
+    with contextlib.suppress(ServerGone):  # the run has ended, for whatever reason
+        link.send(pack(Kind.BYE))
+    failure = client.failure
+    say("the run has ended" if failure is None else f"{type(failure).__name__}: {failure}")
+    link.finish()
+    return 0 if failure is None else 1
+
+
+def _take_place(path: list[str], directory: str) -> None:
+    """Look for modules, scripts and files where the server does, as far as they exist here."""
+    if Path(directory).is_dir():
+        os.chdir(directory)
+    found = [entry for entry in path if Path(entry).exists()]
+    sys.path[:] = [*found, *(entry for entry in sys.path if entry not in found)]
+
+
+class _Client:
+    """The life of one instance; its errors go to the server.
+
+    Attributes:
+        failure: The error that was sent.
+        is_forsaken: Whether the server has gone without a word.
+    """
+
+    def __init__(self, link: Link, instance: Instance, skip: dict[str, int]) -> None:
+        self.failure: PhysxError | None = None
+        self.is_forsaken = False
+        self._link, self._instance = link, instance
+        self._producer = Producer(link, instance, skip["rows"], skip["refused"])
+        self._services = RemoteServices(link, self._producer.flush, skip["shown"])
+
+    def live(self, draw: bool) -> None:
+        """Open the environment and make rows until the run ends or the environment fails."""
+        try:
+            self._instance.open(self._services, draw)
+            fields = [field.to_dict() for field in self._instance.fields]
+            self._link.send(pack(Kind.READY, encode(fields)))
+            self._producer.run()
+        except RunEnded as end:
+            self.is_forsaken = isinstance(end, ServerGone)
+            if self._producer.failure is not None:
+                self._report(self._producer.failure, self._producer.made)
+        except PhysxError as error:
+            self._report(error, self._producer.made)
+
+    def close(self) -> None:
+        """Close the environment."""
+        try:
+            self._instance.close()
+        except PhysxError as error:
+            if self.failure is None:
+                self._report(error, 0)
+
+    def _report(self, error: PhysxError, row: int) -> None:
+        self.failure = error
+        self._link.send(pack(Kind.ERROR, encode_error(error), row))
+
+
+class RemoteServices:
+    """Services of the run, asked over the connection."""
+
+    def __init__(self, link: Link, flush: Callable[[], None], shown: int = 0) -> None:
+        """Keep the connection.
+
+        Args:
+            link: Connection to the server.
+            flush: Sends what waits to be sent; called before each wait for an answer.
+            shown: How many times what is drawn first was sent by a client before this one.
+        """
+        self._link, self._flush, self._to_skip = link, flush, shown
+
+    def predict(self, fields: Sample) -> Sample:
+        """Return the network's prediction: see `Services.predict`."""
+        prediction: Sample = self._ask(Kind.PREDICT, fields, "get_prediction()")
+        return prediction
+
+    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
+        """Keep values of the instance: see `Services.save_parameters`."""
+        self._ask(Kind.SAVE, values, "save_parameters()")
+
+    def load_parameters(self, instance_id: int) -> dict[str, Any]:
+        """Return the values that the instance kept: see `Services.load_parameters`."""
+        values: dict[str, Any] = self._ask(Kind.LOAD, None, "load_parameters()")
+        return values
+
+    def show(self, instance_id: int, step: int, events: list[Event]) -> None:
+        """Send drawing events: see `Services.show`."""
+        if self._to_skip:
+            self._to_skip -= 1
+            return
+        plain = [(event.action, event.kind, event.name, dict(event.values)) for event in events]
+        self._link.send(pack(Kind.SHOW, encode(plain, "update_visualization()"), step))
+
+    def _ask(self, kind: Kind, value: Any, what: str) -> Any:
+        self._flush()
+        return self._link.ask(kind, value, what)

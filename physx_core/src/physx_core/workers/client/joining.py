@@ -1,0 +1,95 @@
+"""Joining: how a client finds its server, and is told what to run."""
+
+from __future__ import annotations
+
+import socket
+import time
+from typing import Any
+
+from physx_core.errors import ConnectionRefusedByPeerError, UnansweredError
+from physx_core.net.frames import Kind
+from physx_core.net.handshake import introduce
+from physx_core.net.remote_errors import decode_error
+from physx_core.net.values import decode
+from physx_core.workers.client.link import Link, RunEnded
+
+PATIENCE = 10.0
+"""Time in s for which a client tries to join."""
+
+_ANSWER_TIME = 10.0
+_PAUSE = 0.2
+
+
+def join(
+    address: str, token: str, instance: int, patience: float = PATIENCE
+) -> tuple[Link, dict[str, Any]]:
+    """Connect to a server, and have it say what to run.
+
+    It tries again where nothing listens, and where the server ends the connection before it knows
+    who is there, as it does with some of those who connect while it is crowded.
+
+    Args:
+        address: ``HOST:PORT``.
+        token: Token of the run.
+        instance: Number of the instance to run, 0 for any that is free.
+        patience: Time in s for which to try again.
+
+    Returns:
+        The connection, and what the instance is made from.
+
+    Raises:
+        ConnectionRefusedByPeerError: Nothing answers at the address, not a server with this token,
+            or the server has no place for the instance.
+    """
+    until = time.monotonic() + patience
+    while True:
+        try:
+            return _try_to_join(address, token, instance)
+        except UnansweredError:
+            if time.monotonic() + _PAUSE > until:
+                raise
+        time.sleep(_PAUSE)
+
+
+def _try_to_join(address: str, token: str, instance: int) -> tuple[Link, dict[str, Any]]:
+    connection = _connection(address)
+    try:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        reader = introduce(connection, token, instance)
+        connection.settimeout(None)
+    except BaseException:
+        connection.close()
+        raise
+    link = Link(connection, reader)
+    try:
+        return link, _what_to_run(link)
+    except BaseException:
+        link.close()
+        raise
+
+
+def _connection(address: str) -> socket.socket:
+    host, _, port = address.rpartition(":")
+    what = f'No server can be reached at "{address}"'
+    advice = "Give the HOST:PORT at which the run listens."
+    try:
+        place = (host.strip("[]"), int(port))
+        return socket.create_connection(place, timeout=_ANSWER_TIME)
+    except (ValueError, OverflowError, socket.gaierror) as error:
+        raise ConnectionRefusedByPeerError(f"{what}: {error}. {advice}") from error
+    except OSError as error:
+        raise UnansweredError(f"{what}: {error}. {advice}") from error
+
+
+def _what_to_run(link: Link) -> dict[str, Any]:
+    try:
+        frame = link.receive()
+    except RunEnded:
+        raise UnansweredError("The server ended the connection.") from None
+    if frame.kind is Kind.ERROR:
+        raise decode_error(frame.payload)
+    if frame.kind is not Kind.SETUP:
+        raise ConnectionRefusedByPeerError(f"The server began with {frame.kind.name}.")
+    setup: dict[str, Any] = decode(frame.payload)
+    return setup

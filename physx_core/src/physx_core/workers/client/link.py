@@ -1,0 +1,180 @@
+"""Link: the client's end of the connection."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import socket
+import threading
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from physx_core.net.frames import Frame, FrameReader, Kind
+from physx_core.net.remote_errors import decode_error
+from physx_core.net.spin_wait import awaited
+from physx_core.net.values import decode, pack_value
+from physx_core.workers.processes.descendants import kill_descendants
+
+_AWAKE_TIME = 2e-4
+_CLEANUP_TIME = 1.0
+_REST = 1 << 16
+_MOST_PARTS = 512  # a system call takes no more than 1024
+_HANGUP = getattr(select, "POLLRDHUP", 0)
+
+
+class RunEnded(BaseException):
+    """The server ended the run, or is gone: unwinds the environment's step."""
+
+
+class ServerGone(RunEnded):
+    """The connection to the server has ended."""
+
+
+class Link:
+    """Connection to the server, authenticated; blocking.
+
+    A thread watches the connection: a process whose server is gone ends within about a second,
+    even inside a long step.
+
+    Attributes:
+        waits_awake: Whether an answer is looked for without sleeping, for 0.2 ms.
+    """
+
+    def __init__(self, connection: socket.socket, reader: FrameReader) -> None:
+        """Take a connection whose handshake is done.
+
+        Args:
+            connection: The socket.
+            reader: The reader that the handshake left.
+        """
+        self.waits_awake = False
+        self._connection = connection
+        self._reader = reader
+        self._postponed: deque[Frame] = deque()
+        self._requests = 0
+        self._poll = select.poll()
+        self._poll.register(connection, select.POLLIN)
+        self._over = threading.Event()
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def send(self, message: bytes) -> None:
+        """Send a message.
+
+        Raises:
+            RunEnded: The server is gone.
+        """
+        try:
+            self._connection.sendall(message)
+        except OSError as error:
+            raise ServerGone from error
+
+    def send_parts(self, parts: Sequence[bytes | memoryview]) -> None:
+        """Send a message whose parts lie in several places.
+
+        Args:
+            parts: Bytes, in their order; they may change once this returns.
+
+        Raises:
+            RunEnded: The server is gone.
+        """
+        waiting = [memoryview(part) for part in parts if len(part)]
+        try:
+            while waiting:
+                sent = self._connection.sendmsg(waiting[:_MOST_PARTS])
+                while waiting and sent >= len(waiting[0]):
+                    sent -= len(waiting.pop(0))
+                if sent:
+                    waiting[0] = waiting[0][sent:]
+        except OSError as error:
+            raise ServerGone from error
+
+    def receive(self) -> Frame:
+        """Wait for the next message.
+
+        Raises:
+            RunEnded: The server is gone.
+        """
+        self._wait_awake()
+        return self._postponed.popleft() if self._postponed else self._next()
+
+    def put_back(self, frame: Frame) -> None:
+        """Have `receive` return a message again that came too early."""
+        self._postponed.appendleft(frame)
+
+    def has_message(self) -> bool:
+        """Return whether `receive` would find a message at once."""
+        return bool(self._postponed or self._reader.has_buffered or self._poll.poll(0))
+
+    def ask(self, kind: Kind, value: Any, what: str) -> Any:
+        """Send a request and wait for the answer.
+
+        Args:
+            kind: What is asked.
+            value: What goes with it.
+            what: Name of the value for error messages.
+
+        Returns:
+            The value that the server answers.
+
+        Raises:
+            RunEnded: The server ended the run instead.
+            PhysxError: The request was refused, or the value cannot travel.
+        """
+        message = pack_value(kind, value, what, self._requests + 1)
+        self._requests += 1
+        self.send(message)
+        self._wait_awake()
+        while True:
+            frame = self._next()
+            if frame.kind is Kind.CLOSE:
+                raise RunEnded
+            if frame.kind not in (Kind.ANSWER, Kind.REFUSAL):
+                self._postponed.append(frame)
+            elif frame.number == self._requests:
+                if frame.kind is Kind.REFUSAL:
+                    raise decode_error(frame.payload)
+                return decode(frame.payload)
+
+    def finish(self) -> None:
+        """Wait until the server has read all that was sent and has closed the connection.
+
+        What a socket still has to send is lost once it is closed and the other side sends to it.
+        """
+        with contextlib.suppress(OSError):
+            self._connection.shutdown(socket.SHUT_WR)
+            while self._connection.recv(_REST):
+                pass
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._over.set()
+        with contextlib.suppress(OSError):
+            self._connection.shutdown(socket.SHUT_RDWR)
+        self._connection.close()
+
+    def _wait_awake(self) -> None:
+        if self.waits_awake:
+            awaited(self.has_message, _AWAKE_TIME)
+
+    def _next(self) -> Frame:
+        try:
+            frame = self._reader.read(self._connection)
+        except (EOFError, OSError) as error:
+            raise ServerGone from error
+        if frame is None:  # a blocking socket has no such case
+            raise ServerGone
+        return frame
+
+    def _watch(self) -> None:
+        poll = select.poll()
+        poll.register(self._connection, _HANGUP)
+        poll.poll()
+        if self._over.wait(_CLEANUP_TIME):
+            return
+        if os.getsid(0) == os.getpid():  # it was launched: a group of its own
+            os.killpg(os.getpid(), signal.SIGKILL)
+        kill_descendants()
+        os._exit(1)

@@ -1,0 +1,189 @@
+"""Producer: makes rows within the credit that the server grants, and sends them in blocks."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+
+import numpy as np
+
+from physx_core.errors import ConnectionRefusedByPeerError, NotFiniteError, PhysxError
+from physx_core.fields import Field
+from physx_core.net.frames import Frame, Kind, pack
+from physx_core.net.values import decode, encode
+from physx_core.rows import ROW_FIELDS, Columns, row_of, shaped_by
+from physx_core.typing import Sample
+from physx_core.workers.client.link import Link, RunEnded
+from physx_core.workers.instance import Instance
+from physx_core.workers.row_codec import pack_rows, row_bytes
+
+_BLOCK_BYTES = 1 << 20
+_BLOCK_ROWS = 4096
+_BLOCK_TIME = 20e-3
+
+
+class Producer:
+    """Steps one instance.
+
+    Attributes:
+        made: How many rows were made, and so the number of the row in the making, counted from 0.
+        failure: Why rows that were made cannot be sent.
+    """
+
+    def __init__(self, link: Link, instance: Instance, skip: int = 0, refused: int = 0) -> None:
+        """Keep what rows are made with.
+
+        Args:
+            link: Where they go.
+            instance: What makes them; open.
+            skip: How many rows the server has from a client before this one. They are made again,
+                but not sent.
+            refused: How many refused rows it has.
+        """
+        self.made = 0
+        self.failure: PhysxError | None = None
+        self._link, self._instance = link, instance
+        self._skip, self._skip_refused = skip, refused
+        self._columns: Columns | None = None
+        self._announced = False
+        self._stored: deque[Sample] = deque()
+        self._credit = 0
+        self._filled = 0
+        self._sent_at = 0.0
+
+    def run(self) -> None:
+        """Make rows until the server ends the run.
+
+        Raises:
+            RunEnded: The server ended the run or is gone, or there is a `failure`.
+            PhysxError: A row could not be made; all rows before it were sent.
+        """
+        while True:
+            if self.made >= self._credit:
+                while self.made >= self._credit:
+                    self._obey(self._link.receive())
+                self._sent_at = time.monotonic()
+            try:
+                self._make_row()
+            except PhysxError:
+                self.flush()
+                self._send_last_refused()
+                raise
+            if self._is_due():
+                self.flush()
+                if self.made < self._skip:
+                    self._link.send(pack(Kind.AGAIN, number=self.made))
+                self._listen()
+
+    def flush(self) -> None:
+        """Send the rows that were not sent yet.
+
+        Rows up to one that holds NaN or an infinite number are sent, and `failure` names that one.
+
+        Raises:
+            RunEnded: There is a `failure`, or the server is gone. No environment can catch it.
+        """
+        self._send_refused()
+        columns, count = self._columns, self._filled
+        self.made -= count
+        while columns is not None and count:
+            try:
+                block = columns.rows(count)
+            except NotFiniteError as error:
+                # The named row is the first of one field; another field may have an earlier one.
+                self.failure = error
+                count = int(np.argmax(columns.arrays["step"][:count] == error.step))
+            else:
+                self._link.send_parts(pack_rows(block, count))
+                break
+        self.made += count
+        self._filled = 0
+        self._sent_at = time.monotonic()
+        if self.failure is not None:
+            raise RunEnded
+
+    def _make_row(self) -> None:
+        instance = self._instance
+        sample = instance.step(self._stored.popleft() if self._stored else None)
+        columns = self._columns
+        if columns is None:
+            columns = self._columns = _columns(shaped_by(instance.fields, sample))
+        if self.made >= self._skip:
+            number, episode, step = instance.instance_id, instance.last_episode, instance.last_step
+            columns.put(self._filled, sample, number, episode, step)
+            self._filled += 1
+        self._announce(columns)
+        self.made += 1
+
+    def _announce(self, columns: Columns) -> None:
+        """Tell the fields of the rows, once."""
+        if not self._announced:
+            self._announced = True
+            table = [field.to_dict() for field in columns.fields]
+            self._link.send(pack(Kind.FIELDS, encode(table)))
+
+    def _send_refused(self) -> None:
+        """Send what `check_sample` refused, once the fields' shapes are known."""
+        refused, columns = self._instance.refused, self._columns
+        if refused is None or columns is None or not self._announced:
+            return
+        rows = refused.take(columns.fields[: -len(ROW_FIELDS)], self._instance.instance_id)
+        skipped = min(self._skip_refused, len(rows["step"]))
+        self._skip_refused -= skipped
+        for start in range(skipped, len(rows["step"]), columns.capacity):
+            part = {name: values[start : start + columns.capacity] for name, values in rows.items()}
+            self._link.send_parts(pack_rows(part, len(part["step"]), Kind.WRONG))
+
+    def _send_last_refused(self) -> None:
+        """Send refused samples of an instance that has come to its end, if need be without rows."""
+        refused = self._instance.refused
+        if refused is None or self._announced:
+            return
+        fields = refused.shaped(self._instance.fields)
+        if all(field.shape is not None for field in fields):
+            self._columns = _columns(fields)
+            self._announce(self._columns)
+            self._send_refused()
+
+    def _is_due(self) -> bool:
+        columns = self._columns
+        return (
+            self.made >= self._credit
+            or (columns is not None and self._filled == columns.capacity)
+            or time.monotonic() - self._sent_at >= _BLOCK_TIME
+        )
+
+    def _listen(self) -> None:
+        """Obey what the server says, up to what is meant for after the rows that it asked for.
+
+        A client that goes on in the place of another is told at once what that one was told.
+        """
+        while self._link.has_message():
+            frame = self._link.receive()
+            if frame.kind in (Kind.APPLY, Kind.STORED) and self.made < self._credit:
+                self._link.put_back(frame)
+                return
+            self._obey(frame)
+
+    def _obey(self, frame: Frame) -> None:
+        if frame.kind is Kind.CREDIT:
+            self._credit = frame.number
+        elif frame.kind is Kind.APPLY:
+            prediction = decode(frame.payload)
+            for row in range(frame.number):
+                self._instance.apply({name: values[row] for name, values in prediction.items()})
+        elif frame.kind is Kind.STORED:
+            stored = decode(frame.payload)
+            self._stored.extend(row_of(stored, row) for row in range(frame.number))
+        elif frame.kind is Kind.CLOSE:
+            raise RunEnded
+        elif frame.kind not in (Kind.ANSWER, Kind.REFUSAL):  # those of an abandoned request
+            raise ConnectionRefusedByPeerError(
+                f"The server sent {frame.kind.name}, which only a client sends."
+            )
+
+
+def _columns(fields: list[Field]) -> Columns:
+    """Return columns for one block of rows."""
+    size = max(1, row_bytes([*fields, *ROW_FIELDS]))
+    return Columns(fields, min(max(1, _BLOCK_BYTES // size), _BLOCK_ROWS))

@@ -1,0 +1,213 @@
+"""Instance: one environment brought to life and stepped, in this process or in a client."""
+
+from __future__ import annotations
+
+import inspect
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from physx_core.components.environment import Environment, Services
+from physx_core.components.scene import Factory
+from physx_core.errors import EnvironmentFailedError, PhysxError, UsageError, WrongSamplesError
+from physx_core.fields import Field
+from physx_core.plugins import resolve
+from physx_core.rows import Refused
+from physx_core.typing import Sample
+
+
+class Instance:
+    """Calls an environment's methods in their order and names the instance in every error.
+
+    Attributes:
+        instance_id: Number of the instance, counted from 1.
+        environment: The environment; None before `open` and after `close`.
+        fields: The environment's fields; shapes that it leaves open become known with the first
+            sample.
+        last_step: Number of the step that made the last sample, counted from 0.
+        last_episode: Number of the trajectory that the last sample belongs to, counted from 0.
+        refused: The samples that `check_sample` refused, if they are recorded; else None.
+    """
+
+    def __init__(
+        self,
+        environment: str | Callable[..., Any],
+        env_kwargs: dict[str, Any],
+        *,
+        instance_id: int,
+        instance_nb: int,
+        seed: Sequence[int],
+        simulations_per_step: int = 1,
+        max_wrong_samples: int = 10,
+        record_wrong: bool = False,
+        accept_all: bool = False,
+    ) -> None:
+        """Keep what the environment is made from.
+
+        Args:
+            environment: Reference of the environment.
+            env_kwargs: Its keyword arguments.
+            instance_id: Number of the instance, counted from 1.
+            instance_nb: How many instances run together.
+            seed: Seed of the whole run.
+            simulations_per_step: Calls of `step` for one sample.
+            max_wrong_samples: How many samples in a row `check_sample` may refuse.
+            record_wrong: Whether the samples that it refuses are kept in `refused`.
+            accept_all: Whether a sample counts whatever `check_sample` says, as in a replay.
+        """
+        self.instance_id = instance_id
+        self.environment: Environment | None = None
+        self.fields: list[Field] = []
+        self.last_step = -1
+        self.last_episode = 0
+        self.refused = Refused() if record_wrong else None
+        self._reference = environment
+        self._arguments: dict[str, Any] = {
+            **env_kwargs,
+            "instance_id": instance_id,
+            "instance_nb": instance_nb,
+            "seed": list(seed),
+        }
+        self._sub_steps = simulations_per_step - 1
+        self._max_wrong_samples = max_wrong_samples
+        self._accepts_all = accept_all
+        self._runner: Any = None
+
+    def open(self, services: Services, draw: bool) -> None:
+        """Make the environment and call `create`, `init`, `init_database`, `init_visualization`.
+
+        Args:
+            services: What the environment may ask of the run.
+            draw: Whether a visualizer looks on.
+
+        Raises:
+            EnvironmentFailedError: The environment does not import, or one of its methods raised.
+            PhysxError: What the environment raised, if it is an error of physx.
+        """
+        make = self._call("import", resolve, "environment", self._reference)
+        environment = self._call("__init__", make, **self._arguments)
+        if not isinstance(environment, Environment):
+            raise UsageError(f"{self._reference!r} made {environment!r}, which is no Environment.")
+        self.environment = environment
+        environment._services = services
+        self._call("create", environment.create)
+        self._call("init", environment.init)
+        self._call("init_database", environment.init_database)
+        if not any(field.role == "training" for field in environment.fields):
+            raise UsageError(
+                f"{type(environment).__name__}.init_database() defined no training fields: "
+                "call define_training_fields()."
+            )
+        self.fields = environment.fields
+        if draw:
+            environment.factory = Factory()
+            self._call("init_visualization", environment.init_visualization)
+            environment.update_visualization()
+
+    def step(self, stored: Sample | None = None) -> dict[str, Any]:
+        """Simulate until `check_sample` accepts a sample, and return it, not yet checked.
+
+        Args:
+            stored: A stored row that the environment shall replay, or None. It is the same one for
+                all sub-steps, and again after a sample that was refused.
+
+        Raises:
+            WrongSamplesError: `check_sample` refused too many samples in a row.
+            UnknownFieldError: The step gave no data.
+            EnvironmentFailedError: The environment raised.
+        """
+        environment = self._alive()
+        environment.sample = stored
+        wrong = 0
+        while True:
+            sample, accepted = self._simulate(environment)
+            self.last_step = environment.step_index
+            self.last_episode = environment.sample_episode
+            environment.step_index += 1
+            if accepted or self._accepts_all:
+                return sample
+            if self.refused is not None:
+                self.refused.note(sample, self.last_episode, self.last_step)
+            wrong += 1
+            if wrong > self._max_wrong_samples:
+                raise WrongSamplesError(
+                    f"check_sample() refused {wrong} samples in a row; "
+                    f"max_wrong_samples_per_step is {self._max_wrong_samples}.",
+                    instance_id=self.instance_id,
+                    step=self.last_step,
+                )
+
+    def apply(self, prediction: Sample) -> None:
+        """Give a prediction in physical units to the environment.
+
+        Raises:
+            EnvironmentFailedError: The environment raised.
+        """
+        environment = self._alive()
+        self._call("apply_prediction", environment.apply_prediction, prediction)
+
+    def close(self) -> None:
+        """Close the environment; calling it again does nothing.
+
+        Raises:
+            EnvironmentFailedError: The environment raised.
+        """
+        environment, self.environment = self.environment, None
+        try:
+            if environment is not None:
+                self._call("close", environment.close)
+        finally:
+            if self._runner is not None:
+                self._runner.close()
+                self._runner = None
+
+    def _simulate(self, environment: Environment) -> tuple[dict[str, Any], bool]:
+        """Run the sub-steps and the step; return the sample, and whether it was accepted."""
+        method = "step"
+        try:
+            if self._sub_steps:
+                environment.compute_training_data = False
+                for _ in range(self._sub_steps):
+                    self._finish(environment.step())
+                environment.compute_training_data = True
+            result = environment.step()
+            if result is not None:
+                self._finish(result)
+            sample = environment.take_sample()
+            method = "check_sample"
+            return sample, environment.check_sample()
+        except Exception as error:
+            raise self._failure(method, error) from error
+
+    def _finish(self, result: Any) -> None:
+        """Run a coroutine that `step` returned to its end."""
+        if inspect.iscoroutine(result):
+            if self._runner is None:
+                import asyncio
+
+                self._runner = asyncio.Runner()
+            self._runner.run(result)
+
+    def _call(self, method: str, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return function(*args, **kwargs)
+        except Exception as error:
+            raise self._failure(method, error) from error
+
+    def _failure(self, method: str, error: Exception) -> Exception:
+        """Return the error to raise: that of physx with its place noted, or one that wraps it."""
+        step = self.environment.step_index if self.environment is not None else -1
+        if method not in ("step", "check_sample", "apply_prediction", "close"):
+            step = -1
+        if isinstance(error, PhysxError):
+            if method != "import":
+                error.add_note(f"in {method}() of instance {self.instance_id}")
+            return error
+        summary = "".join(traceback.format_exception_only(error)).strip()
+        text = "".join(traceback.format_exception(error))
+        return EnvironmentFailedError(self.instance_id, method, step, summary, text)
+
+    def _alive(self) -> Environment:
+        if self.environment is None:
+            raise UsageError(f"Instance {self.instance_id} is not open.")
+        return self.environment

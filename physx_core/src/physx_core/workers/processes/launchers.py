@@ -1,0 +1,209 @@
+"""Launchers of the core: processes on this machine, or people who start clients themselves."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from typing import IO
+
+from physx_core.components.launcher import ClientHandle, Launcher
+from physx_core.errors import ClientError, ConfigError
+from physx_core.net.handshake import TOKEN_VARIABLE
+from physx_core.workers.processes.watchdog import Guard
+
+CLIENT_VARIABLE = "PHYSX_CLIENT"
+"""Environment variable that is set in every client process."""
+
+_TAIL = 8192
+_LINES = 60
+_TERMINATE_TIME = 0.5
+
+
+class ClientProcess(ClientHandle):
+    """One client, started on this machine.
+
+    Its standard input is empty, its standard output is this process's, and the end of its standard
+    error is kept for error messages. Ctrl-C in a terminal does not reach it.
+
+    Attributes:
+        instance_id: Number of the instance that it runs, counted from 1.
+    """
+
+    def __init__(
+        self,
+        instance_id: int,
+        address: str,
+        token: str,
+        core: int | None = None,
+        guard: Guard | None = None,
+    ) -> None:
+        """Keep what the process is started with.
+
+        Args:
+            instance_id: Number of the instance, counted from 1.
+            address: The server's ``HOST:PORT``.
+            token: Token of the run.
+            core: The only processor core that it may use; None: all that this process may use.
+            guard: Ends it if this process is gone; None: one for it alone.
+        """
+        self.instance_id = instance_id
+        self._core, self._guard = core, guard or Guard()
+        self._command = [
+            *(sys.executable, "-P", "-m", "physx_core.workers"),
+            *("--connect", address, "--instance", str(instance_id)),
+        ]
+        self._variables = {TOKEN_VARIABLE: token, CLIENT_VARIABLE: "1"}
+        self._process: subprocess.Popen[bytes] | None = None
+        self._reader: threading.Thread | None = None
+        self._tail = b""
+
+    def start(self) -> None:
+        """Start the process.
+
+        Raises:
+            ClientError: The operating system refused.
+        """
+        # Instances share the processor cores: a numerical library must not take all for each.
+        environment = {"OMP_NUM_THREADS": "1", **os.environ, **self._variables}
+        try:
+            self._process = subprocess.Popen(
+                self._command,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                bufsize=0,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise ClientError(self.instance_id, f"could not be started: {error}.") from error
+        self._guard.add(self._process.pid)
+        if self._core is not None:
+            with contextlib.suppress(ProcessLookupError):  # it has ended already
+                os.sched_setaffinity(self._process.pid, {self._core})
+        self._reader = threading.Thread(
+            target=self._keep_tail, args=(self._process.stderr,), daemon=True
+        )
+        self._reader.start()
+
+    @property
+    def pid(self) -> int | None:
+        """Process id, None before `start`."""
+        return self._process.pid if self._process is not None else None
+
+    def exit_status(self) -> int | None:
+        """Return the exit status, negative for a signal; None while the process runs."""
+        process = self._process
+        if process is None or process.returncode is not None:
+            return None if process is None else process.returncode
+        status = process.poll()
+        if status is not None:
+            self.kill()  # what the environment left running
+            self._guard.remove(process.pid)
+        return status
+
+    def stderr(self) -> str:
+        """Return the last lines that the process wrote to its standard error."""
+        if self._reader is not None and self.exit_status() is not None:
+            self._reader.join(0.2)
+        lines = self._tail.decode(errors="replace").splitlines()
+        return "\n".join(lines[-_LINES:])
+
+    def terminate(self) -> None:
+        """Ask the process and those that it started to end."""
+        self._signal_group(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """Kill the process and those that it started."""
+        self._signal_group(signal.SIGKILL)
+
+    def wait(self, until: float) -> bool:
+        """Wait for the end of the process: see `ClientHandle.wait`."""
+        return self._process is None or super().wait(until)
+
+    def _signal_group(self, number: signal.Signals) -> None:
+        if self._process is not None:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, number)
+
+    def _keep_tail(self, stream: IO[bytes]) -> None:
+        with stream:
+            while chunk := stream.read(_TAIL):
+                self._tail = (self._tail + chunk)[-_TAIL:]
+
+
+class SubprocessLauncher(Launcher):
+    """Starts each client as a process on this machine."""
+
+    def __init__(self, *, affinity: bool = False) -> None:
+        """Keep how processes are started.
+
+        Args:
+            affinity: Bind each client to one of the processor cores that this process may use, in
+                turn. It helps where as many clients as cores keep busy, and harms where the
+                environments use several threads.
+
+        Raises:
+            ConfigError: This operating system cannot do so.
+        """
+        self._cores: list[int] = []
+        self._guard = Guard()
+        if affinity:
+            if not hasattr(os, "sched_setaffinity"):
+                raise ConfigError(
+                    f"affinity: processes cannot be bound to processor cores on {sys.platform}."
+                )
+            self._cores = sorted(os.sched_getaffinity(0))
+
+    def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
+        """Start the processes: see `Launcher.launch`."""
+        started: list[ClientHandle] = []
+        try:
+            for number in instances:
+                core = self._cores[(number - 1) % len(self._cores)] if self._cores else None
+                process = ClientProcess(number, address, token, core, self._guard)
+                started.append(process)
+                process.start()
+        except BaseException:
+            stop(started, 0.0)
+            raise
+        return started
+
+
+class ManualLauncher(Launcher):
+    """Starts nothing: people do, with ``physx client``, on this machine or another."""
+
+    by_hand = True
+
+    def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
+        """Start nothing; the server says where clients can connect."""
+        return []
+
+
+def stop(clients: Iterable[ClientHandle], patience: float) -> None:
+    """End clients and all that they started; none is left when this returns.
+
+    Args:
+        clients: What to end.
+        patience: Time in s for which they may end on their own.
+    """
+    running = list(clients)
+    try:
+        running = _still_running(running, patience)
+        for client in running:
+            client.terminate()
+        running = _still_running(running, _TERMINATE_TIME)
+    finally:
+        for client in running:
+            client.kill()
+        _still_running(running, 10.0)
+
+
+def _still_running(clients: list[ClientHandle], patience: float) -> list[ClientHandle]:
+    until = time.monotonic() + patience
+    return [client for client in clients if not client.wait(until)]

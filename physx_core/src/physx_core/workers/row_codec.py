@@ -1,0 +1,146 @@
+"""Rows on the wire: each field's values of a block of rows, one after the other, little-endian."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from physx_core.errors import ConnectionRefusedByPeerError
+from physx_core.fields import Field
+from physx_core.net.frames import Kind, header
+from physx_core.typing import Array, Batch
+
+_SMALL = 1 << 14
+"""Bytes of rows that are quicker copied than sent in parts."""
+
+
+def row_bytes(fields: Sequence[Field]) -> int:
+    """Return the bytes of one row; all shapes are known."""
+    return sum(field.nbytes for field in fields)
+
+
+def pack_rows(block: Batch, count: int, kind: Kind = Kind.ROWS) -> list[bytes | memoryview]:
+    """Return the message that carries a block of rows, in parts: many rows are not copied.
+
+    Args:
+        block: Field name to contiguous array of shape (count, *field shape).
+        count: How many rows.
+        kind: What rows they are.
+
+    Raises:
+        UsageError: The block is longer than a message may be.
+    """
+    arrays = list(block.values())
+    length = sum(array.nbytes for array in arrays)
+    begin = header(kind, length, count)
+    if length <= _SMALL:
+        return [b"".join((begin, *(array.data for array in arrays)))]
+    return [begin, *(array.reshape(-1).view("u1").data for array in arrays)]
+
+
+def unpack_rows(payload: bytearray, fields: Sequence[Field], count: int) -> Batch:
+    """Return the rows of a message as views of it.
+
+    Args:
+        payload: Payload of the message.
+        fields: Fields of the rows, all shapes known.
+        count: How many rows it says to hold.
+
+    Raises:
+        ConnectionRefusedByPeerError: It has another length than that many rows.
+    """
+    sizes = [field.nbytes for field in fields]
+    if len(payload) != count * sum(sizes):
+        raise ConnectionRefusedByPeerError(
+            f"A client sent {len(payload)} bytes for {count} rows of {sum(sizes)} bytes."
+        )
+    block: Batch = {}
+    start = 0
+    for field, size in zip(fields, sizes, strict=True):
+        shape = (count, *(field.shape or ()))
+        block[field.name] = np.ndarray(shape, field.dtype, buffer=payload, offset=start)
+        start += count * size
+    return block
+
+
+class RowQueue:
+    """Rows of one client that arrived and were not taken yet.
+
+    Attributes:
+        count: How many rows wait.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._blocks: deque[Batch] = deque()
+        self._taken = 0
+
+    def append(self, block: Batch, count: int) -> None:
+        """Add a block of rows behind the others."""
+        self._blocks.append(block)
+        self.count += count
+
+    def take(self, limit: int, out: Batch, first: int, stride: int) -> int:
+        """Move rows into every `stride`-th row of a batch.
+
+        Args:
+            limit: How many rows at most.
+            out: Where they go.
+            first: Row of `out` for the first one.
+            stride: Distance in rows of `out` from one to the next.
+
+        Returns:
+            How many rows were moved.
+        """
+        moved = 0
+        while moved < limit and self.count:
+            block, start = self._blocks[0], self._taken
+            available = len(next(iter(block.values()))) - start
+            size = min(available, limit - moved)
+            begin = first + moved * stride
+            rows = slice(begin, begin + (size - 1) * stride + 1, stride)
+            for name, values in block.items():
+                target: Array = out[name]
+                target[rows] = values[start : start + size]
+            if size == available:
+                self._blocks.popleft()
+                self._taken = 0
+            else:
+                self._taken += size
+            moved += size
+            self.count -= size
+        return moved
+
+
+class RefusedRows:
+    """Rows of one client that `check_sample` refused, in the order of their steps.
+
+    Attributes:
+        count: How many arrived in all.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._blocks: deque[Batch] = deque()
+
+    def append(self, block: Batch, count: int) -> None:
+        """Add a block of rows behind the others."""
+        self._blocks.append(block)
+        self.count += count
+
+    def take(self, end: int | None) -> list[Batch]:
+        """Return the rows of steps below `end`, or all if it is None, and forget them."""
+        taken = []
+        while self._blocks:
+            block = self._blocks[0]
+            steps = block["step"]
+            size = len(steps) if end is None else int(np.searchsorted(steps, end))
+            if size:
+                taken.append({name: values[:size] for name, values in block.items()})
+            if size < len(steps):
+                self._blocks[0] = {name: values[size:] for name, values in block.items()}
+                break
+            self._blocks.popleft()
+        return taken

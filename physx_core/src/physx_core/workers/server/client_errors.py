@@ -1,0 +1,83 @@
+"""Losses: how a client came to its end, as the error that says so."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+from physx_core.components.launcher import ClientHandle
+from physx_core.errors import ClientError
+from physx_core.workers.server.peer import Peer
+
+_LINES_TIME = 0.1  # for the last lines of its standard error to arrive
+_LAST_WORDS_TIME = 0.3  # for a client that hangs to write where
+_LEAVE_TIME = 0.8  # a process that goes on without a connection ends itself a little later
+
+
+def ended(number: int, peer: Peer | None, handle: ClientHandle | None) -> ClientError:
+    """Return the error for a client that is gone.
+
+    Args:
+        number: Its instance.
+        peer: Its connection; None: it has not connected yet.
+        handle: Its process; None where it was started by hand.
+    """
+    if peer is not None and peer.offense:
+        if handle is not None:
+            handle.wait(time.monotonic() + _LINES_TIME)
+        stderr = "" if handle is None else handle.stderr()
+        what = f"was cut off after {peer.received} rows. {peer.offense}"
+        return ClientError(number, what, stderr=stderr)
+    made = 0 if peer is None else peer.received
+    when = "before it connected" if peer is None else f"after {made} rows"
+    if handle is None:
+        return ClientError(number, f"closed the connection {when}. Its own terminal may say why.")
+    handle.wait(time.monotonic() + _LEAVE_TIME)
+    status = handle.exit_status()
+    how = "closed the connection" if status is None else _ending(status)
+    return ClientError(
+        number,
+        f"{how} {when}. To see what it does, run with as_tcp_ip_client=False.",
+        exit_status=status,
+        stderr=handle.stderr(),
+    )
+
+
+def silent(
+    number: int, peer: Peer | None, handle: ClientHandle | None, timeout: float
+) -> ClientError:
+    """Return the error for a client that let the server wait for too long.
+
+    Args:
+        number: Its instance.
+        peer: Its connection, or the last one that it had; None: it has not connected.
+        handle: Its process; None where it was started by hand.
+        timeout: How long the server waited, in s.
+    """
+    waited = f"for {timeout:g} s while the server waited for it"
+    if peer is None:
+        how = f"did not connect {waited}. If its start takes"
+    elif peer.vacant:
+        lost = f"was lost after {peer.received} rows"
+        how = f"{lost}, and none in its place connected {waited}. If a start takes"
+    else:
+        how = f"sent nothing {waited}. If its steps take"
+    if handle is not None:
+        handle.terminate()  # its last lines tell where it was
+        handle.wait(time.monotonic() + _LAST_WORDS_TIME)
+    return ClientError(
+        number,
+        f"{how} that long, raise EnvironmentConfig.timeout.",
+        stderr="" if handle is None else handle.stderr(),
+    )
+
+
+def _ending(status: int) -> str:
+    """Return an exit status, negative for a signal, in words."""
+    if status >= 0:
+        return f"ended with exit status {status}"
+    try:
+        name = signal.Signals(-status).name
+    except ValueError:
+        name = "unknown"
+    return f"was killed by signal {-status} ({name})"

@@ -1,0 +1,345 @@
+"""ClientGroup: the clients of a run, started together, watched together, ended together."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from physx_core.components.environment import Services
+from physx_core.components.launcher import ClientHandle, Launcher
+from physx_core.config import EnvironmentConfig
+from physx_core.errors import ClientError, ConfigError, EnvironmentFailedError, PhysxError
+from physx_core.net.handshake import TOKEN_VARIABLE
+from physx_core.net.tokens import run_token
+from physx_core.net.values import encode
+from physx_core.plugins import reference_of, resolve
+from physx_core.plugins.references import located
+from physx_core.workers.processes.launchers import stop
+from physx_core.workers.server.client_errors import ended, silent
+from physx_core.workers.server.peer import Peer
+from physx_core.workers.server.server import Server
+
+_TICK = 0.1
+_GRACE = 1.0
+_EXIT_TIME = 5.0
+_SAY_EVERY = 5.0
+_PASSING = (EnvironmentFailedError, ClientError)  # what may not come again
+_LOG = logging.getLogger("physx")
+
+
+class ClientGroup:
+    """One server and a client for each instance.
+
+    Attributes:
+        server: The server.
+        config: Which environment, how many clients, and how long they may be silent.
+    """
+
+    def __init__(
+        self,
+        config: EnvironmentConfig,
+        services: Services,
+        seed: Sequence[int],
+        *,
+        accept_all: bool = False,
+    ) -> None:
+        """Keep what the clients are started with.
+
+        Args:
+            config: Which environment, how many clients, and what starts them.
+            services: What the environments may ask of the run.
+            seed: Seed of all instances.
+            accept_all: Whether samples that `check_sample` refuses count like the others.
+        """
+        self.config = config
+        self._seed = list(seed)
+        self._accepts_all = accept_all
+        self._launcher = _make_launcher(config)
+        self._handles: dict[int, ClientHandle] = {}
+        self._launched: dict[int, float] = {}
+        self._exits: dict[int, float] = {}
+        self._restarts: Counter[int] = Counter()
+        self._checked = self._served = self._said = 0.0
+        self._closing = False
+        self.server = Server(
+            config.ip_address,
+            config.port,
+            config.num_clients,
+            services,
+            self._setup,
+            run_token(config, self._launcher.by_hand),
+            self._replaces,
+        )
+
+    def open(self) -> None:
+        """Start the clients and wait until their environments live.
+
+        Raises:
+            ConfigError: The server cannot listen there.
+            ClientError: A client did not come to life.
+            PhysxError: An environment failed.
+        """
+        self._encoded(1)  # what cannot travel is named before anything is started
+        self.server.open()
+        numbers = list(self._numbers)
+        self._launch(numbers)
+        if self._launcher.by_hand:
+            _LOG.warning(
+                "The run waits for %d %s. Start each with: physx client --connect %s "
+                "(and the token in %s, or in a file with --token-file)",
+                len(numbers),
+                "clients" if len(numbers) > 1 else "client",
+                self._public_address(),
+                TOKEN_VARIABLE,
+            )
+        self.wait(lambda: [number for number in numbers if not self._is_ready(number)])
+
+    def peer(self, instance_id: int) -> Peer:
+        """Return the connection of an instance's client, or of the last one that it had."""
+        return self.server.peers[instance_id]
+
+    def wait(self, missing: Callable[[], Sequence[int]]) -> None:
+        """Serve the clients until none is waited for.
+
+        Args:
+            missing: Tells the instances that are waited for; called after each round.
+
+        Raises:
+            PhysxError: A client ended, failed, or let the server wait for too long, and none takes
+                its place.
+        """
+        began = time.monotonic()
+        if began - self._served > _TICK / 10:
+            self._serve(0.0)
+        while waited := missing():
+            self._serve(_TICK)
+            if self._served - began < min(_SAY_EVERY, self.config.timeout):
+                continue
+            self._say(waited, began)
+            if self._silent(waited, began):
+                self._serve(0.0)  # an answer may have taken long while others had their say
+                for number in self._silent(waited, began):
+                    peer, handle = self.server.peers.get(number), self._handles.get(number)
+                    self._lose(number, silent(number, peer, handle, self.config.timeout))
+
+    def close(self, *, orderly: bool) -> None:
+        """Have the clients close their environments, and end them; no process is left behind.
+
+        Args:
+            orderly: Wait for as long as a client may be silent, and raise what goes wrong;
+                otherwise wait for a moment and raise nothing.
+
+        Raises:
+            ClientError: A client ended too early or is silent for too long.
+        """
+        patience = 0.0
+        self._closing = True
+        try:
+            absent = [number for number in self._handles if self._present(number) is None]
+            stop([self._handles.pop(number) for number in absent], 0.0)
+            self.server.end()
+            if orderly:
+                self.wait(self._unfinished)
+                patience = _EXIT_TIME
+            else:
+                self._wait_a_moment()
+                patience = 0.0 if self._unfinished() else _GRACE
+        finally:
+            stop(self._handles.values(), patience)
+            self._handles = {}
+            self.server.close()
+
+    @property
+    def _numbers(self) -> range:
+        return range(1, self.config.num_clients + 1)
+
+    def _launch(self, numbers: Sequence[int]) -> None:
+        now = time.monotonic()
+        started = self._launcher.launch(numbers, self.server.address, self.server.token)
+        handles = {handle.instance_id: handle for handle in started}
+        self._handles.update(handles)
+        self._launched.update(dict.fromkeys(numbers, now))
+        without = [number for number in numbers if number not in handles]
+        if without and not self._launcher.by_hand:
+            raise ClientError(
+                without[0],
+                f"was not started: {type(self._launcher).__name__}.launch() returned no handle "
+                "for it. A launcher that starts nothing says by_hand = True.",
+            )
+
+    def _public_address(self) -> str:
+        """Return ``HOST:PORT`` for people."""
+        if self.config.ip_address not in ("", "0.0.0.0", "::"):
+            return self.server.address
+        return f"{socket.gethostname()}:{self.server.address.rpartition(':')[2]}"
+
+    def _serve(self, timeout: float) -> None:
+        began = time.monotonic()
+        self.server.pump(timeout)
+        self._served = time.monotonic()
+        lost = any(peer.is_lost and not peer.vacant for peer in self.server.peers.values())
+        if lost or self._served - self._checked > _TICK:
+            self._checked = self._served
+            self._check_ended(self._served, began)
+
+    def _wait_a_moment(self) -> None:
+        until = time.monotonic() + _GRACE
+        while self._unfinished() and time.monotonic() < until:
+            try:
+                self.server.pump(_TICK)
+            except Exception:  # the run has failed already, with an error of its own
+                continue
+
+    def _unfinished(self) -> list[int]:
+        peers = self.server.peers.values()
+        return [p.instance_id for p in peers if not (p.finished or p.gone or p.failure)]
+
+    def _present(self, number: int) -> Peer | None:
+        """Return the connection of an instance's client; None where it has none now."""
+        peer = self.server.peers.get(number)
+        return None if peer is None or peer.vacant else peer
+
+    def _is_ready(self, number: int) -> bool:
+        peer = self._present(number)
+        if peer is not None and peer.failure is not None:
+            raise peer.failure
+        return peer is not None and bool(peer.fields)
+
+    def _check_ended(self, now: float, listened_since: float) -> None:
+        for number in self._numbers:
+            handle, peer = self._handles.get(number), self._present(number)
+            if peer is not None and peer.failure is not None:
+                if self._replaces(number, peer.failure):
+                    self._lose(number, peer.failure)
+                continue
+            if peer is not None and peer.finished:
+                continue
+            if peer is not None and peer.gone:
+                left = handle is None and not peer.offense
+                self._lose(number, ended(number, peer, handle), left=left)
+            elif handle is not None and handle.exit_status() is not None:
+                # What it sent before its end may still be on its way, or wait to be read.
+                since = self._exits.setdefault(number, now)
+                if peer is None or (now - since > 2 * _TICK and peer.heard < listened_since):
+                    self._lose(number, ended(number, peer, handle))
+
+    # Clients that others take the place of --------------------------------------------------
+
+    def _replaces(self, number: int, error: PhysxError | None) -> bool:
+        """Return whether another client goes on where one failed, or left without an error."""
+        if error is None and self._launcher.by_hand:
+            return True
+        passing = error is None or isinstance(error, _PASSING)
+        return passing and self._restarts[number] < self.config.restarts
+
+    def _lose(self, number: int, error: PhysxError, *, left: bool = False) -> None:
+        """Have another client take the place of one that is lost.
+
+        Args:
+            number: The instance.
+            error: How it was lost.
+            left: Whether it closed the connection, as those may that people start.
+
+        Raises:
+            PhysxError: None takes its place: the error.
+        """
+        absent = self._launcher.by_hand and self._present(number) is None
+        if absent or not self._replaces(number, None if left else error):
+            raise error
+        if not left:
+            self._restarts[number] += 1
+        text, _, details = str(error).partition("\n")
+        follows = self._what_follows(number, left)
+        _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
+        self.server.vacate(number)
+        handle = self._handles.pop(number, None)
+        closes = isinstance(error, EnvironmentFailedError)  # and needs a moment for it
+        stop([] if handle is None else [handle], _GRACE if closes else 0.0)
+        self._exits.pop(number, None)
+        if not self._closing:
+            self._launch([number])
+
+    def _what_follows(self, number: int, left: bool) -> str:
+        if self._closing:
+            return "The run was at its end, and all rows are there."
+        text = "Another client goes on in its place."
+        if self._launcher.by_hand:
+            text = (
+                f"The run waits up to {self.config.timeout:g} s for another client to go on in its "
+                f"place, at {self._public_address()}."
+            )
+        restart = f"Restart {self._restarts[number]} of {self.config.restarts}."
+        return text if left else f"{restart} {text}"
+
+    def _say(self, waited: Sequence[int], began: float) -> None:
+        """Say now and then which clients are not there."""
+        now = time.monotonic()
+        if now - max(began, self._said) < _SAY_EVERY:
+            return
+        times = {n: now - max(began, self._heard(n)) for n in self.server.holding_up(waited)}
+        absent = [n for n in sorted(times) if self._present(n) is None and times[n] > _SAY_EVERY]
+        if absent:
+            self._said = now
+            _LOG.warning(
+                "The run waits for a client to run instance %s, since %.0f s, at %s. "
+                "It waits no longer than %g s.",
+                ", ".join(map(str, absent)),
+                max(times[number] for number in absent),
+                self._public_address(),
+                self.config.timeout,
+            )
+
+    def _heard(self, number: int) -> float:
+        peer = self.server.peers.get(number)
+        return max(self._launched.get(number, 0.0), peer.heard if peer is not None else 0.0)
+
+    def _silent(self, waited: Sequence[int], began: float) -> list[int]:
+        """Return those that let the server wait for too long."""
+        limit = time.monotonic() - self.config.timeout
+        numbers = sorted(self.server.holding_up(waited))
+        return [number for number in numbers if max(began, self._heard(number)) < limit]
+
+    def _setup(self, peer: Peer) -> bytes:
+        """Return what a client is told first: the instance, and what of it is there already."""
+        skip = {"rows": peer.received, "refused": peer.refused.count, "shown": peer.shown}
+        return self._encoded(peer.instance_id, skip=skip)
+
+    def _encoded(self, instance_id: int, **progress: Any) -> bytes:
+        config = self.config
+        return encode(
+            {
+                "environment": located("environment", config.environment),
+                "env_kwargs": config.env_kwargs,
+                "seed": self._seed,
+                "instance_id": instance_id,
+                "instance_nb": config.num_clients,
+                "simulations_per_step": config.simulations_per_step,
+                "max_wrong_samples": config.max_wrong_samples_per_step,
+                "record_wrong": config.record_wrong_samples,
+                "accept_all": self._accepts_all,
+                "draw": config.visualizer is not None,
+                "path": [str(Path(entry).resolve()) for entry in sys.path],
+                "directory": str(Path.cwd()),
+                **progress,
+            },
+            "EnvironmentConfig",
+        )
+
+
+def _make_launcher(config: EnvironmentConfig) -> Launcher:
+    make = resolve("launcher", config.launcher)
+    name = reference_of(config.launcher)
+    try:
+        launcher = make(**config.launcher_kwargs)
+    except TypeError as error:
+        text = str(error).split("() ")[-1]
+        raise ConfigError(f"EnvironmentConfig.launcher_kwargs: {name} {text}.") from error
+    if not isinstance(launcher, Launcher):
+        raise ConfigError(f"EnvironmentConfig.launcher: {name} is no Launcher.")
+    return launcher

@@ -1,0 +1,376 @@
+"""Server: listens, lets in who knows the token, and serves the clients in one thread."""
+
+from __future__ import annotations
+
+import secrets
+import selectors
+import socket
+import time
+from collections.abc import Callable, Iterable
+
+from physx_core.components.environment import Services
+from physx_core.errors import (
+    ConfigError,
+    ConnectionRefusedByPeerError,
+    PhysxError,
+    SampleError,
+)
+from physx_core.net.frames import MAX_PAYLOAD, Frame, Kind, pack
+from physx_core.net.remote_errors import decode_error, encode_error
+from physx_core.net.spin_wait import awaited, has_core_for_each
+from physx_core.workers.row_codec import unpack_rows
+from physx_core.workers.server.journal import Journal
+from physx_core.workers.server.peer import Peer
+from physx_core.workers.server.service_requests import Answers
+from physx_core.workers.server.validation import (
+    check_environment_fields,
+    check_row_fields,
+    check_rows,
+    declared_fields,
+)
+
+_HANDSHAKE_TIME = 5.0
+_AWAKE_TIME = 5e-5  # for which clients that got answers are waited for without sleeping
+_MAX_STRANGERS = 128
+_ACCEPTED_AT_ONCE = 16
+_TURNS = 64
+_LONG = 1 << 16
+
+
+class Server:
+    """Connections of the clients; nothing happens but in calls of `pump`.
+
+    Attributes:
+        peers: Instance number to the connection of its client.
+        token: Secret of the run.
+    """
+
+    def __init__(
+        self,
+        ip_address: str,
+        port: int,
+        instance_nb: int,
+        services: Services,
+        setup: Callable[[Peer], bytes],
+        token: str,
+        replaces: Callable[[int, PhysxError | None], bool] = lambda number, error: False,
+    ) -> None:
+        """Keep where to listen and what to tell clients.
+
+        Args:
+            ip_address: Address to listen at.
+            port: Port to listen at, 0 for any free one.
+            instance_nb: How many instances run.
+            services: What the environments may ask of the run.
+            setup: Makes the payload that tells an instance's client what to run.
+            token: Secret of the run.
+            replaces: Whether an instance's client that fails with an error, or leaves without one,
+                makes room for another.
+        """
+        self.peers: dict[int, Peer] = {}
+        self.token = token
+        self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
+        self._awake_time = _AWAKE_TIME if has_core_for_each(instance_nb) else 0.0
+        self._answers = Answers(services)
+        self._setup, self._replaces = setup, replaces
+        self._ending = self._has_news = False
+        self._strangers: list[Peer] = []
+        self._selector = selectors.DefaultSelector()
+        self._listener: socket.socket | None = None
+        self._dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
+            Kind.READY: _ready,
+            Kind.FIELDS: _fields,
+            Kind.ROWS: _rows,
+            Kind.WRONG: _wrong,
+            Kind.ERROR: _error,
+            Kind.BYE: self._bye,
+            Kind.AGAIN: _again,
+            **dict.fromkeys((Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW), self._answers.take),
+        }
+
+    def open(self) -> None:
+        """Begin to listen.
+
+        Raises:
+            ConfigError: The address is not one of this machine, or the port is in use.
+        """
+        where = f"{self._ip_address} port {self._port}"
+        try:
+            found = socket.getaddrinfo(self._ip_address, self._port, type=socket.SOCK_STREAM)
+            family, address = found[0][0], found[0][4]
+            self._listener = socket.create_server(address, family=family, backlog=128)
+        except (OSError, OverflowError) as error:
+            raise ConfigError(
+                f"The server cannot listen at {where}: {error}. Choose EnvironmentConfig.port=0 "
+                "for any free port, or an ip_address of this machine; a port below 1024 needs "
+                "rights, and one that another run uses is taken."
+            ) from error
+        self._listener.setblocking(False)
+        self._selector.register(self._listener, selectors.EVENT_READ)
+
+    @property
+    def address(self) -> str:
+        """``HOST:PORT`` at which clients on this machine reach the server."""
+        if self._listener is None:
+            raise ConfigError("The server is not open.")
+        host, port = self._listener.getsockname()[:2]
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+        return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+    def pump(self, timeout: float) -> None:
+        """Do what there is to do; wait up to `timeout` s for the first of it.
+
+        As long as all that happens is that predictions are asked for and answered, and for no
+        longer than `timeout`, it goes on.
+        """
+        until = time.monotonic() + timeout
+        awake = 0.0
+        while self._answer_at_once(timeout, awake) and time.monotonic() < until:
+            awake = self._awake_time
+        self._watch()
+
+    def _answer_at_once(self, timeout: float, awake: float) -> bool:
+        """Do what there is to do; return whether it was to answer requests and nothing else.
+
+        Args:
+            timeout: How long to wait for the first of it, in s.
+            awake: How much of that to wait without sleeping, in s.
+        """
+        self._has_news = False
+        found = awaited(lambda: self._selector.select(0), awake) if awake else []
+        for key, events in found or self._selector.select(timeout):
+            if key.data is None:
+                self._accept()
+                self._has_news = True
+                continue
+            if events & selectors.EVENT_WRITE:
+                key.data.flush()
+                self._has_news = True
+            if events & selectors.EVENT_READ:
+                self._read(key.data)
+        asked = self._answers.count
+        if not asked or (asked < self._instance_nb and self._expects_more_requests()):
+            return False
+        return self._answers.predict() and not self._has_news
+
+    @property
+    def asking(self) -> set[int]:
+        """The instances that wait for a prediction."""
+        return self._answers.asking
+
+    def end(self) -> None:
+        """Tell all clients to close their environments."""
+        self._ending = True
+        for peer in self.peers.values():
+            peer.send(pack(Kind.CLOSE))
+
+    def vacate(self, number: int) -> None:
+        """Have the next client of an instance go on where the present one failed or left."""
+        peer = self.peers.get(number)
+        if peer is not None:
+            self._drop(peer)
+            self._answers.forget(peer)
+            peer.vacant, peer.failure, peer.heard = True, None, time.monotonic()
+
+    def close(self) -> None:
+        """Close all connections; calling it again does nothing."""
+        for peer in [*self._strangers, *self.peers.values()]:
+            self._drop(peer)
+            if peer.journal is not None:
+                peer.journal.close()
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
+        self._selector.close()
+
+    def holding_up(self, waited: Iterable[int]) -> set[int]:
+        """Return those that the server waits for in the end, where it waits for some instances.
+
+        Those of them that wait for a prediction wait for the others that are at work.
+        """
+        waited = set(waited)
+        others = self._at_work() if waited & self.asking else set()
+        return (waited | others) - self.asking
+
+    def _expects_more_requests(self) -> bool:
+        """Return whether a client is at work that may yet ask for a prediction.
+
+        A batch is predicted once every client asks or has nothing to do. So which requests are in
+        a batch depends on the environments, and not on how fast each of them happens to be: the
+        rounding of a network's result may depend on the size of the batch.
+        """
+        if self._ending or not self._answers.batches:
+            return False
+        numbers, asking = range(1, self._instance_nb + 1), self._answers.asking
+        return any(n not in asking and self._is_at_work(n) for n in numbers)
+
+    def _at_work(self) -> set[int]:
+        return {n for n in range(1, self._instance_nb + 1) if self._is_at_work(n)}
+
+    def _is_at_work(self, number: int) -> bool:
+        peer = self.peers.get(number)
+        if peer is None or not peer.is_at_work:
+            return peer is None
+        return peer.vacant or not peer.is_lost or self._replaces(number, peer.failure)
+
+    def _accept(self) -> None:
+        """Take some of the connections that wait; a flood of them must not keep the run waiting.
+
+        Where strangers are too many one of them is dropped, by chance: whoever keeps places busy
+        cannot keep a client out that tries again.
+        """
+        for _ in range(_ACCEPTED_AT_ONCE):
+            if self._listener is None:
+                return
+            try:
+                connection, _ = self._listener.accept()
+                peer = Peer(connection, self.token)
+            except BlockingIOError:
+                return
+            except OSError:  # it was gone before it was accepted
+                continue
+            if len(self._strangers) >= _MAX_STRANGERS:
+                self._drop(secrets.choice(self._strangers))
+            self._strangers.append(peer)
+            self._selector.register(connection, selectors.EVENT_READ, peer)
+
+    def _watch(self) -> None:
+        """Drop strangers that keep silent; have the selector look for what is to be sent."""
+        for peer in [*self._strangers]:
+            if time.monotonic() - peer.heard > _HANDSHAKE_TIME:
+                self._drop(peer)
+        for peer in [*self._strangers, *self.peers.values()]:
+            if peer.has_outgoing != peer.awaits_room and not peer.gone:
+                peer.awaits_room = peer.has_outgoing
+                events = selectors.EVENT_READ | (selectors.EVENT_WRITE * peer.awaits_room)
+                self._selector.modify(peer.connection, events, peer)
+
+    def _read(self, peer: Peer) -> None:
+        turns = 0
+        try:
+            while not peer.gone:
+                turns += 1
+                frame = peer.reader.read(peer.connection)
+                if peer.handshake is None:
+                    peer.hear(whole=frame is not None)
+                if frame is not None:
+                    self._take(peer, frame)
+                if frame is None or not peer.reader.may_have_more:
+                    return
+                enough = turns >= _TURNS or len(frame.payload) > _LONG
+                if enough and not peer.reader.has_buffered:
+                    # Others want to be heard too; the selector finds what is left. And rows are
+                    # moved to their places while they are in the processor's cache.
+                    return
+        except EOFError:
+            self._drop(peer)
+        except ConnectionRefusedByPeerError as error:
+            peer.offense = str(error)
+            self._drop(peer)
+        except SampleError as error:
+            peer.failure, peer.failed_row = peer.failure or error, peer.received
+            self._drop(peer)
+
+    def _take(self, peer: Peer, frame: Frame) -> None:
+        if peer.handshake is not None:
+            self._greet(peer, frame)
+        elif frame.kind in self._dispatch:
+            self._has_news |= frame.kind is not Kind.PREDICT
+            self._dispatch[frame.kind](peer, frame)
+        else:
+            raise ConnectionRefusedByPeerError(
+                f"It sent {frame.kind.name}, which is not for a client to send now."
+            )
+
+    def _greet(self, peer: Peer, frame: Frame) -> None:
+        handshake = peer.handshake
+        if handshake is None:
+            return
+        peer.send(handshake.answer(frame))
+        wanted = handshake.instance_id
+        if wanted is None:
+            return
+        numbers = range(1, self._instance_nb + 1)
+        free = [n for n in numbers if n not in self.peers or self.peers[n].vacant]
+        if not free or (wanted and wanted not in free):
+            refusal = ConnectionRefusedByPeerError(
+                f"The server has no place for instance {wanted or 'of any number'}: of its "
+                f"{self._instance_nb} instances {free or 'none'} are free."
+            )
+            peer.send(pack(Kind.ERROR, encode_error(refusal)))
+            raise refusal
+        peer.handshake = None
+        peer.instance_id = wanted or free[0]
+        peer.reader.limit = MAX_PAYLOAD
+        self._strangers.remove(peer)
+        former = self.peers.get(peer.instance_id)
+        self.peers[peer.instance_id] = peer
+        if former is not None:
+            peer.succeed(former)
+        elif self._replaces(peer.instance_id, None):
+            peer.journal = Journal()
+        peer.send(pack(Kind.SETUP, self._setup(peer)))
+
+    def _drop(self, peer: Peer) -> None:
+        if peer.gone:
+            return
+        peer.gone = self._has_news = True
+        self._selector.unregister(peer.connection)
+        peer.connection.close()
+        if peer in self._strangers:
+            self._strangers.remove(peer)
+
+    # What clients say -----------------------------------------------------------------------
+
+    def _bye(self, peer: Peer, frame: Frame) -> None:
+        if not (self._ending or peer.failure):
+            raise ConnectionRefusedByPeerError("It said that it is done, but nobody ended the run.")
+        peer.finished = peer.failure is None
+        self._drop(peer)  # for which it waits
+
+
+def _ready(peer: Peer, frame: Frame) -> None:
+    fields = declared_fields(frame.payload)
+    if peer.fields:
+        raise ConnectionRefusedByPeerError("It defined its fields twice.")
+    check_environment_fields(fields)
+    peer.fields = fields
+
+
+def _fields(peer: Peer, frame: Frame) -> None:
+    fields = declared_fields(frame.payload)
+    if peer.has_told_fields:
+        raise ConnectionRefusedByPeerError("It told the fields of its rows twice.")
+    check_row_fields(fields, peer.fields)
+    if peer.row_fields and fields != peer.row_fields:
+        raise ConnectionRefusedByPeerError(
+            "Its rows have other fields than those of the client before it."
+        )
+    peer.row_fields, peer.has_told_fields = fields, True
+
+
+def _rows(peer: Peer, frame: Frame) -> None:
+    count = frame.number
+    if not peer.row_fields or not 0 < count <= peer.granted - peer.received:
+        raise ConnectionRefusedByPeerError(f"It sent {count} rows that nobody asked for.")
+    block = unpack_rows(frame.payload, peer.row_fields, count)
+    peer.last_step = check_rows(block, peer.instance_id, peer.last_step)
+    peer.rows.append(block, count)
+    peer.received += count
+
+
+def _wrong(peer: Peer, frame: Frame) -> None:
+    count = frame.number
+    if not peer.row_fields or not 0 < count <= peer.refusable - peer.refused.count:
+        raise ConnectionRefusedByPeerError(f"It sent {count} refused rows that nobody asked for.")
+    block = unpack_rows(frame.payload, peer.row_fields, count)
+    check_rows(block, peer.instance_id, peer.last_step)
+    peer.refused.append(block, count)
+
+
+def _again(peer: Peer, frame: Frame) -> None:
+    """Nothing is to be done: the client is heard of while it has no rows to send."""
+
+
+def _error(peer: Peer, frame: Frame) -> None:
+    peer.failure, peer.failed_row = decode_error(frame.payload), frame.number

@@ -1,0 +1,180 @@
+"""Answers: what environments in other processes ask of the run, handed to its services."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from physx_core.components.environment import Services
+from physx_core.errors import ConnectionRefusedByPeerError, PhysxError, UsageError
+from physx_core.net.frames import Frame, Kind, pack
+from physx_core.net.remote_errors import encode_error
+from physx_core.net.values import pack_value
+from physx_core.typing import Batch, Sample
+from physx_core.workers.server.peer import Peer
+from physx_core.workers.server.validation import drawing_events, named_values
+
+_MOST_UNREAD = 1 << 26
+_KEPT = "the kept parameters"
+
+Signature: TypeAlias = tuple[tuple[str, tuple[int, ...], str], ...]
+Request: TypeAlias = tuple[Peer, int, Sample]
+"""Who wants a prediction, the number of the request, and for what."""
+
+
+class Answers:
+    """Answers requests; those for predictions are collected and answered together.
+
+    Where the services have a method ``predict_batch(batch) -> batch``, requests of the same fields
+    that wait at the same moment go through it as one batch. Otherwise each goes through `predict`.
+
+    Attributes:
+        batches: Whether requests for predictions go through the services as one batch.
+    """
+
+    def __init__(self, services: Services) -> None:
+        """Keep the services.
+
+        Args:
+            services: What the environments may ask of the run.
+        """
+        self._services = services
+        self._predict_batch: Callable[[Batch], Batch] | None = getattr(
+            services, "predict_batch", None
+        )
+        self.batches = self._predict_batch is not None
+        self._waiting: list[Request] = []
+
+    @property
+    def count(self) -> int:
+        """How many instances wait for a prediction."""
+        return len(self._waiting)
+
+    @property
+    def asking(self) -> set[int]:
+        """The instances that wait for a prediction."""
+        return {peer.instance_id for peer, _, _ in self._waiting}
+
+    def take(self, peer: Peer, frame: Frame) -> None:
+        """Answer a request, or keep it for `predict`.
+
+        Whatever the services raise goes back to the environment if it is an error of physx, and on
+        to the caller otherwise. A request that a client before this one made gets the same answer.
+
+        Raises:
+            ConnectionRefusedByPeerError: The requests are not numbered from 1, are malformed, or
+                answers to others before it are not read.
+        """
+        if frame.kind is not Kind.SHOW:
+            if peer.unread > _MOST_UNREAD:
+                raise ConnectionRefusedByPeerError("It asks, but does not read the answers.")
+            peer.requests += 1
+            if frame.number != peer.requests:
+                raise ConnectionRefusedByPeerError("It numbered its requests wrongly.")
+            recorded = peer.journal.answer(frame.number) if peer.journal is not None else None
+            if recorded is not None:
+                peer.send_once(recorded)
+                return
+        if frame.kind is Kind.PREDICT:
+            self._keep(peer, frame)
+        elif frame.kind is Kind.SAVE:
+            values = named_values(frame.payload)
+            save = self._services.save_parameters
+            self._answer(peer, frame.number, _KEPT, save, peer.instance_id, values)
+        elif frame.kind is Kind.LOAD:
+            load = self._services.load_parameters
+            self._answer(peer, frame.number, _KEPT, load, peer.instance_id)
+        else:
+            events = drawing_events(frame.payload)
+            peer.shown += 1
+            self._services.show(peer.instance_id, frame.number, events)
+
+    def _keep(self, peer: Peer, frame: Frame) -> None:
+        """Keep a request for `predict`, in the place of one that its environment gave up."""
+        sample = named_values(frame.payload)
+        for name, value in sample.items():
+            try:
+                if isinstance(value, (list, tuple)):
+                    np.asarray(value)
+            except ValueError:
+                refusal = UsageError(f'get_prediction() got "{name}", which is no array.')
+                peer.send(pack(Kind.REFUSAL, encode_error(refusal), frame.number))
+                return
+        if self._waiting:
+            self.forget(peer)
+        self._waiting.append((peer, frame.number, sample))
+
+    def forget(self, peer: Peer) -> None:
+        """Forget the requests of a client that is lost."""
+        self._waiting = [request for request in self._waiting if request[0] is not peer]
+
+    def predict(self) -> bool:
+        """Answer the requests for predictions that wait; return whether all answers are sent."""
+        waiting, self._waiting = self._waiting, []
+        if len(waiting) == 1:
+            ((peer, number, sample),) = waiting
+            self._answer(peer, number, "the prediction", self._services.predict, sample)
+            return not peer.has_outgoing
+        groups: dict[Signature | int, list[Request]] = {}
+        for place, request in enumerate(sorted(waiting, key=lambda one: one[0].instance_id)):
+            key = place if self._predict_batch is None else _signature(request[2])
+            groups.setdefault(key, []).append(request)
+        for requests in groups.values():
+            self._predict_group(requests)
+        return not any(peer.has_outgoing for peer, _, _ in waiting)
+
+    def _predict_group(self, requests: list[Request]) -> None:
+        try:
+            messages = [
+                pack_value(Kind.ANSWER, prediction, "the prediction", number)
+                for (_, number, _), prediction in zip(
+                    requests, self._predictions(requests), strict=True
+                )
+            ]
+        except PhysxError as error:
+            for peer, number, _ in requests:
+                peer.send(pack(Kind.REFUSAL, encode_error(error), number))
+            return
+        except Exception as error:
+            numbers = ", ".join(str(peer.instance_id) for peer, _, _ in requests)
+            error.add_note(f"while the prediction for instance {numbers} was made")
+            raise
+        for (peer, _, _), message in zip(requests, messages, strict=True):
+            peer.send(message)
+
+    def _predictions(self, requests: list[Request]) -> list[Sample]:
+        if self._predict_batch is None or len(requests) == 1:
+            return [self._services.predict(sample) for _, _, sample in requests]
+        samples = [sample for _, _, sample in requests]
+        batch = {name: np.stack([np.asarray(one[name]) for one in samples]) for name in samples[0]}
+        predicted = {name: np.asarray(array) for name, array in self._predict_batch(batch).items()}
+        for name, array in predicted.items():
+            if array.shape[:1] != (len(samples),):
+                raise UsageError(
+                    f'The prediction of "{name}" for {len(samples)} samples has shape '
+                    f"{array.shape}; its first axis must have that length."
+                )
+        return [
+            {name: array[place] for name, array in predicted.items()}
+            for place in range(len(samples))
+        ]
+
+    def _answer(
+        self, peer: Peer, number: int, what: str, act: Callable[..., Any], *args: Any
+    ) -> None:
+        """Answer a request with what `act` returns for some arguments."""
+        try:
+            message = pack_value(Kind.ANSWER, act(*args), what, number)
+        except PhysxError as error:
+            message = pack(Kind.REFUSAL, encode_error(error), number)
+        except Exception as error:
+            error.add_note(f"while {what} for instance {peer.instance_id} was made")
+            raise
+        peer.send(message)
+
+
+def _signature(sample: Sample) -> Signature:
+    arrays = ((name, np.asarray(value)) for name, value in sorted(sample.items()))
+    return tuple((name, array.shape, array.dtype.str) for name, array in arrays)

@@ -1,0 +1,165 @@
+"""Claims: what a client says about its rows, checked before any of it is believed.
+
+A client knows the token, but it may be broken or of another make: what it sends is taken only
+where it fits what it said before.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from physx_core.components.scene import Event
+from physx_core.errors import ConfigError, ConnectionRefusedByPeerError, NotFiniteError
+from physx_core.fields import RESERVED, Field, is_finite
+from physx_core.net.frames import MAX_PAYLOAD
+from physx_core.net.values import decode
+from physx_core.rows import ROW_FIELDS
+from physx_core.typing import Batch
+
+_DTYPE = re.compile(r"[<>|=]?[biufc]\d{1,2}")
+_ROLES = ("training", "additional")
+_ACTIONS = ("add", "update")
+
+
+def declared_fields(payload: bytes | bytearray) -> list[Field]:
+    """Return the fields that a message lists.
+
+    Raises:
+        ConnectionRefusedByPeerError: It lists something else, no fields, or a name twice.
+    """
+    plain = decode(payload)
+    try:
+        if not isinstance(plain, list) or not all(map(_is_field, plain)):
+            raise ConfigError("one is described in an unknown way.")
+        fields = [Field.from_dict(one) for one in plain]
+    except ConfigError as error:
+        raise ConnectionRefusedByPeerError(f"Its fields are none: {error}") from error
+    if not fields or len({field.name for field in fields}) < len(fields):
+        raise ConnectionRefusedByPeerError("It listed no fields, or one twice.")
+    return fields
+
+
+def _is_field(plain: Any) -> bool:
+    if not isinstance(plain, dict) or not {"name", "dtype"} <= plain.keys():
+        return False
+    dtype, shape = plain["dtype"], plain.get("shape", [])
+    return (
+        isinstance(dtype, str)
+        and _DTYPE.fullmatch(dtype) is not None
+        and isinstance(shape, list)
+        and all(type(size) is int for size in shape)
+        and isinstance(plain.get("unit", ""), str)
+        and plain.get("role", "training") in _ROLES
+    )
+
+
+def check_environment_fields(fields: Sequence[Field]) -> None:
+    """Check the fields that an environment is said to define.
+
+    Raises:
+        ConnectionRefusedByPeerError: One has a name that physx fills itself.
+    """
+    reserved = [field.name for field in fields if field.name in RESERVED]
+    if reserved:
+        raise ConnectionRefusedByPeerError(f'It defined the reserved field "{reserved[0]}".')
+
+
+def check_row_fields(fields: Sequence[Field], environment: Sequence[Field]) -> None:
+    """Check the fields that rows are said to have.
+
+    Args:
+        fields: Fields of the rows.
+        environment: Fields that the environment defined before; open shapes may be known now.
+
+    Raises:
+        ConnectionRefusedByPeerError: They are others, have an open shape, or a row of them is
+            longer than a message may be.
+    """
+    expected = [*environment, *ROW_FIELDS]
+    if len(fields) != len(expected):
+        raise ConnectionRefusedByPeerError(
+            f"Its rows have {len(fields)} fields, but it defined {len(expected)}."
+        )
+    for field, known in zip(fields, expected, strict=True):
+        shape = field.shape if known.shape is None else known.shape
+        if field.shape is None or field != replace(known, shape=shape):
+            raise ConnectionRefusedByPeerError(f"Its rows have {field}, but it defined {known}.")
+    size = sum(field.nbytes for field in fields)
+    if size > MAX_PAYLOAD:
+        raise ConnectionRefusedByPeerError(f"Its rows have {size} bytes; {MAX_PAYLOAD} are taken.")
+
+
+def named_values(payload: bytes | bytearray) -> dict[str, Any]:
+    """Return the values of a request, by name.
+
+    Raises:
+        ConnectionRefusedByPeerError: The message holds something else.
+    """
+    values = decode(payload)
+    if not isinstance(values, dict) or not {*map(type, values)} <= {str}:
+        raise ConnectionRefusedByPeerError("It sent a request that is no dictionary of names.")
+    return values
+
+
+def drawing_events(payload: bytes | bytearray) -> list[Event]:
+    """Return the drawing events of a message.
+
+    Raises:
+        ConnectionRefusedByPeerError: It holds something else.
+    """
+    plain = decode(payload)
+    if not isinstance(plain, list) or not all(map(_is_event, plain)):
+        raise ConnectionRefusedByPeerError("It sent drawing events that are none.")
+    return [Event(*parts) for parts in plain]
+
+
+def _is_event(parts: Any) -> bool:
+    return (
+        isinstance(parts, tuple)
+        and [type(part) for part in parts] == [str, str, str, dict]
+        and parts[0] in _ACTIONS
+        and all(type(name) is str for name in parts[3])
+    )
+
+
+def check_rows(block: Batch, instance_id: int, last_step: int) -> int:
+    """Check rows that arrived, as the client must have done before it sent them.
+
+    Args:
+        block: Rows of a client, at least one.
+        instance_id: The client's instance.
+        last_step: Step of its last row before these, -1 for none.
+
+    Returns:
+        Step of the last row.
+
+    Raises:
+        ConnectionRefusedByPeerError: They are not of this instance, or their steps do not rise.
+        NotFiniteError: One holds NaN or an infinite number.
+    """
+    steps, numbers = block["step"], block["env_id"]
+    several = len(steps) > 1
+    if numbers[0] != instance_id or (several and (numbers != instance_id).any()):
+        raise ConnectionRefusedByPeerError("It sent rows of another instance.")
+    if steps[0] <= last_step or (several and (steps[1:] <= steps[:-1]).any()):
+        raise ConnectionRefusedByPeerError("It sent rows whose steps do not rise.")
+    for name, values in block.items():
+        kind = values.dtype.kind
+        if kind == "b" and values.tobytes().translate(None, b"\0\1"):
+            raise ConnectionRefusedByPeerError(
+                f'It sent rows whose field "{name}" is neither true nor false.'
+            )
+        if kind in "fc" and not is_finite(values):
+            row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
+            raise NotFiniteError(
+                f'field "{name}" holds NaN or an infinite number.',
+                field=name,
+                instance_id=instance_id,
+                step=int(steps[row]),
+            )
+    return int(steps[-1])

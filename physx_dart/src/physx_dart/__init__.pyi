@@ -1,0 +1,8 @@
+"""physx plugins `dart` and `pinocchio`: simulations of robots, and environments with them."""
+
+from .dart.simulation import DartBackend as DartBackend
+from .environments.arm import DartArm as DartArm
+from .environments.arm import PinocchioArm as PinocchioArm
+from .environments.double_pendulum import DartDoublePendulum as DartDoublePendulum
+from .environments.double_pendulum import PinocchioDoublePendulum as PinocchioDoublePendulum
+from .pinocchio.simulation import PinocchioBackend as PinocchioBackend

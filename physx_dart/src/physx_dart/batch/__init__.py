@@ -1,0 +1,1 @@
+"""Batched forward dynamics, in one process or several."""

@@ -1,0 +1,110 @@
+"""A process that computes rows of batches for another one: ``python -m physx_dart.batch.worker``.
+
+It is told the models once, then which rows to compute. The rows lie in memory that both processes
+map, and so do the results. It ends when the other process closes the connection or is gone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import mmap
+import os
+import socket
+import struct
+import sys
+
+import numpy as np
+import pinocchio
+
+from physx_core.typing import Vector
+from physx_dart.batch.batches import Batches, MoverBatches
+from physx_dart.pinocchio.resistance import Resistance
+
+FORWARD, GRADIENTS = range(2)
+REQUEST = struct.Struct("<4q")
+"""`FORWARD` or `GRADIENTS`; rows of the batch; the first to compute, and the first after those."""
+DONE = b"."
+"""Answer to each request."""
+
+
+class SharedRows:
+    """Rows of states and results in a file that several processes map; it grows as needed.
+
+    Attributes:
+        file: Descriptor of the file.
+    """
+
+    def __init__(self, file: int, nq: int, nv: int) -> None:
+        """Keep what is mapped.
+
+        Args:
+            file: Descriptor of the file; it must stay open.
+            nq: Length of the positions.
+            nv: Length of the velocities.
+        """
+        self.file, self._nq, self._nv = file, nq, nv
+        self._numbers = np.empty(0)
+
+    def arrays(self, kind: int, rows: int) -> tuple[tuple[Vector, ...], Vector]:
+        """Return what `computed` takes and returns for a batch, as parts of the file."""
+        begin = rows * self._nq
+        size = begin + 6 * rows * self._nv
+        if size > len(self._numbers):
+            if os.fstat(self.file).st_size < 8 * size:
+                os.ftruncate(self.file, 8 * size)
+            self._numbers = np.frombuffer(mmap.mmap(self.file, 8 * size), np.float64)
+        positions = self._numbers[:begin].reshape(rows, self._nq)
+        others = self._numbers[begin:size].reshape(6, rows, self._nv)
+        if kind == FORWARD:
+            return (positions, *others[:2]), others[3]
+        return (positions, *others[:3]), others[3:]
+
+
+def computed(batches: Batches, kind: int, states: tuple[Vector, ...]) -> Vector:
+    """Return the accelerations, shape (n, nv), or the gradients, shape (3, n, nv), of states."""
+    return (batches.forward if kind == FORWARD else batches.gradients)(*states)
+
+
+def described(batches: Batches) -> bytes:
+    """Return a line of text that `batches_of` makes the same batches from; it holds no code."""
+    movers = [
+        (each.model.saveToString(), each.resistance.table.tolist()) for each in batches.movers
+    ]
+    return json.dumps(movers).encode("ascii") + b"\n"
+
+
+def batches_of(line: bytes) -> Batches:
+    """Return the batches that a line of `described` says."""
+    movers = []
+    for text, table in json.loads(line):
+        model = pinocchio.Model()
+        model.loadFromString(text)
+        movers.append(MoverBatches(model, Resistance(np.array(table).reshape(5, model.nv))))
+    return Batches(movers)
+
+
+def serve(link: socket.socket, file: int) -> None:
+    """Compute rows until the other process closes the connection.
+
+    Args:
+        link: Connection to the process that has the batches.
+        file: Descriptor of the memory in which they lie.
+    """
+    with link, link.makefile("rb") as requests:
+        line = requests.readline()
+        if not line.endswith(b"\n"):
+            return
+        batches = batches_of(line)
+        memory = SharedRows(file, batches.nq, batches.nv)
+        while len(request := requests.read(REQUEST.size)) == REQUEST.size:
+            kind, rows, begin, end = REQUEST.unpack(request)
+            states, found = memory.arrays(kind, rows)
+            mine = tuple(each[begin:end] for each in states)
+            found[..., begin:end, :] = computed(batches, kind, mine)
+            link.sendall(DONE)
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(ConnectionError):  # the other process is gone
+        serve(socket.socket(fileno=0), int(sys.argv[1]))

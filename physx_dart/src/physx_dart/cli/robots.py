@@ -1,0 +1,58 @@
+"""``physx robots``: list the robots that a world may name, and their collision shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from physx_core import PhysxError, plugins
+from physx_core.errors import UsageError
+from physx_core.simulation import RobotInfo
+
+_HELP = """usage: physx robots
+
+Lists the robots that can be given by name, as in Robot("cartpole"), with the degrees of freedom of
+their joints (a floating base has 6 more), their mass, and what of them touches other things. Where
+meshes do, Robot(collisions="boxes") or "capsules" is many times faster."""
+
+
+def run(words: Sequence[str]) -> None:
+    """Print each robot that an installed backend knows by name.
+
+    Raises:
+        UsageError: There are words after the command.
+    """
+    if words and words[0] in ("-h", "--help"):
+        print(_HELP)
+        return
+    if words:
+        raise UsageError(f"physx robots takes no options, not {' '.join(words)}.")
+    robots = {info.path: info for info in _robots()}
+    if not robots:
+        print("No installed backend knows robots by name. To install one: pip install physx-dart")
+        return
+    _print_table(list(robots.values()))
+
+
+def _robots() -> Iterator[RobotInfo]:
+    """Return the robots of all backends; of one that is broken just its error is printed."""
+    for name in plugins.available():
+        try:
+            backends = plugins.load(name).components.get("backend", {})
+            for key in backends:
+                yield from plugins.resolve("backend", f"{name}/{key}").robots()
+        except PhysxError as error:
+            print(f"{name}  broken: {error}")
+
+
+def _print_table(robots: Sequence[RobotInfo]) -> None:
+    width = max(len(info.name) for info in robots)
+    print(f"{'name':{width}}  dof  mass [kg]  collisions")
+    for info in robots:
+        if info.error:
+            reason = info.error.splitlines()[0].rstrip(":")
+            print(f"{info.name:{width}}  cannot be loaded: {reason}")
+            continue
+        line = f"{info.name:{width}}  {info.joints:3}  {info.mass:9.4g}  {info.collisions:10}"
+        print(f"{line}  {info.warning}".rstrip())
+    if any(info.warning for info in robots):
+        print('slow: with Robot(collisions="boxes") or "capsules" each mesh is its bounding shape')

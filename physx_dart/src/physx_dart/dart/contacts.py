@@ -1,0 +1,70 @@
+"""Reading DART's contacts and rays into arrays at once; DART's own objects never leave here."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from dartpy import collision
+
+from physx_core.simulation import CONTACT, RAY_HIT
+from physx_core.typing import Records, Vector
+
+
+class ContactReader:
+    """What touches in a world of DART.
+
+    Args:
+        world: The world; it must live as long as this reader.
+        bodies: DART's bodies in the order of `Layout.names`.
+        period: Length of a physics step, in s.
+    """
+
+    def __init__(self, world: Any, bodies: list[Any], period: float) -> None:
+        self._world = world
+        # As long as Python's objects for them are kept, DART gives the same ones again.
+        self._bodies = {body: place for place, body in enumerate(bodies)}
+        self._places: dict[Any, int] = {}
+
+    def contacts(self) -> Records:
+        """Return the contacts of the last step: an array of `CONTACT` records."""
+        found = self._world.getLastCollisionResult().getContacts()
+        records = np.zeros(len(found), CONTACT)
+        bodies_a, bodies_b = records["body_a"], records["body_b"]
+        points, forces, normals = records["point"], records["force"], records["normal"]
+        depths = records["depth"]
+        for row, contact in enumerate(found):
+            first = self._place(contact.collisionObject1)
+            second = self._place(contact.collisionObject2)
+            if first <= second:
+                bodies_a[row], bodies_b[row] = first, second
+                forces[row], normals[row] = contact.force, contact.normal
+            else:
+                bodies_a[row], bodies_b[row] = second, first
+                forces[row], normals[row] = -contact.force, -contact.normal
+            points[row], depths[row] = contact.point, contact.penetrationDepth
+        return records
+
+    def raycast(self, begins: Vector, ends: Vector) -> Records:
+        """Return what rays meet first: an array of `RAY_HIT` records."""
+        records = np.zeros(len(begins), RAY_HIT)
+        records["body"] = -1
+        group = self._world.getConstraintSolver().getCollisionGroup()
+        option = collision.RaycastOption()
+        option.mSortByClosest = True
+        for record, begin, end in zip(records, begins, ends, strict=True):
+            result = collision.RaycastResult()
+            if not group.raycast(begin, end, option, result) or not result.hasHit():
+                continue
+            hit = result.mRayHits[0]
+            record["hit"], record["body"] = True, self._place(hit.mCollisionObject)
+            record["point"], record["normal"] = hit.mPoint, hit.mNormal
+            record["fraction"] = hit.mFraction
+        return records
+
+    def _place(self, collision_object: Any) -> int:
+        place = self._places.get(collision_object)
+        if place is None:
+            place = self._bodies[collision_object.getShapeFrame().getBodyNode()]
+            self._places[collision_object] = place
+        return place

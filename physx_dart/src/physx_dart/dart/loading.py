@@ -1,0 +1,203 @@
+"""Making DART's skeletons: of robots, objects and the ground, with their collision shapes."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from dartpy import dynamics, utils
+
+from physx_core.errors import ModelError
+from physx_core.simulation import Ground, HeightField, Stairs
+from physx_core.typing import Vector
+from physx_dart.shared.parts import Mover, Static
+from physx_dart.shared.rotations import matrix_from_quaternion
+from physx_dart.shared.shapes import Shape
+
+WORLD = "world"
+ROOT = "physx root"
+"""Name that DART gets for a root link `world`, which it would leave out."""
+GROUND_SIZE = (1000.0, 1000.0, 10.0)
+"""Of the box that stands for an endless plane, in m. DART finds one point only where a box touches
+a plane, but the corners where it touches a box."""
+
+_MESH = (
+    '<robot name="mesh"><link name="mesh"><collision><geometry><mesh filename="{}"/>'
+    "</geometry></collision></link></robot>"
+)
+
+
+def load_skeleton(mover: Mover) -> dynamics.Skeleton:
+    """Return the skeleton of a robot or object, without shapes.
+
+    Raises:
+        ModelError: DART cannot load it; the error holds what DART says.
+    """
+    model, text = mover.model, mover.model.text
+    if model.links[0] == WORLD:
+        text = text.replace(f'link="{WORLD}"', f'link="{ROOT}"')
+        text = text.replace(f'<link name="{WORLD}">', f'<link name="{ROOT}">')
+    skeleton = _parsed(text, mover.fixed_base, str(model.path))
+    if mover.fixed_base:
+        place = _transform(mover.position, matrix_from_quaternion(np.array(mover.orientation)))
+        skeleton.getRootJoint().setTransformFromParentBodyNode(place)
+    skeleton.setName(mover.name)
+    return skeleton
+
+
+def link_name(link: str) -> str:
+    """Return the name that a link has in DART."""
+    return ROOT if link == WORLD else link
+
+
+def attach_shapes(skeleton: dynamics.Skeleton, shapes: Sequence[Shape]) -> None:
+    """Give a skeleton's bodies the shapes that touch things.
+
+    Raises:
+        ModelError: A mesh cannot be loaded.
+    """
+    for shape in shapes:
+        body = skeleton.getBodyNode(link_name(shape.body))
+        if body is None:  # an object has one body only
+            body = skeleton.getBodyNode(0)
+        _attach(body, _dart_shape(shape), shape, _transform(shape.position, shape.rotation))
+
+
+def static_skeleton(static: Static) -> dynamics.Skeleton:
+    """Return a skeleton that never moves, of a shape or of the ground.
+
+    Raises:
+        ModelError: A mesh cannot be loaded.
+    """
+    skeleton = dynamics.Skeleton(static.name)
+    joint, body = skeleton.createWeldJointAndBodyNodePair()
+    rotation = matrix_from_quaternion(np.array(static.orientation))
+    joint.setTransformFromParentBodyNode(_transform(static.position, rotation))
+    what = static.what
+    if isinstance(what, Shape):
+        _attach(body, _dart_shape(what), what, _transform(what.position, what.rotation))
+    elif isinstance(what, HeightField):
+        _attach(body, _height_shape(what), what, np.eye(4))
+    else:
+        for size, place in _ground_boxes(what):
+            _attach(body, dynamics.BoxShape(list(size)), what, place)
+    return skeleton
+
+
+def _ground_boxes(ground: Ground | Stairs) -> list[tuple[Sequence[float], Vector]]:
+    normal = np.array(ground.normal if isinstance(ground, Ground) else (0.0, 0.0, 1.0))
+    height = ground.height if isinstance(ground, Ground) else 0.0
+    center = (height - 0.5 * GROUND_SIZE[2]) * normal
+    boxes: list[tuple[Sequence[float], Vector]] = [
+        (GROUND_SIZE, _transform(center, _axes_along(normal)))
+    ]
+    if isinstance(ground, Stairs):
+        boxes += [(size, _transform(place, np.eye(3))) for place, size in ground.boxes()]
+    return boxes
+
+
+def _axes_along(normal: Vector) -> Vector:
+    """Return a rotation matrix whose last column is a direction."""
+    if normal[2] > 1 - 1e-15:
+        return np.eye(3)
+    other = np.eye(3)[int(np.argmin(np.abs(normal)))]
+    first = np.cross(other, normal)
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(normal, first), normal])
+
+
+def _attach(
+    body: dynamics.BodyNode,
+    shape: object,
+    material: Shape | Ground | Stairs | HeightField,
+    place: Vector,
+) -> None:
+    node = body.createShapeNode(shape)
+    node.setRelativeTransform(place)
+    node.createCollisionAspect()
+    aspect = node.createDynamicsAspect()
+    aspect.setFrictionCoeff(float(material.friction))
+    aspect.setRestitutionCoeff(float(material.restitution))
+
+
+def _dart_shape(shape: Shape) -> Any:
+    size = list(shape.size)
+    if shape.mesh is not None:
+        loaded = _loaded_mesh(shape.mesh)
+        loaded.setScale(size)
+        return loaded
+    if shape.kind == "box":
+        return dynamics.BoxShape(size)
+    if shape.kind == "sphere":
+        return dynamics.SphereShape(*size)
+    if shape.kind == "capsule":
+        return dynamics.CapsuleShape(*size)
+    return dynamics.CylinderShape(*size)
+
+
+def _loaded_mesh(path: Path) -> Any:
+    text = _MESH.format(str(path).replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;"))
+    skeleton = _parsed(text, True, str(path))
+    for node in skeleton.getBodyNode(0).getShapeNodes():
+        return node.getShape()
+    raise ModelError(f"DART finds no mesh in {path}.")
+
+
+def _height_shape(field: HeightField) -> Any:
+    """Return a mesh of a height field, by way of a file, since DART takes none otherwise."""
+    nx, ny = field.heights.shape
+    x0, y0 = field.corner()
+    lines = [
+        f"v {x0 + i * field.spacing[0]!r} {y0 + j * field.spacing[1]!r} {float(z)!r}"
+        for (i, j), z in np.ndenumerate(field.heights)
+    ]
+    for i in range(nx - 1):
+        for j in range(ny - 1):
+            a, b = i * ny + j + 1, (i + 1) * ny + j + 1
+            lines += [f"f {a} {b} {b + 1}", f"f {a} {b + 1} {a + 1}"]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "heights.obj"
+        path.write_text("\n".join(lines) + "\n", encoding="ascii")
+        return _loaded_mesh(path)
+
+
+def _transform(position: Sequence[float] | Vector, rotation: Vector) -> Vector:
+    transform = np.zeros((4, 4))
+    transform[:3, :3], transform[:3, 3], transform[3, 3] = rotation, position, 1.0
+    return transform
+
+
+def _parsed(text: str, fixed_base: bool, origin: str) -> dynamics.Skeleton:
+    options = utils.DartLoaderOptions()
+    kind = utils.DartLoaderRootJointType
+    options.mDefaultRootJointType = kind.FIXED if fixed_base else kind.FLOATING
+    loader = utils.DartLoader()
+    loader.setOptions(options)
+    with _captured_messages() as messages:
+        skeleton = loader.parseSkeletonString(text, "")
+    if skeleton is None:
+        raise ModelError(f"DART cannot load {origin}.{''.join(messages)}")
+    return skeleton
+
+
+@contextmanager
+def _captured_messages() -> Iterator[list[str]]:
+    """Collect what native code of this process writes to standard error meanwhile."""
+    messages: list[str] = []
+    sys.stderr.flush()
+    saved = os.dup(2)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield messages
+        finally:
+            os.dup2(saved, 2)
+            os.close(saved)
+            file.seek(0)
+            messages.append(" It says: " + file.read().decode(errors="replace").strip())

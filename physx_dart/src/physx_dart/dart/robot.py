@@ -1,0 +1,231 @@
+"""One robot or object in DART."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from dartpy import dynamics
+
+from physx_core.simulation.rotations import turned_back
+from physx_core.typing import Vector
+from physx_dart.dart.loading import link_name, load_skeleton
+from physx_dart.shared.engine import RobotEngine
+from physx_dart.shared.parts import Mover
+from physx_dart.shared.rotations import (
+    base_accelerations,
+    matrix_from_quaternion,
+    poses_from_matrices,
+    quaternion_of,
+    vector_from_quaternion,
+)
+from physx_dart.shared.urdf import Joint
+
+_ACTUATORS = {
+    "force": dynamics.ActuatorType.FORCE,
+    "servo": dynamics.ActuatorType.SERVO,
+    "velocity": dynamics.ActuatorType.VELOCITY,
+    "position": dynamics.ActuatorType.SERVO,
+}
+
+
+class DartRobot(RobotEngine):
+    """A skeleton of DART, and a second one on which states are computed without moving the first.
+
+    Attributes:
+        skeleton: The skeleton that is simulated.
+        bodies: Its body of each link.
+    """
+
+    def __init__(self, mover: Mover, gravity: tuple[float, ...]) -> None:
+        super().__init__(mover)
+        self.skeleton = load_skeleton(mover)
+        self._gravity = gravity
+        self._made_shadow: Any = None
+        joints = [self.skeleton.getJoint(joint.name) for joint in self.model.joints]
+        places = [joint.getIndexInSkeleton(0) for joint in joints]
+        self._native = np.array([*range(self.base), *places], dtype=np.intp)
+        self._sorted = bool((self._native == np.arange(self.nv)).all())
+        self.bodies = [self.skeleton.getBodyNode(link_name(link)) for link in self.model.links]
+        for joint, native in zip(self.model.joints, joints, strict=True):
+            _configure(joint, native)
+        self._held = np.zeros(self.nv)
+        self._read()
+
+    def hold(self, commands: Vector) -> None:
+        """Hold commands, shape (joints,), that are within their limits."""
+        if self.base or not self._sorted:
+            if self._sorted:
+                self._held[self.base :] = commands
+            else:
+                self._held[self._native[self.base :]] = commands
+            commands = self._held
+        if self.nv > self.base:
+            self.skeleton.setCommands(commands)
+
+    def _read(self) -> None:
+        """Take the state from DART; to be called after each change of it."""
+        self._q, self._v = self.skeleton.getPositions(), self.skeleton.getVelocities()
+        self._quaternion: tuple[float, ...] | None = None
+        self._twist: Vector | None = None
+
+    def _attitude(self) -> tuple[float, ...]:
+        """Return the base's quaternion x, y, z, w."""
+        if self._quaternion is None:
+            self._quaternion = quaternion_of(*self._q[:3].tolist())
+        return self._quaternion
+
+    def positions(self) -> Vector:
+        """Return the present positions, shape (nq,), in a vector of its own."""
+        q = self._q if self._sorted else self._q[self._native]
+        if not self.base:
+            return q.copy()
+        found = np.empty(self.nq)
+        found[:7], found[7:] = (*q[3:6].tolist(), *self._attitude()), q[6:]
+        return found
+
+    def velocities(self) -> Vector:
+        """Return the present velocities, shape (nv,), in a vector of its own."""
+        if self._twist is None:
+            v = self._v if self._sorted else self._v[self._native]
+            self._twist = self._in_base(v.copy()) if self.base else v
+        return self._twist.copy()
+
+    def accelerations(self) -> Vector:
+        """Return the accelerations of the last step, shape (nv,)."""
+        a = self._ordered(self.skeleton.getAccelerations())
+        if not self.base:
+            return a
+        x, y, z, *linear = a[:6].tolist()
+        attitude = self._attitude()
+        change = base_accelerations(attitude, linear, self.velocities())
+        a[:6] = (*change, *turned_back(attitude, x, y, z))
+        return a
+
+    def _in_base(self, v: Vector) -> Vector:
+        """Turn a base's angular and linear motion in the world into linear, angular in its own."""
+        x, y, z, a, b, c = v[:6].tolist()
+        attitude = self._attitude()
+        v[:6] = (*turned_back(attitude, a, b, c), *turned_back(attitude, x, y, z))
+        return v
+
+    def write(self, positions: Vector, velocities: Vector) -> None:
+        """Set the state."""
+        self._place(self.skeleton, positions, velocities)
+        self._read()
+
+    def native(self) -> tuple[Vector, Vector]:
+        """Return the state exactly as DART has it, copied."""
+        return self._q.copy(), self._v.copy()
+
+    def set_native(self, positions: Vector, velocities: Vector) -> None:
+        """Set the state to what `native` returned."""
+        self.skeleton.setPositions(positions)
+        self.skeleton.setVelocities(velocities)
+        self._read()
+
+    def speed(self) -> float:
+        """Return the length of the velocities; NaN or inf where the state is broken."""
+        self._read()
+        q, v = self._q, self._v
+        return math.sqrt(v.dot(v)) if math.isfinite(q.dot(q)) else math.nan
+
+    def can_move(self, link: int) -> bool:
+        """Return whether a link, by its place in the model, can move at all."""
+        return self.bodies[link].getNumDependentGenCoords() > 0
+
+    def push(self, link: int, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
+        """Add a wrench for the next steps until `release`."""
+        body = self.bodies[link]
+        body.addExtForce(force, point, local, True)
+        body.addExtTorque(torque, local)
+
+    def release(self) -> None:
+        """End all wrenches."""
+        self.skeleton.clearExternalForces()
+
+    @property
+    def _shadow(self) -> Any:
+        if self._made_shadow is None:
+            self._made_shadow = load_skeleton(self.mover)
+            self._made_shadow.setGravity(list(self._gravity))
+            self._links = [
+                self._made_shadow.getBodyNode(link_name(link)) for link in self.model.links
+            ]
+        return self._made_shadow
+
+    def poses(self, positions: Vector) -> Vector:
+        """Return the poses of all links in positions, shape (links, 7)."""
+        self._place(self._shadow, positions, np.zeros(self.nv))
+        transforms = [body.getWorldTransform().matrix() for body in self._links]
+        return poses_from_matrices(np.array(transforms))
+
+    def forward(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
+        """Return the accelerations that torques cause, resistance included."""
+        rotation = self._place(self._shadow, positions, velocities)
+        forces = torques - self.resistance.torques(positions, velocities)
+        if rotation is not None:
+            forces = np.concatenate([rotation @ forces[3:6], rotation @ forces[:3], forces[6:]])
+        self._shadow.setForces(self._reordered(forces))
+        self._shadow.computeForwardDynamics()
+        a = self._ordered(self._shadow.getAccelerations())
+        if rotation is not None:
+            linear = a[3:6] @ rotation - np.cross(velocities[3:6], velocities[:3])
+            a = np.concatenate([linear, a[:3] @ rotation, a[6:]])
+        return a
+
+    def inverse(self, positions: Vector, velocities: Vector, accelerations: Vector) -> Vector:
+        """Return the torques that cause accelerations, resistance included."""
+        rotation = self._place(self._shadow, positions, velocities)
+        a = accelerations
+        if rotation is not None:
+            linear = rotation @ (a[:3] + np.cross(velocities[3:6], velocities[:3]))
+            a = np.concatenate([rotation @ a[3:6], linear, a[6:]])
+        self._shadow.setAccelerations(self._reordered(a))
+        self._shadow.computeInverseDynamics(False, False, False)
+        forces = self._ordered(self._shadow.getForces())
+        if rotation is not None:
+            forces = np.concatenate([forces[3:6] @ rotation, forces[:3] @ rotation, forces[6:]])
+        return forces + self.resistance.torques(positions, velocities)
+
+    def _place(self, skeleton: Any, positions: Vector, velocities: Vector) -> Vector | None:
+        """Set a skeleton's state; return the base's rotation matrix, None for a fixed base."""
+        rotation = None
+        if not self.fixed_base:
+            quaternion = positions[3:7] / np.linalg.norm(positions[3:7])
+            rotation = matrix_from_quaternion(quaternion)
+            vector = vector_from_quaternion(quaternion)
+            positions = np.concatenate([vector, positions[:3], positions[7:]])
+            twist = velocities
+            velocities = np.concatenate([rotation @ twist[3:6], rotation @ twist[:3], twist[6:]])
+        skeleton.setPositions(self._reordered(positions))
+        skeleton.setVelocities(self._reordered(velocities))
+        return rotation
+
+    def _ordered(self, native: Vector) -> Vector:
+        return native if self._sorted else native[self._native]
+
+    def _reordered(self, vector: Vector) -> Vector:
+        if self._sorted:
+            return vector
+        native = np.empty(self.nv)
+        native[self._native] = vector
+        return native
+
+
+def _configure(joint: Joint, native: Any) -> None:
+    """Give a joint of DART its limits, resistance and actuator."""
+    settings = joint.settings
+    native.setPositionLowerLimit(0, joint.lower)
+    native.setPositionUpperLimit(0, joint.upper)
+    native.setVelocityLowerLimit(0, -joint.max_velocity)
+    native.setVelocityUpperLimit(0, joint.max_velocity)
+    native.setForceLowerLimit(0, -joint.max_torque)
+    native.setForceUpperLimit(0, joint.max_torque)
+    native.setLimitEnforcement(True)
+    native.setDampingCoefficient(0, joint.damping)
+    native.setCoulombFriction(0, joint.friction)
+    native.setSpringStiffness(0, settings.stiffness)
+    native.setRestPosition(0, settings.rest)
+    native.setActuatorType(_ACTUATORS[settings.mode])

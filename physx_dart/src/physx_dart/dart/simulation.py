@@ -1,0 +1,182 @@
+"""The engine DART. All calls of dartpy are in the modules whose names begin with `dart_`.
+
+DART integrates with semi-implicit Euler: velocities first, then positions with the new velocities.
+Damping and springs are implicit; contacts, position and velocity limits, servos and Coulomb
+friction are constraints of its solver.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import dartpy
+from dartpy import constraint
+from dartpy.simulation import CollisionDetectorType
+
+from physx_core.errors import FeatureNotSupportedError, SimulationError, UnknownOptionError
+from physx_core.simulation import FEATURES, Backend, RobotInfo, Simulation, World, finite_rows
+from physx_core.typing import Records, Vector
+from physx_dart.dart.contacts import ContactReader
+from physx_dart.dart.loading import attach_shapes, static_skeleton
+from physx_dart.dart.robot import DartRobot
+from physx_dart.shared import catalog
+from physx_dart.shared.parts import Parts, read_parts
+from physx_dart.shared.robot_simulation import RobotSimulation
+from physx_dart.shared.shapes import Shape
+
+_DETECTORS = {
+    "dart": CollisionDetectorType.DART,
+    "fcl": CollisionDetectorType.FCL,
+    "bullet": CollisionDetectorType.BULLET,
+    "ode": CollisionDetectorType.ODE,
+}
+_SOLVERS = ("dantzig", "pgs", "nsgs", "fbf")
+_ISOTROPIC = ("nsgs", "fbf")
+_EXACT = ("dart", "dantzig")
+"""The detector and the solver that carry nothing over from one step to the next."""
+_RAYS = ("dart", "bullet")
+
+
+class DartBackend(Backend):
+    """DART, a simulator of articulated bodies.
+
+    Detectors: ``dart`` (the usual one), ``bullet``, ``ode``, ``fcl`` (without capsules). Contact
+    solvers: ``dantzig`` (the usual one), ``pgs``, both with a friction pyramid, and ``nsgs``,
+    ``fbf`` with a cone, which is the same in all directions.
+    """
+
+    def build(self, world: World, seed: int | None = None) -> Simulation:
+        """Build a simulation; DART draws nothing at random, the seed has no effect.
+
+        Raises:
+            ModelError: A robot or mesh cannot be loaded; the message says why.
+            FeatureNotSupportedError: The world asks for what DART does not have.
+            UnknownOptionError: There is no detector or solver of that name.
+        """
+        return DartSimulation(world)
+
+    def robots(self) -> Sequence[RobotInfo]:
+        """Return the robots of this package and of ``example-robot-data``."""
+        return catalog.robots()
+
+
+class DartSimulation(RobotSimulation):
+    """A world of DART."""
+
+    engine = "dart"
+    lacks: ClassVar[frozenset[str]] = frozenset({"armature", "rk4"})
+
+    def __init__(self, world: World) -> None:
+        """Build the world.
+
+        Raises:
+            ModelError: A robot or mesh cannot be loaded; the message says why.
+            FeatureNotSupportedError: The world asks for what DART does not have.
+            UnknownOptionError: There is no detector or solver of that name.
+        """
+        detector, solver = world.detector or "dart", world.solver or "dantzig"
+        for option, name, known in (
+            ("detector", detector, tuple(_DETECTORS)),
+            ("solver", solver, _SOLVERS),
+        ):
+            if name not in known:
+                raise UnknownOptionError(f"World.{option} for dart", [name], known)
+        parts = read_parts(world)
+        self._check_features(parts, detector)
+        self._world = _new_world(world, detector, solver)
+        robots = [self._add(parts, place) for place in range(len(parts.movers))]
+        statics = [] if world.contacts == "none" else parts.statics
+        self._statics = [static_skeleton(static) for static in statics]
+        for skeleton in self._statics:
+            self._world.addSkeleton(skeleton)
+        bodies = [body for robot in robots for body in robot.bodies]
+        bodies += [skeleton.getBodyNode(0) for skeleton in self._statics]
+        _let_pass(self._world, [[each.getBodyNode(0)] for each in self._statics])
+        if world.contacts == "static":
+            _let_pass(self._world, [robot.bodies for robot in robots])
+        self._reader = ContactReader(self._world, bodies, world.period)
+        self._step_world = self._world.step
+        lacks = [] if (detector, solver) == _EXACT else ["exact_restore"]
+        lacks += [] if solver in _ISOTROPIC else ["isotropic_friction"]
+        lacks += [] if detector in _RAYS else ["raycast"]
+        super().__init__(parts, robots, lacks)
+
+    def _check_features(self, parts: Parts, detector: str) -> None:
+        features = frozenset(FEATURES) - self.lacks
+        if parts.world.integrator != "euler":
+            raise FeatureNotSupportedError(self.engine, "rk4", features)
+        if any(joint.settings.armature for each in parts.movers for joint in each.model.joints):
+            raise FeatureNotSupportedError(self.engine, "armature", features)
+        shapes = [shape for each in parts.movers for shape in each.model.shapes]
+        shapes += [each.what for each in parts.statics if isinstance(each.what, Shape)]
+        if detector == "fcl" and any(shape.kind == "capsule" for shape in shapes):
+            advice = "Use another detector."
+            raise FeatureNotSupportedError(self.engine, "capsules in fcl", features, advice)
+
+    def _add(self, parts: Parts, place: int) -> DartRobot:
+        mover = parts.movers[place]
+        robot = DartRobot(mover, parts.world.gravity)
+        if parts.world.contacts != "none":
+            attach_shapes(robot.skeleton, mover.model.shapes)
+        if mover.self_collisions and parts.world.contacts == "all":
+            robot.skeleton.enableSelfCollisionCheck()
+        self._world.addSkeleton(robot.skeleton)
+        return robot
+
+    def advance(self, n: int) -> None:
+        """Simulate n physics steps."""
+        step = self._step_world
+        for _ in range(n):
+            step(False)
+
+    def touching(self) -> Records:
+        """Return the contacts of the last physics step."""
+        return self._reader.contacts()
+
+    def raycast(self, begins: Vector, ends: Vector) -> Records:
+        """Return what rays, shape (n, 3) each, meet first."""
+        self._check_open()
+        if "raycast" not in self.features:
+            raise self._lacks("raycast")
+        first, last = finite_rows("begins", begins, 3), finite_rows("ends", ends, 3)
+        if len(first) != len(last):
+            raise SimulationError(f"There are {len(first)} begins of rays but {len(last)} ends.")
+        return self._reader.raycast(first, last)
+
+    def close(self) -> None:
+        """Free the world; calling it again does nothing."""
+        if not self._closed:
+            super().close()
+            del self._step_world, self._reader, self._statics, self._world
+
+
+def _new_world(world: World, detector: str, solver: str) -> Any:
+    made = dartpy.simulation.World()
+    made.setTimeStep(world.period)
+    made.setGravity(list(world.gravity))
+    made.setCollisionDetector(_DETECTORS[detector])
+    sleeping = made.getDeactivationOptions()
+    sleeping.mEnabled = False
+    made.setDeactivationOptions(sleeping)
+    contacts = made.getConstraintSolver()
+    second = contacts.getSecondaryBoxedLcpSolver()
+    if solver == "pgs":  # it has no constructor: the second solver becomes the first
+        contacts.setSecondaryBoxedLcpSolver(None)
+        contacts.setBoxedLcpSolver(second)
+    elif solver == "nsgs":
+        contacts.setBoxedLcpSolver(constraint.NsgsFrictionSolver())
+    elif solver == "fbf":
+        contacts.setBoxedLcpSolver(constraint.FbfFrictionSolver())
+    return made
+
+
+def _let_pass(world: Any, groups: list[list[Any]]) -> None:
+    """Let the bodies of different groups pass through each other."""
+    collisions = world.getConstraintSolver().getCollisionOption().collisionFilter
+    touching = [[body for body in bodies if body.getNumShapeNodes()] for bodies in groups]
+    for place, bodies in enumerate(touching):
+        for others in touching[place + 1 :]:
+            for body in bodies:
+                for other in others:
+                    collisions.addBodyNodePairToBlackList(body, other)

@@ -1,0 +1,122 @@
+"""A double pendulum that swings freely under smooth random torques."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from physx_core import Field, plugins
+from physx_core.components import Environment
+from physx_core.errors import ConfigError
+from physx_core.simulation import Robot, Simulation, World
+from physx_dart.environments.trajectories import SmoothTrajectory
+
+URDF = Path(__file__).parent / "robots" / "double_pendulum.urdf"
+"""Two links of 1 kg and 0.5 m that hang down at zero."""
+
+
+class DoublePendulumEnvironment(Environment):
+    """A double pendulum from random initial states.
+
+    Fields: ``state``, the angles and angular velocities of both joints; ``torque``, what acts at
+    that instant; ``acceleration``, what follows from both. Without torques (``torque_amplitude=0``)
+    the state alone determines the acceleration.
+
+    Args:
+        period: Length of a physics step, in s.
+        steps_per_sample: Physics steps in each step, under a constant torque.
+        episode_steps: Steps after which the pendulum starts anew.
+        torque_amplitude: Largest torque, in N m.
+    """
+
+    backend: ClassVar[str] = "dart"
+
+    def __init__(
+        self,
+        *,
+        period: float = 1e-3,
+        steps_per_sample: int = 10,
+        episode_steps: int = 200,
+        torque_amplitude: float = 1.0,
+        **kwargs: Any,
+    ) -> None:
+        """Keep the options.
+
+        Raises:
+            ConfigError: A number of steps is less than 1.
+        """
+        super().__init__(**kwargs)
+        if steps_per_sample < 1 or episode_steps < 1:
+            raise ConfigError("steps_per_sample and episode_steps must be at least 1.")
+        self.period, self.steps_per_sample = period, steps_per_sample
+        self.episode_steps, self.torque_amplitude = episode_steps, torque_amplitude
+        self._steps = 0
+
+    def create(self) -> None:
+        """Build the simulation."""
+        world = World([Robot(URDF, "pendulum")], period=self.period)
+        self.simulation: Simulation = plugins.resolve("backend", self.backend).build(world)
+
+    def init_database(self) -> None:
+        """Define the fields."""
+        self.define_training_fields(
+            [
+                Field("state", shape=(4,), unit="rad, rad/s"),
+                Field("torque", shape=(2,), unit="N m"),
+                Field("acceleration", shape=(2,), unit="rad/s^2"),
+            ]
+        )
+
+    def init_visualization(self) -> None:
+        """Add the pendulum."""
+        if self.factory is not None:
+            bodies, poses = self.simulation.layout.bodies, self.simulation.body_poses()
+            self.factory.add_robot("pendulum", str(URDF), bodies, poses=poses)
+
+    def step(self) -> None:
+        """Simulate a sample's physics steps, or show the stored sample that is to be replayed."""
+        if self.sample is not None:
+            self.simulation.set_state(self.sample["state"][:2], self.sample["state"][2:])
+            names = ("state", "torque", "acceleration")
+            self.set_training_data(**{name: self.sample[name] for name in names})
+        else:
+            self._simulate()
+        if self.factory is not None:
+            self.factory.update_robot("pendulum", poses=self.simulation.body_poses())
+            self.update_visualization()
+
+    def close(self) -> None:
+        """Free the simulation."""
+        if hasattr(self, "simulation"):
+            self.simulation.close()
+
+    def _simulate(self) -> None:
+        simulation = self.simulation
+        if self._steps % self.episode_steps == 0:
+            if self._steps:
+                self.new_episode()
+            simulation.set_state(self.rng.uniform(-np.pi, np.pi, 2), self.rng.uniform(-3, 3, 2))
+            limit = np.full(2, self.torque_amplitude)
+            self._torques = SmoothTrajectory.draw(self.rng, np.zeros(2), limit, (0.2, 2.0))
+            self._begin = simulation.frame
+        torque, _, _ = self._torques.at((simulation.frame - self._begin) * self.period)
+        simulation.set_torques(torque)
+        simulation.step(self.steps_per_sample)
+        q, v = simulation.positions(), simulation.velocities()
+        a = simulation.forward_dynamics(q, v, torque)
+        self.set_training_data(state=np.concatenate([q, v]), torque=torque, acceleration=a)
+        self._steps += 1
+
+
+class DartDoublePendulum(DoublePendulumEnvironment):
+    """The double pendulum in DART."""
+
+    backend = "dart"
+
+
+class PinocchioDoublePendulum(DoublePendulumEnvironment):
+    """The double pendulum in Pinocchio."""
+
+    backend = "pinocchio"

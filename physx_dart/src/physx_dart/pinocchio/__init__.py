@@ -1,0 +1,1 @@
+"""The engine Pinocchio: integration, contacts, and constraint solver."""

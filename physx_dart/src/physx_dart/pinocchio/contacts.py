@@ -1,0 +1,319 @@
+"""Contacts of one robot or object with what never moves, for Pinocchio.
+
+A box touches with its corners, a capsule with the spheres at its ends, a cylinder with three points
+of each rim, one of them the deepest; a shape's edges and faces do not touch corners of others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio
+from numpy.typing import NDArray
+
+from physx_core.errors import FeatureNotSupportedError
+from physx_core.typing import Vector
+from physx_dart.pinocchio.surfaces import Plane, Surface, surfaces_of
+from physx_dart.shared.parts import Mover, Static
+from physx_dart.shared.shapes import Shape
+
+_MARGIN = 1e-4
+"""Distance, in m, at which a point counts as touching."""
+_RETURN = 0.1
+"""Share of a point's depth that it comes back in each step."""
+_FASTEST_RETURN = 1.0
+"""Speed at which it comes back at most, in m/s."""
+_BOUNCE = 0.1
+"""Speed of approach, in m/s, from which things bounce."""
+_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_THIRDS = np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
+"""Cosines and sines of three directions around a rim."""
+_CROSS = np.zeros((3, 9))
+_CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = 1.0, -1.0, 1.0, -1.0, 1.0, -1.0
+"""Makes a vector the matrix, row by row, whose product with another is their cross product."""
+
+
+Places = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Touching:
+    """Points that touch, or may within the next step.
+
+    Attributes:
+        links: Place of each point's link in the robot, shape (k,).
+        statics: Place of what it touches among the statics, shape (k,).
+        points: In the world frame, in m, shape (k, 3).
+        axes: Two tangents and the outward normal of each, as rows, shape (k, 3, 3).
+        gaps: Distances, negative inside, in m, shape (k,).
+        friction: Coefficients, shape (k,).
+        restitution: Coefficients, shape (k,).
+        jacobian: Of the points along their axes, shape (3 k, nv).
+    """
+
+    links: Places
+    statics: Places
+    points: Vector
+    axes: Vector
+    gaps: Vector
+    friction: Vector
+    restitution: Vector
+    jacobian: Vector
+
+    def bias(self, before: Vector, period: float) -> Vector:
+        """Return what is added to the free velocities along the axes, shape (3 k,).
+
+        Args:
+            before: Velocities before the step, shape (nv,).
+            period: Length of the step, in s.
+        """
+        pace = self.gaps / period
+        along = np.where(self.gaps > 0, pace, np.maximum(_RETURN * pace, -_FASTEST_RETURN))
+        if self.restitution.any():
+            approach = self.jacobian[2::3] @ before
+            bounces = (self.restitution > 0) & (approach < -_BOUNCE)
+            along = np.where(bounces, self.restitution * approach, along)
+        found = np.zeros(3 * len(along))
+        found[2::3] = along
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Near:
+    """Points near one surface: as `Touching`, their places in the finder, and radii around them."""
+
+    statics: Places
+    rows: Places
+    gaps: Vector
+    normals: Vector
+    axes: Vector
+    points: Vector
+    radii: Vector
+
+    @classmethod
+    def at(
+        cls,
+        place: int,
+        surface: Surface,
+        rows: Places,
+        gaps: Vector,
+        normals: Vector,
+        points: Vector,
+        radii: Vector,
+    ) -> _Near:
+        """Add the tangents at the surface of the static of that place."""
+        if isinstance(surface, Plane):
+            axes = np.ones((len(rows), 1, 1)) * np.array(axes_of(*surface.normal.tolist()))
+        else:
+            axes = np.array([axes_of(*normal) for normal in normals.tolist()])
+        return cls(np.full(len(rows), place), rows, gaps, normals, axes, points, radii)
+
+
+class ContactFinder:
+    """Finds where a robot or object touches what never moves."""
+
+    def __init__(
+        self,
+        mover: Mover,
+        statics: Sequence[Static],
+        model: Any,
+        data: Any,
+        frames: Sequence[int],
+        features: Sequence[str],
+    ) -> None:
+        """Prepare the points; `find` computes with the model and its data.
+
+        Raises:
+            FeatureNotSupportedError: A shape is a mesh.
+        """
+        self._model, self._data = model, data
+        self._surfaces = [
+            (place, surface)
+            for place, static in enumerate(statics)
+            for surface in surfaces_of(static, "pinocchio", features)
+        ]
+        self._up = next(
+            (each.normal for _, each in self._surfaces if isinstance(each, Plane)),
+            np.array([0.0, 0.0, 1.0]),
+        )
+        links = {name: i for i, name in enumerate(mover.model.links)}
+        points: list[tuple[int, Vector, float, int, Shape]] = []
+        rims: list[tuple[int, Vector, float, int, Shape, Vector]] = []
+        for shape in mover.model.shapes if self._surfaces else ():
+            if shape.kind == "mesh":
+                advice = 'Use Robot(collisions="boxes") or "capsules".'
+                raise FeatureNotSupportedError("pinocchio", "mesh_contacts", features, advice)
+            link = links.get(shape.body, 0)
+            frame = model.frames[frames[link]]
+            turn, place = frame.placement.rotation, frame.placement.translation
+            rotation, center = turn @ shape.rotation, turn @ shape.position + place
+            if shape.kind == "cylinder":
+                for end in (-0.5, 0.5):
+                    rim = center + end * shape.size[1] * rotation[:, 2]
+                    rims.append((frame.parentJoint, rim, shape.size[0], link, shape, rotation))
+                continue
+            offsets, radius = _points(shape)
+            for offset in offsets:
+                spot = center + rotation @ offset
+                points.append((frame.parentJoint, spot, radius, link, shape))
+        anchors: list[Any] = [*points, *rims]
+        self._arrange(anchors, len(points))
+        materials, shapes = [static.what for static in statics], [row[4] for row in anchors]
+        of_materials = np.array([(each.friction, each.restitution) for each in materials])
+        of_shapes = np.array([(shape.friction, shape.restitution) for shape in shapes])
+        first, second = of_materials.reshape(-1, 1, 2), of_shapes.reshape(1, -1, 2)
+        self._friction = np.minimum(first[:, :, 0], second[:, :, 0])
+        self._restitution = first[:, :, 1] * second[:, :, 1]
+
+    def _arrange(self, anchors: list[Any], points: int) -> None:
+        """Put points, then the centers of rims, into arrays."""
+        used = sorted({row[0] for row in anchors})
+        model, data = self._model, self._data
+        # Arrays that look into Pinocchio's own memory: they change with each `find`.
+        self._turns = [data.oMi[joint].rotation for joint in used]
+        self._places = [data.oMi[joint].translation for joint in used]
+        self._moved = np.zeros((len(used), model.nv))
+        for row, joint in enumerate(used):
+            for each in (each for each in model.supports[joint] if each > 0):
+                first = model.idx_vs[each]
+                self._moved[row, first : first + model.nvs[each]] = 1.0
+        self._joints = np.array([used.index(row[0]) for row in anchors], np.intp)
+        self._links = np.array([row[3] for row in anchors], np.intp)
+        self._centers = np.array([row[1] for row in anchors]).reshape(-1, 3)
+        self._radii = np.array([row[2] for row in anchors])
+        self._first_rim = points
+        self._rim_axes = np.array([row[5] for row in anchors[points:]]).reshape(-1, 3, 3)
+
+    def __bool__(self) -> bool:
+        """Return whether anything can ever touch."""
+        return len(self._joints) > 0
+
+    def find(self, q: Vector, v: Vector, period: float) -> Touching | None:
+        """Return the points that touch, or may within the next step; None where there are none.
+
+        Args:
+            q: Positions, shape (nq,).
+            v: Velocities that the robot would have without contacts, shape (nv,).
+            period: Length of the step, in s.
+        """
+        motions = pinocchio.computeJointJacobians(self._model, self._data, q)
+        joints, turns = self._joints, np.array(self._turns)
+        points = np.einsum("nij,nj->ni", turns[joints], self._centers)
+        points += np.array(self._places)[joints]
+        # How each joint moves: turn, and drift of what of it is at the world's origin.
+        twists = period * ((self._moved * v) @ motions.T)
+        steps = _moved(twists[joints], points)
+        reach, first = self._radii, self._first_rim
+        if first < len(points):
+            # No point of a rim moves further than its center and its turn take it.
+            spins, reach = _lengths(twists[:, 3:])[joints[first:]], reach.copy()
+            reach[first:] += _lengths(steps[first:]) + reach[first:] * spins
+        found: list[_Near] = []
+        for place, surface in self._surfaces:
+            gaps, normals = surface.distances(points)
+            ahead = gaps + np.einsum("ij,ij->i", normals, steps)
+            close = np.minimum(gaps, ahead) < reach + _MARGIN
+            if not surface.even:
+                close[first:] = True
+            rows = np.flatnonzero(close)
+            if len(rows) and rows[-1] >= first:
+                rows, rims = rows[rows < first], rows[rows >= first]
+                found += self._near_rims(place, surface, rims, turns, points, twists)
+            if len(rows):
+                radii = self._radii[rows]
+                gaps, normals = gaps[rows] - radii, normals[rows]
+                found.append(_Near.at(place, surface, rows, gaps, normals, points[rows], radii))
+        return self._touching(motions, found) if found else None
+
+    def _near_rims(
+        self,
+        place: int,
+        surface: Surface,
+        rims: Places,
+        turns: Vector,
+        points: Vector,
+        twists: Vector,
+    ) -> list[_Near]:
+        """Return those points of rims that touch, or may within the next step."""
+        rows, around = np.repeat(rims, 3), self._rims(rims, turns, points)
+        gaps, normals = surface.distances(around)
+        steps = _moved(twists[self._joints[rows]], around)
+        close = np.minimum(gaps, gaps + np.einsum("ij,ij->i", normals, steps)) < _MARGIN
+        if not close.any():
+            return []
+        rows, gaps, normals, around = rows[close], gaps[close], normals[close], around[close]
+        return [_Near.at(place, surface, rows, gaps, normals, around, np.zeros(len(rows)))]
+
+    def _rims(self, rows: Places, turns: Vector, points: Vector) -> Vector:
+        """Return three points of each rim, one of them the deepest, shape (3 rows, 3)."""
+        axes = turns[self._joints[rows]] @ self._rim_axes[rows - self._first_rim]
+        along = axes[:, :, 2]
+        downward = (along @ self._up)[:, None] * along - self._up
+        lengths = _lengths(downward)[:, None]
+        upright = lengths <= 1e-9
+        first = np.where(upright, axes[:, :, 0], downward / np.where(upright, 1.0, lengths))
+        around = _THIRDS @ np.stack([first, np.cross(along, first)], axis=1)
+        return (points[rows][:, None] + self._radii[rows][:, None, None] * around).reshape(-1, 3)
+
+    def _touching(self, motions: Vector, found: list[_Near]) -> Touching:
+        rows, statics = _joined(found, "rows"), _joined(found, "statics")
+        gaps, normals = _joined(found, "gaps"), _joined(found, "normals")
+        depths = _joined(found, "radii") + 0.5 * np.minimum(gaps, 0.0)
+        points = _joined(found, "points") - depths[:, None] * normals
+        axes = _joined(found, "axes")
+        turned = (points @ _CROSS).reshape(-1, 3, 3) @ motions[3:]
+        jacobian = axes @ ((motions[:3] - turned) * self._moved[self._joints[rows], None])
+        return Touching(
+            links=self._links[rows],
+            statics=statics,
+            points=points,
+            axes=axes,
+            gaps=gaps,
+            friction=self._friction[statics, rows],
+            restitution=self._restitution[statics, rows],
+            jacobian=jacobian.reshape(-1, jacobian.shape[2]),
+        )
+
+
+def axes_of(x: float, y: float, z: float) -> tuple[tuple[float, float, float], ...]:
+    """Return two tangents and the normal (x, y, z) itself."""
+    if abs(z) > 0.5:
+        length = math.hypot(x, z)
+        a, b, c = z / length, 0.0, -x / length
+    else:
+        length = math.hypot(x, y)
+        a, b, c = y / length, -x / length, 0.0
+    return (a, b, c), (y * c - z * b, z * a - x * c, x * b - y * a), (x, y, z)
+
+
+def _moved(twists: Vector, points: Vector) -> Vector:
+    """Return how far points (n, 3) are moved by drift and turn (n, 6)."""
+    return twists[:, :3] + np.einsum(
+        "nij,nj->ni", (twists[:, 3:] @ _CROSS).reshape(-1, 3, 3), points
+    )
+
+
+def _lengths(vectors: Vector) -> Vector:
+    """Return the lengths of rows."""
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+
+
+def _joined(found: list[_Near], name: str) -> Any:
+    """Return one array of all that is near."""
+    parts = [getattr(each, name) for each in found]
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _points(shape: Shape) -> tuple[Vector, float]:
+    """Return where spheres are in a shape, and their radius; a radius of 0 is a point."""
+    if shape.kind == "box":
+        return _CORNERS * np.array(shape.size), 0.0
+    if shape.kind == "sphere":
+        return np.zeros((1, 3)), shape.size[0]
+    ends = np.zeros((2, 3))
+    ends[:, 2] = -0.5 * shape.size[1], 0.5 * shape.size[1]
+    return ends, shape.size[0]

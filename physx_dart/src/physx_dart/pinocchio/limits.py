@@ -1,0 +1,178 @@
+"""Joint limits, motors and Coulomb friction as impulses, once the free motion is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physx_core.typing import Vector
+from physx_dart.shared.urdf import Joint
+
+_REGULARIZATION = 1e-9
+"""Share that is added to the diagonal, as DART's solver does."""
+_FASTEST_RETURN = 10.0
+"""Speed in rad/s or m/s at which a joint comes back into its limits at most, as in DART."""
+
+
+class JointConstraints:
+    """Limits of position and velocity, motors, and Coulomb friction, of a robot's joints.
+
+    A joint may not leave its limits in the next step, nor move faster than its velocity limit; one
+    that is outside comes back, whatever its velocity limit. Friction stops a joint if it can within
+    its bounds; a motor brings it to its velocity likewise. A motor without bounds does so whatever
+    the limits are.
+
+    Each of these is a row: a velocity that is aimed at, and bounds of the impulse. The lower limits
+    of all joints come first, then the upper ones, then friction and motors where there are any.
+
+    Attributes:
+        joints: Joint of each row, shape (rows,).
+        least: Smallest impulse of each row, in N m s or N s, shape (rows,).
+        most: Largest impulse of each row.
+        targets: Velocities that the motors aim at, shape (n,), in rad/s or m/s.
+        acts: Whether anything but limits acts.
+        limits: Whether any joint has limits.
+    """
+
+    def __init__(self, joints: Sequence[Joint], period: float) -> None:
+        """Keep the bounds of all joints, and the period in s."""
+        modes = np.array([joint.settings.mode for joint in joints], dtype=object)
+        lower = np.array([joint.lower for joint in joints])
+        upper = np.array([joint.upper for joint in joints])
+        fastest = np.array([joint.max_velocity for joint in joints])
+        friction = period * np.array([joint.friction for joint in joints])
+        strength = period * np.array([joint.max_torque for joint in joints])
+        free = modes == "velocity"
+        lower[free], upper[free], fastest[free] = -np.inf, np.inf, np.inf
+        friction[free], strength[free] = 0.0, np.inf
+        self._rubs, self._motors = np.flatnonzero(friction), np.flatnonzero(modes != "force")
+        self._arrange(friction[self._rubs], strength[self._motors], len(joints))
+        signs = np.array([[1.0], [-1.0]])
+        self._signs, self._pace = signs, signs / period
+        self._limits = self._pace * [lower, upper]
+        self._slowest = -fastest
+        self._period = period
+        self.targets = np.zeros(len(joints))
+        self.acts = bool(len(self._rubs) or len(self._motors))
+        self.limits = bool(np.isfinite([lower, upper, fastest]).any())
+        self._ranges = [
+            (place, float(low), float(high))
+            for place, (low, high) in enumerate(zip(lower, upper, strict=True))
+            if low > -math.inf or high < math.inf
+        ]
+        self._slowest_limit = float(fastest.min(initial=np.inf))
+
+    def _arrange(self, friction: Vector, strength: Vector, n: int) -> None:
+        """Set what is known of the rows beforehand."""
+        nothing, places = np.zeros(n), np.arange(n)
+        self.joints = np.concatenate([places, places, self._rubs, self._motors])
+        self.least = np.concatenate([nothing, nothing - np.inf, -friction, -strength])
+        self.most = np.concatenate([nothing + np.inf, nothing, friction, strength])
+
+    def safe(self, positions: Vector, velocities: Vector) -> tuple[int, float]:
+        """Return for how many steps no limit can act while the speed stays below a bound.
+
+        Args:
+            positions: Shape (n,).
+            velocities: Likewise.
+
+        Returns:
+            The number of steps and the bound of the square of the velocities' length.
+        """
+        if not self.limits:
+            return 2**30, math.inf
+        square = float(velocities.dot(velocities))
+        bound = min(self._slowest_limit, max(2 * math.sqrt(square), 1.0))
+        slack, places = math.inf, positions.tolist()
+        for place, lower, upper in self._ranges:
+            slack = min(slack, places[place] - lower, upper - places[place])
+        if not slack > 0 or not square < bound * bound:
+            return 0, 0.0
+        return int(min(slack / (bound * self._period), 2**30)), bound * bound
+
+    def bounds(self, positions: Vector) -> Vector:
+        """Return how fast joints have to move at least, up for lower and down for upper limits.
+
+        Args:
+            positions: Before the step, shape (n,).
+
+        Returns:
+            Shape (2, n), in rad/s or m/s: mostly negative, as joints need not move.
+        """
+        needed = self._limits - self._pace * positions
+        bounds = np.maximum(needed, self._slowest)
+        if (needed > 0).any():
+            bounds = np.where((needed > 0).any(axis=0), needed, bounds)
+        return np.minimum(bounds, _FASTEST_RETURN)
+
+    def acting(self, bounds: Vector, velocities: Vector, reach: float) -> NDArray[np.bool_]:
+        """Return which rows act, shape (rows,): motors, friction that moves, and some limits.
+
+        Those of joints that are outside do always, as other joints may push them further.
+
+        Args:
+            bounds: As `bounds` returned them.
+            velocities: After the step, shape (n,).
+            reach: How close to its bound a velocity is when a limit counts as acting.
+        """
+        acts = np.ones(len(self.joints), np.bool_)
+        limits = acts[: bounds.size].reshape(bounds.shape)
+        np.less(self._signs * velocities, bounds + reach, out=limits)
+        limits |= bounds > 0
+        if len(self._rubs):  # what rests without friction stays at rest, as in DART
+            acts[bounds.size : bounds.size + len(self._rubs)] = velocities[self._rubs] != 0
+        return acts
+
+    def aims(self, bounds: Vector) -> Vector:
+        """Return the velocity that each row aims at, shape (rows,)."""
+        limits = (self._signs * bounds).ravel()
+        if not self.acts:
+            return limits
+        return np.concatenate([limits, np.zeros(len(self._rubs)), self.targets[self._motors]])
+
+
+def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vector:
+    """Return the impulses that bring about a change of velocities as far as their bounds allow.
+
+    They solve the box-constrained linear complementarity problem by principal pivoting: blocks of
+    pivots as long as they help, else single ones, which always end (J. J. Judice and F. M. Pires,
+    A block principal pivoting algorithm for large-scale strictly monotone linear complementarity
+    problems, Computers & Operations Research 21, 1994).
+
+    Args:
+        response: Change of the velocities for unit impulses, shape (n, n), positive definite.
+        change: Wanted change of the velocities, shape (n,).
+        least: Smallest impulses, shape (n,), may be -inf.
+        most: Largest impulses, likewise.
+    """
+    matrix = response.copy()
+    matrix.flat[:: len(change) + 1] *= 1 + _REGULARIZATION
+    alone = change / matrix.diagonal()
+    if len(change) == 1:
+        return np.clip(alone, least, most)
+    # -1: at its least, 1: at its most, 0: between; at first as if no row knew of the others.
+    side = (alone > most).astype(np.int8) - (alone < least)
+    best, blocks = len(change) + 1, 3
+    impulses = np.zeros(len(change))
+    for _ in range(50 * (len(change) + 1)):
+        free = side == 0
+        impulses = np.where(side < 0, least, np.where(side > 0, most, 0.0))
+        if free.any():
+            rest = (change - matrix @ impulses)[free]
+            impulses[free] = np.linalg.solve(matrix[free][:, free], rest)
+        under, over = free & (impulses < least), free & (impulses > most)
+        freed = side * (matrix @ impulses - change) > 0
+        wrong = np.flatnonzero(under | over | freed)
+        if not len(wrong):
+            break
+        if len(wrong) < best:
+            best, blocks = len(wrong), 3
+        elif blocks:
+            blocks -= 1
+        else:
+            wrong = wrong[-1:]
+        side[wrong] = np.where(freed[wrong], 0, np.where(under[wrong], -1, 1))
+    return np.clip(impulses, least, most)

@@ -1,0 +1,94 @@
+"""Models of Pinocchio, from the same description as everything else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio
+
+from physx_core.errors import ModelError
+from physx_core.typing import Vector
+from physx_dart.shared.parts import Mover
+from physx_dart.shared.rotations import matrix_from_quaternion
+
+_TRANSLATION, _ROTATION = "physx translation", "physx rotation"
+_LINK = "physx link "
+
+
+def load_model(mover: Mover, gravity: tuple[float, ...], *, armature: Vector) -> Any:
+    """Return the model of a robot or object whose state is that of `physx_core`'s backends.
+
+    Raises:
+        ModelError: Pinocchio cannot load it.
+    """
+    if mover.fixed_base:
+        model = _parsed(mover)
+        _weld(model, mover)
+    else:
+        model = _parsed(mover, pinocchio.JointModelFreeFlyer())
+    return _finished(model, mover, gravity, armature, 1 if mover.fixed_base else 2)
+
+
+def load_stepping_model(mover: Mover, gravity: tuple[float, ...], *, armature: Vector) -> Any:
+    """Return the model that is stepped: its base moves along the world's axes and turns.
+
+    Its positions are those of `load_model`; the first three velocities of a floating base are along
+    the world's axes, not its own. So semi-implicit Euler keeps the linear momentum of a body that
+    tumbles, as DART does, which it does not in the base's own frame.
+
+    Raises:
+        ModelError: Pinocchio cannot load it.
+    """
+    if mover.fixed_base:
+        return load_model(mover, gravity, armature=armature)
+    nowhere = pinocchio.SE3.Identity()
+    base = pinocchio.Model()
+    first = base.addJoint(0, pinocchio.JointModelTranslation(), nowhere, _TRANSLATION)
+    second = base.addJoint(first, pinocchio.JointModelSpherical(), nowhere, _ROTATION)
+    frame = pinocchio.Frame(_ROTATION, second, 0, nowhere, pinocchio.FrameType.BODY)
+    place = base.addFrame(frame)
+    robot = _parsed(mover)
+    links = [frame for frame in robot.frames if frame.type == pinocchio.FrameType.BODY]
+    for frame in links:  # appendModel cannot tell a link and a joint of the same name apart
+        frame.name = f"{_LINK}{frame.name}"
+    model = pinocchio.appendModel(base, robot, place, nowhere)
+    for frame in model.frames:
+        frame.name = frame.name.removeprefix(_LINK)
+    return _finished(model, mover, gravity, armature, 3)
+
+
+def frames_of(model: Any, mover: Mover) -> list[int]:
+    """Return the frame of each link of a model."""
+    return [model.getFrameId(link, pinocchio.FrameType.BODY) for link in mover.model.links]
+
+
+def _parsed(mover: Mover, *root: Any) -> Any:
+    try:
+        return pinocchio.buildModelFromXML(mover.model.text, *root)
+    except (ValueError, RuntimeError) as error:
+        raise ModelError(f"Pinocchio cannot load {mover.model.path}: {error}") from error
+
+
+def _weld(model: Any, mover: Mover) -> None:
+    """Move the root of a robot with a fixed base to its place."""
+    rotation = matrix_from_quaternion(np.array(mover.orientation))
+    base = pinocchio.SE3(rotation, np.array(mover.position))
+    for joint in range(1, model.njoints):
+        if model.parents[joint] == 0:
+            model.jointPlacements[joint] = base * model.jointPlacements[joint]
+    for place, frame in enumerate(model.frames):
+        if frame.parentJoint == 0 and place > 0:
+            model.frames[place].placement = base * frame.placement
+
+
+def _finished(
+    model: Any, mover: Mover, gravity: tuple[float, ...], armature: Vector, first: int
+) -> Any:
+    model.gravity.linear = np.array(gravity, np.float64)
+    model.armature = np.asarray(armature, np.float64)
+    moving = list(model.names)[first:]
+    if moving != [joint.name for joint in mover.model.joints]:
+        path = mover.model.path
+        raise ModelError(f"Pinocchio reads the joints of {path} in another order: {moving}.")
+    return model

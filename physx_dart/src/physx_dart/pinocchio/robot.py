@@ -1,0 +1,383 @@
+"""One robot or object, stepped with Pinocchio's algorithms.
+
+Pinocchio has no simulator, so the step is written here, as DART does it: semi-implicit Euler with
+implicit damping and springs; contacts, limits, servos and Coulomb friction by impulses; and a
+floating base whose position and rotation move with its velocities in the world frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio
+from numpy import add, multiply
+
+from physx_core.simulation import CONTACT, World
+from physx_core.simulation.rotations import turned, turned_back
+from physx_core.typing import Records, Vector
+from physx_dart.pinocchio.contacts import ContactFinder, Places, Touching
+from physx_dart.pinocchio.limits import JointConstraints, solve
+from physx_dart.pinocchio.models import frames_of, load_stepping_model
+from physx_dart.pinocchio.solver import ImpulseSolver
+from physx_dart.shared.algorithms import MoverAlgorithms
+from physx_dart.shared.engine import RobotEngine
+from physx_dart.shared.parts import Mover, Static
+from physx_dart.shared.rotations import base_accelerations, matrix_from_quaternion
+
+_UNSEEN = 10
+"""Steps after which it is seen whether a limit might have acted."""
+_REACH = 1.0
+"""Speed in rad/s or m/s within which a limit takes part where something touches."""
+_MISSED = 1e-9
+"""Speed beyond its bound at which a joint counts as having left its limits."""
+
+
+class PinocchioRobot(RobotEngine):
+    """The state of one robot or object, and how it goes on.
+
+    Inside, the velocities of a floating base are those of `load_stepping_model`.
+    """
+
+    def __init__(
+        self,
+        mover: Mover,
+        world: World,
+        statics: Sequence[Static],
+        solver: ImpulseSolver,
+        features: Sequence[str],
+    ) -> None:
+        """Load the models.
+
+        Raises:
+            ModelError: Pinocchio cannot load the robot.
+            FeatureNotSupportedError: A collision shape is a mesh.
+        """
+        super().__init__(mover)
+        self._algorithms: MoverAlgorithms | None = None
+        self._gravity, self._period = world.gravity, world.period
+        resists, dt = self.resistance, world.period
+        implicit = resists.armature + dt * resists.damping + dt * dt * resists.stiffness
+        self._free = load_stepping_model(mover, world.gravity, armature=implicit)
+        self._free_data = self._free.createData()
+        # Constraints act on the robot without its dampers, as in DART.
+        self._model = load_stepping_model(mover, world.gravity, armature=resists.armature)
+        self._data = self._model.createData()
+        self._frames = frames_of(self._free, mover)
+        self._pushes = pinocchio.StdVec_Force()
+        self._pushes.extend(pinocchio.Force.Zero() for _ in range(self._free.njoints))
+        self._more: tuple[Any, ...] = ()  # the wrenches, while there are any
+        self._joints = JointConstraints(self.model.joints, dt)
+        self._contacts = ContactFinder(
+            mover, statics, self._free, self._free_data, self._frames, features
+        )
+        self._acted_on = bool(self._contacts) or self._joints.acts
+        self._solver = solver
+        self._rk4 = world.integrator == "rk4"
+        modes = [joint.settings.mode for joint in self.model.joints]
+        forces = np.array([mode == "force" for mode in modes], np.float64)
+        self._forces = None if forces.all() else forces
+        self._positions, self._velocities = np.zeros(self.nq), np.zeros(self.nv)
+        self._earlier, self._before = self._positions, self._velocities
+        self._safe_steps, self._bound = 0, 0.0
+        # Arrays multiply each other in half the time that a number and an array take.
+        self._periods, self._motion = np.full(self.nv, dt), np.zeros(self.nv)
+        self._turned: Vector | None = None  # the velocities that `_twist` was made of
+        self._twist = self._velocities
+        self._torques = np.zeros(self.nv)
+        self._springs = bool(resists.stiffness.any())
+        self._smooth = bool(resists.damping.any() or resists.stiffness.any())
+        self._touching: Touching | None = None
+        self._impulses = np.zeros(0)
+        # Of an inverse matrix of inertia, Pinocchio computes the upper half.
+        self._upper = np.triu(np.ones((self.nv, self.nv)), 1) + 0.5 * np.eye(self.nv)
+        self._unit = np.eye(self.nv)
+
+    # Stepping -------------------------------------------------------------------------------
+
+    def run(self, n: int) -> None:
+        """Simulate n physics steps."""
+        if self._rk4:
+            for _ in range(n):
+                self._step_rk4()
+            return
+        while n > 0:
+            done = 0 if self._acted_on else self._run_free(n)
+            n -= done
+            if n > 0:
+                self._step()
+                self._safe_steps = 0
+                n -= 1
+
+    def _run_free(self, n: int) -> int:
+        """Simulate up to n steps while no limit can act; return how many.
+
+        Whether the joints stayed slow enough for that is seen every few steps; if they did not, the
+        last few are taken back.
+        """
+        if self._safe_steps <= 0:
+            base = self.base
+            q, v = self._positions[self.nq - self.nv + base :], self._velocities[base:]
+            self._safe_steps, self._bound = self._joints.safe(q, v)
+        steps, done = min(n, self._safe_steps), 0
+        while done < steps:
+            count = min(_UNSEEN, steps - done)
+            state = self._positions, self._velocities, self._earlier, self._before
+            if self._smooth:
+                for _ in range(count):
+                    self._step_free(1, self._resisted(self._positions, self._velocities))
+            else:
+                self._step_free(count, self._torques)
+            v = self._velocities[self.base :]
+            if not v.dot(v) < self._bound:
+                self._positions, self._velocities, self._earlier, self._before = state
+                self._safe_steps = 0
+                return done
+            done += count
+        self._safe_steps -= done
+        return done
+
+    def _step_free(self, count: int, torques: Vector) -> None:
+        """Simulate steps, at least one, in which nothing acts but torques and wrenches."""
+        model, data, more = self._free, self._free_data, self._more
+        periods, motion = self._periods, self._motion
+        aba, integrate = pinocchio.aba, pinocchio.integrate
+        q, v = self._positions, self._velocities
+        earlier, before = q, v
+        for _ in range(count):
+            earlier, before = q, v
+            # An array of its own, in which the new velocities are made.
+            v = aba(model, data, q, v, torques, *more) if more else aba(model, data, q, v, torques)
+            multiply(v, periods, v)
+            add(v, before, v)
+            q = integrate(model, q, multiply(v, periods, motion))
+        self._positions, self._velocities = q, v
+        self._earlier, self._before = earlier, before
+
+    def _resisted(self, q: Vector, v: Vector) -> Vector:
+        """Return the held torques less those of dampers and of springs at the step's end."""
+        resists = self.resistance
+        torques = self._torques - resists.damping * v
+        if not self._springs:
+            return torques
+        ahead = q[self.nq - self.nv :] + self._period * v - resists.rest
+        return torques - np.where(resists.stiffness, resists.stiffness * ahead, 0.0)
+
+    def _step(self) -> None:
+        """Simulate one step in which anything may act."""
+        q, v, dt = self._positions, self._velocities, self._period
+        model, data = self._free, self._free_data
+        torques = self._resisted(q, v) if self._smooth else self._torques
+        a = pinocchio.aba(model, data, q, v, torques, *self._more)
+        self._earlier, self._before = q, v
+        self._velocities = after = self._constrained(q, v, v + dt * a)
+        self._positions = pinocchio.integrate(model, q, dt * after)
+
+    def _constrained(self, q: Vector, before: Vector, v: Vector) -> Vector:
+        """Return velocities (nv,) after the impulses of contacts, limits, servos and friction.
+
+        Contacts may drive joints out of their limits. So limits that are close take part from the
+        beginning, and those that are left nevertheless join in. Without contacts, as in DART, those
+        limits act that the free motion would leave.
+        """
+        base, joints = self.base, self._joints
+        touching = None
+        if self._contacts:
+            touching = self._contacts.find(q, v, self._period)
+        self._touching = touching
+        bounds = joints.bounds(q[self.nq - self.nv + base :])
+        acts = joints.acting(bounds, v[base:], _REACH if touching else 0.0)
+        if touching is None and not acts.any():
+            return v
+        upper = pinocchio.computeMinverse(self._model, self._data, q) * self._upper
+        inverse, aims = upper + upper.T, joints.aims(bounds)
+        if touching is None:
+            return self._limited(inverse, v, np.flatnonzero(acts), aims)
+        while True:
+            rows = np.flatnonzero(acts)
+            after = self._touched(inverse, before, v, touching, rows, aims)
+            missed = joints.acting(bounds, after[base:], -_MISSED) & ~acts
+            if not missed.any():
+                return after
+            acts |= missed
+
+    def _limited(self, inverse: Vector, v: Vector, rows: Places, aims: Vector) -> Vector:
+        """Return velocities after the impulses of rows of the joints alone."""
+        joints = self._joints
+        index = joints.joints[rows] + self.base
+        spread = inverse[:, index]
+        change = aims[rows] - v[index]
+        return v + spread @ solve(spread[index], change, joints.least[rows], joints.most[rows])
+
+    def _touched(
+        self,
+        inverse: Vector,
+        before: Vector,
+        v: Vector,
+        touching: Touching,
+        rows: Places,
+        aims: Vector,
+    ) -> Vector:
+        """Return velocities after the impulses of contacts and of rows of the joints."""
+        joints = self._joints
+        jacobian, wanted = touching.jacobian, -touching.bias(before, self._period)
+        if len(rows):
+            jacobian = np.concatenate([jacobian, self._unit[joints.joints[rows] + self.base]])
+            wanted = np.concatenate([wanted, aims[rows]])
+        spread = inverse @ jacobian.T
+        impulses = self._solver.solve(
+            jacobian @ spread,
+            jacobian @ v - wanted,
+            touching.friction,
+            joints.least[rows],
+            joints.most[rows],
+        )
+        self._impulses = impulses[: 3 * len(touching.gaps)]
+        return v + spread @ impulses
+
+    def _step_rk4(self) -> None:
+        """Simulate one step with the classic method of fourth order."""
+        q, v, dt, model = self._positions, self._velocities, self._period, self._model
+        half = 0.5 * dt
+        a1 = self._acceleration(q, v)
+        v2 = v + half * a1
+        a2 = self._acceleration(pinocchio.integrate(model, q, half * v), v2)
+        v3 = v + half * a2
+        a3 = self._acceleration(pinocchio.integrate(model, q, half * v2), v3)
+        v4 = v + dt * a3
+        a4 = self._acceleration(pinocchio.integrate(model, q, dt * v3), v4)
+        self._earlier, self._before = q, v
+        self._positions = pinocchio.integrate(model, q, dt / 6 * (v + 2 * v2 + 2 * v3 + v4))
+        self._velocities = v + dt / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+
+    def _acceleration(self, q: Vector, v: Vector) -> Vector:
+        torques = self._torques - self.resistance.smooth(q, v)
+        return pinocchio.aba(self._model, self._data, q, v, torques, self._pushes)
+
+    def contacts(self, first: int, statics: int) -> Records:
+        """Return the contacts of the last step.
+
+        Args:
+            first: Place of the robot's first link in `Layout.names`.
+            statics: Place of the first static there.
+        """
+        touching = self._touching
+        if touching is None:
+            return np.zeros(0, CONTACT)
+        records = np.zeros(len(touching.gaps), CONTACT)
+        records["body_a"] = first + touching.links
+        records["body_b"] = statics + touching.statics
+        records["point"], records["normal"] = touching.points, touching.axes[:, 2]
+        forces = self._impulses.reshape(-1, 3) / self._period
+        records["force"] = np.einsum("kij,ki->kj", touching.axes, forces)
+        records["depth"] = np.maximum(-touching.gaps, 0.0)
+        return records
+
+    def hold(self, commands: Vector) -> None:
+        """Hold commands, shape (joints,), that are within their limits."""
+        self._joints.targets = commands
+        torques = commands if self._forces is None else commands * self._forces
+        if self.base:
+            self._torques[self.base :] = torques
+        else:
+            self._torques = torques
+
+    def can_move(self, link: int) -> bool:
+        """Return whether a link, by its place in the model, can move at all."""
+        return bool(self._free.frames[self._frames[link]].parentJoint > 0)
+
+    def push(self, link: int, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
+        """Add a wrench for the next steps until `release`."""
+        frame = self._free.frames[self._frames[link]]
+        joint, place = frame.parentJoint, frame.placement
+        if not local:
+            pinocchio.forwardKinematics(self._model, self._data, self._positions)
+            turn = (self._data.oMi[joint].rotation @ place.rotation).T
+            force, torque = turn @ force, turn @ torque
+        wrench = pinocchio.Force(force, torque + np.cross(point, force))
+        self._pushes[joint] = self._pushes[joint] + place.act(wrench)
+        self._more = (self._pushes,)
+
+    def release(self) -> None:
+        """End all wrenches."""
+        if self._more:
+            for joint in range(self._free.njoints):
+                self._pushes[joint] = pinocchio.Force.Zero()
+            self._more = ()
+
+    # State ----------------------------------------------------------------------------------
+
+    def positions(self) -> Vector:
+        """Return the present positions, shape (nq,), in a vector of its own."""
+        q = self._positions.copy()
+        if self.base and q[6] < 0:
+            q[3:7] *= -1
+        return q
+
+    def velocities(self) -> Vector:
+        """Return the present velocities, shape (nv,), in a vector of its own."""
+        if not self.base:
+            return self._velocities.copy()
+        if self._turned is not self._velocities:
+            self._turned, self._twist = self._velocities, self._velocities.copy()
+            self._twist[:3] = turned_back(self._positions[3:7].tolist(), *self._twist[:3].tolist())
+        return self._twist.copy()
+
+    def accelerations(self) -> Vector:
+        """Return the accelerations of the last step, shape (nv,)."""
+        a = (self._velocities - self._before) / self._period
+        if not self.base:
+            return a
+        earlier, now = self._earlier[3:7].tolist(), self._positions[3:7].tolist()
+        x, y, z = turned_back(now, *turned(earlier, *self._before[3:6].tolist()))
+        p, q, r = self._velocities[3:6].tolist()
+        change = base_accelerations(now, a[:3].tolist(), self.velocities())
+        pace = 1 / self._period
+        a[:6] = (*change, pace * (p - x), pace * (q - y), pace * (r - z))
+        return a
+
+    def write(self, positions: Vector, velocities: Vector) -> None:
+        """Set the state."""
+        self._positions, self._velocities = positions.copy(), velocities.copy()
+        if self.base:
+            rotation = matrix_from_quaternion(positions[3:7])
+            self._velocities[:3] = rotation @ velocities[:3]
+        self._earlier, self._before = self._positions, self._velocities
+        self._touching, self._safe_steps = None, 0
+
+    def native(self) -> tuple[Vector, Vector]:
+        """Return the state as it is stepped, copied."""
+        return self._positions.copy(), self._velocities.copy()
+
+    def set_native(self, positions: Vector, velocities: Vector) -> None:
+        """Set the state to what `native` returned."""
+        self._positions, self._velocities = positions.copy(), velocities.copy()
+        self._earlier, self._before = self._positions, self._velocities
+        self._touching, self._safe_steps = None, 0
+
+    def speed(self) -> float:
+        """Return the length of the velocities; NaN or inf where the state is broken."""
+        v = self._velocities  # positions come from these, so they are finite if these are
+        return math.sqrt(v.dot(v))
+
+    # Any state ------------------------------------------------------------------------------
+
+    @property
+    def _any(self) -> MoverAlgorithms:
+        if self._algorithms is None:
+            self._algorithms = MoverAlgorithms(self.mover, self._gravity)
+        return self._algorithms
+
+    def poses(self, positions: Vector) -> Vector:
+        """Return the poses of all links in positions, shape (links, 7)."""
+        return self._any.poses(positions)
+
+    def forward(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
+        """Return the accelerations that torques cause, resistance included."""
+        return self._any.forward(positions, velocities, torques)
+
+    def inverse(self, positions: Vector, velocities: Vector, accelerations: Vector) -> Vector:
+        """Return the torques that cause accelerations, resistance included."""
+        return self._any.inverse(positions, velocities, accelerations)

@@ -1,0 +1,121 @@
+"""The engine Pinocchio: its algorithms and constraint solvers, stepped by `pinocchio_robot`.
+
+All calls of pinocchio are in `algorithms` and the modules whose names begin with `pinocchio_`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+
+from physx_core.errors import FeatureNotSupportedError
+from physx_core.simulation import FEATURES, Backend, RobotInfo, Simulation, World
+from physx_core.typing import Records
+from physx_dart.pinocchio.robot import PinocchioRobot
+from physx_dart.pinocchio.solver import ImpulseSolver
+from physx_dart.shared import catalog
+from physx_dart.shared.parts import Parts, read_parts
+from physx_dart.shared.robot_simulation import RobotSimulation
+
+_WITHOUT_RK4 = ("actuators", "contacts", "isotropic_friction", "joint_friction", "limits")
+
+
+class PinocchioBackend(Backend):
+    """Pinocchio, a library of rigid-body algorithms.
+
+    Robots and objects touch what never moves, but not each other. Contact solvers: ``pgs`` (the
+    usual one) and ``admm``, both with a friction cone. There is one way to find contacts, without a
+    name: by points and spheres, see `physx_dart.pinocchio.contacts`.
+    """
+
+    def build(self, world: World, seed: int | None = None) -> Simulation:
+        """Build a simulation; nothing is drawn at random, the seed has no effect.
+
+        Raises:
+            ModelError: A robot or mesh cannot be loaded; the message says why.
+            FeatureNotSupportedError: The world asks for what is not there.
+            UnknownOptionError: There is no solver of that name.
+        """
+        return PinocchioSimulation(world)
+
+    def robots(self) -> Sequence[RobotInfo]:
+        """Return the robots of this package and of ``example-robot-data``."""
+        return catalog.robots()
+
+
+class PinocchioSimulation(RobotSimulation):
+    """A world of Pinocchio."""
+
+    engine = "pinocchio"
+    lacks: ClassVar[frozenset[str]] = frozenset(
+        {"body_contacts", "mesh_contacts", "raycast", "self_collisions"}
+    )
+
+    def __init__(self, world: World) -> None:
+        """Build the world.
+
+        Raises:
+            ModelError: A robot or mesh cannot be loaded; the message says why.
+            FeatureNotSupportedError: The world asks for what is not there.
+            UnknownOptionError: There is no solver of that name.
+        """
+        solver = ImpulseSolver(world.solver or "pgs")
+        parts = read_parts(world)
+        self._check_features(parts)
+        statics = [] if world.contacts == "none" else parts.statics
+        features = sorted(frozenset(FEATURES) - self.lacks)
+        self._stepped_parts = [
+            PinocchioRobot(mover, world, statics, solver, features) for mover in parts.movers
+        ]
+        lacks = () if world.integrator == "euler" else (*_WITHOUT_RK4, "restitution")
+        super().__init__(parts, self._stepped_parts, lacks)
+
+    def _check_features(self, parts: Parts) -> None:
+        world, features = parts.world, frozenset(FEATURES) - self.lacks
+        if world.detector is not None:
+            raise FeatureNotSupportedError(self.engine, f"detector {world.detector}", features)
+        touching = [mover for mover in parts.movers if mover.model.shapes]
+        if world.contacts == "all":
+            if len(touching) > 1:
+                advice = 'Use World(contacts="static").'
+                raise FeatureNotSupportedError(self.engine, "body_contacts", features, advice)
+            if any(mover.self_collisions for mover in touching):
+                raise FeatureNotSupportedError(self.engine, "self_collisions", features)
+        if world.integrator == "rk4":
+            self._check_rk4(parts, features)
+
+    def _check_rk4(self, parts: Parts, features: frozenset[str]) -> None:
+        advice = 'Use World(integrator="euler").'
+        if parts.statics and parts.world.contacts != "none":
+            raise FeatureNotSupportedError(self.engine, "contacts in rk4", features, advice)
+        for joint in (joint for mover in parts.movers for joint in mover.model.joints):
+            limits = [joint.lower, joint.upper, joint.max_velocity]
+            for name, asked in (
+                ("limits", np.isfinite(limits).any()),
+                ("joint_friction", joint.friction > 0),
+                ("actuators", joint.settings.mode != "force"),
+            ):
+                if asked:
+                    what = f'{name} in rk4, of the joint "{joint.name}"'
+                    raise FeatureNotSupportedError(self.engine, what, features, advice)
+
+    def advance(self, n: int) -> None:
+        """Simulate n physics steps."""
+        for robot in self._stepped_parts:
+            robot.run(n)
+
+    def touching(self) -> Records:
+        """Return the contacts of the last physics step."""
+        first, statics = 0, len(self.layout.bodies)
+        found = []
+        for robot in self._stepped_parts:
+            found.append(robot.contacts(first, statics))
+            first += len(robot.model.links)
+        return np.concatenate(found)
+
+    def close(self) -> None:
+        """Free the world; calling it again does nothing."""
+        super().close()
+        self._stepped_parts = []

@@ -1,0 +1,168 @@
+"""Impulses of contacts, limits, servos and friction together."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio
+
+from physx_core.errors import SimulationError, UnknownOptionError
+from physx_core.typing import Vector
+from physx_dart.pinocchio.contact_problem import ContactProblem
+
+SOLVERS = ("pgs", "admm")
+_NEWTON_STEPS = 12
+_ITERATIONS = 300
+"""Of Pinocchio's solvers; what they left is Newton's method's again."""
+_ACCURACY = 1e-11
+"""Of velocities, in m/s, and impulses."""
+_GOOD = 100.0
+"""Error of an iterated solution that is left as it is, as a multiple of an exact one's."""
+_ENDLESS = 1e6
+"""Impulse that stands for one without bounds where Pinocchio's solvers want a number."""
+
+
+class ImpulseSolver:
+    """Solves for the impulses of points with friction cones, and of rows with bounds.
+
+    Newton's method mostly finds them in a few steps, and exactly. Where it goes in circles,
+    Pinocchio's solvers come first, one after the other, and Newton's method goes on from what they
+    found: projected Gauss-Seidel fails at impacts of light links on heavy ones and at jammed
+    joints, ADMM at some that the first finds.
+
+    Args:
+        name: Which comes first: ``"pgs"`` (projected Gauss-Seidel) or ``"admm"``.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Prepare the solver.
+
+        Raises:
+            UnknownOptionError: There is none of that name.
+        """
+        if name not in SOLVERS:
+            raise UnknownOptionError("World.solver for pinocchio", [name], SOLVERS)
+        gauss_seidel = (
+            pinocchio.PGSConstraintSolver,
+            pinocchio.PGSSolverResult,
+            _accurate(pinocchio.PGSSolverSettings()),
+        )
+        admm = (
+            pinocchio.ADMMConstraintSolver,
+            pinocchio.ADMMSolverResult,
+            _accurate(pinocchio.ADMMSolverSettings()),
+        )
+        self._solvers = {"pgs": gauss_seidel, "admm": admm}
+        self._order = sorted(SOLVERS, key=lambda each: each != name)
+        self._points: dict[float, Any] = {}
+        self._limits: dict[int, Any] = {}
+        self._chains: dict[int, Any] = {}
+
+    def solve(
+        self, response: Vector, free: Vector, friction: Vector, least: Vector, most: Vector
+    ) -> Vector:
+        """Return the impulses, shape (3 k + m,).
+
+        Args:
+            response: Velocities for unit impulses, shape (3 k + m, 3 k + m).
+            free: Velocities without impulses, less what is wanted, shape (3 k + m,): of k points
+                along two tangents and the normal, then of m rows.
+            friction: Coefficients of the points, shape (k,).
+            least: Smallest impulses of the rows, shape (m,): first of those with one bound.
+            most: Largest impulses, likewise.
+
+        Raises:
+            SimulationError: They are no numbers.
+        """
+        if not np.isfinite(free).all() or not np.isfinite(response).all():
+            raise SimulationError("The state is no longer finite. Use a smaller period.")
+        problem = ContactProblem(response, free, friction, least, most)
+        best, least_error = problem.newton(np.zeros(len(free)), _NEWTON_STEPS)
+        good = problem.accuracy
+        for name in self._order:
+            if least_error < good:
+                break
+            good = _GOOD * problem.accuracy
+            begin = self.iterated(problem, name)
+            if np.isfinite(begin).all():
+                found, error = problem.newton(begin, _NEWTON_STEPS)
+                if error < least_error:
+                    best, least_error = found, error
+        return best
+
+    def iterated(self, problem: ContactProblem, name: str) -> Vector:
+        """Return what one of Pinocchio's solvers finds, ``"pgs"`` or ``"admm"``."""
+        models = pinocchio.StdVec_ConstraintModel()
+        for coefficient in problem.friction:
+            models.append(self._point(float(coefficient)))
+        size, least, most = 3 * len(problem.friction), problem.least, problem.most
+        one_sided = int((np.isinf(least) != np.isinf(most)).sum())
+        if one_sided:
+            models.append(self._limit(one_sided))
+        if one_sided < len(least):
+            models.append(self._bounded(least[one_sided:], most[one_sided:]))
+        data = pinocchio.StdVec_ConstraintData()
+        for model in models:
+            data.append(model.createData())
+        # Limits of Pinocchio only push upward.
+        signs = np.ones(len(problem.free))
+        signs[size:][np.isinf(least) & np.isfinite(most)] = -1.0
+        delassus = pinocchio.DelassusOperatorDense(problem.matrix * np.outer(signs, signs))
+        kind, result_of, settings = self._solvers[name]
+        result = result_of()
+        kind().solve(delassus, signs * problem.free, models, data, settings, result)
+        return signs * result.retrieveConstraintImpulses()
+
+    def _point(self, coefficient: float) -> Any:
+        if coefficient not in self._points:
+            model = pinocchio.PointContactConstraintModel(self._chain(1), 1)
+            model.setFriction(coefficient)
+            self._points[coefficient] = pinocchio.ConstraintModel(model)
+        return self._points[coefficient]
+
+    def _limit(self, length: int) -> Any:
+        """Return a constraint of limits that joints of a made-up model are at."""
+        if length not in self._limits:
+            nothing = np.zeros(length)
+            model = pinocchio.JointLimitConstraintModel(
+                self._chain(length), _joints(length), nothing, nothing + np.inf, nothing + 1.0
+            )
+            model.makeSelectionMaximal()
+            self._limits[length] = pinocchio.ConstraintModel(model)
+        return self._limits[length]
+
+    def _bounded(self, least: Vector, most: Vector) -> Any:
+        """Return a constraint with bounds: that of friction in joints of a made-up model."""
+        return pinocchio.ConstraintModel(
+            pinocchio.JointFrictionConstraintModel(
+                self._chain(len(least)),
+                _joints(len(least)),
+                np.maximum(least, -_ENDLESS),
+                np.minimum(most, _ENDLESS),
+            )
+        )
+
+    def _chain(self, length: int) -> Any:
+        if length not in self._chains:
+            model = pinocchio.Model()
+            for place in range(length):
+                nowhere = pinocchio.SE3.Identity()
+                model.addJoint(0, pinocchio.JointModelRX(), nowhere, str(place))
+            self._chains[length] = model
+        return self._chains[length]
+
+
+def _joints(length: int) -> Any:
+    joints = pinocchio.StdVec_Index()
+    joints.extend(range(1, length + 1))
+    return joints
+
+
+def _accurate(settings: Any) -> Any:
+    """Return settings with which a solver goes on until its result is accurate."""
+    settings.max_iterations = _ITERATIONS
+    for kind in ("feasibility", "complementarity"):
+        setattr(settings, f"absolute_{kind}_tol", _ACCURACY)
+        setattr(settings, f"relative_{kind}_tol", 0.0)
+    return settings

@@ -1,0 +1,152 @@
+"""Surfaces of what never moves: how far points are from them, and which way is out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from physx_core.errors import FeatureNotSupportedError
+from physx_core.simulation import Ground, HeightField, Stairs
+from physx_core.typing import Vector
+from physx_dart.shared.parts import Static
+from physx_dart.shared.rotations import matrix_from_quaternion
+from physx_dart.shared.shapes import Shape
+
+
+class Surface(ABC):
+    """The surface of one thing.
+
+    Attributes:
+        even: Whether the distances of two points differ by no more than that between them.
+    """
+
+    even: ClassVar[bool] = True
+
+    @abstractmethod
+    def distances(self, points: Vector) -> tuple[Vector, Vector]:
+        """Return distances of points (n, 3), negative inside, and normals outward, (n,), (n, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plane(Surface):
+    """An endless plane: normal of length 1, and its height along it in m."""
+
+    normal: Vector
+    height: float
+
+    def distances(self, points: Vector) -> tuple[Vector, Vector]:
+        """Return distances and normals."""
+        return points @ self.normal - self.height, np.ones((len(points), 1)) * self.normal
+
+
+@dataclass(frozen=True, eq=False)
+class Solid(Surface):
+    """A shape at a place: center (3,), rotation matrix (3, 3)."""
+
+    shape: Shape
+    center: Vector
+    rotation: Vector
+
+    def distances(self, points: Vector) -> tuple[Vector, Vector]:
+        """Return distances and normals."""
+        local = (points - self.center) @ self.rotation
+        size = self.shape.size
+        if self.shape.kind == "box":
+            found, normals = _box(local, 0.5 * np.array(size))
+        elif self.shape.kind == "cylinder":
+            found, normals = _cylinder(local, *size)
+        else:
+            half = 0.5 * size[1] if self.shape.kind == "capsule" else 0.0
+            axis = np.zeros_like(local)
+            axis[:, 2] = np.clip(local[:, 2], -half, half)
+            lengths, normals = _directions(local - axis)
+            found = lengths - size[0]
+        return found, normals @ self.rotation.T
+
+
+@dataclass(frozen=True, eq=False)
+class Heights(Surface):
+    """A height field; the distance is that to the plane of the triangle below or above."""
+
+    even: ClassVar[bool] = False
+    field: HeightField
+
+    def distances(self, points: Vector) -> tuple[Vector, Vector]:
+        """Return distances and normals."""
+        heights, spacing = self.field.heights, np.array(self.field.spacing)
+        grid = (points[:, :2] - self.field.corner()) / spacing
+        last = np.array(heights.shape) - 1
+        outside = ((grid < 0) | (grid > last)).any(axis=1)
+        cell = np.clip(np.floor(grid), 0, last - 1).astype(np.intp)
+        x, y = (grid - cell).T
+        i, j = cell.T
+        low, high = heights[i, j], heights[i + 1, j + 1]
+        along_x, along_y = heights[i + 1, j], heights[i, j + 1]
+        below = x >= y  # the triangle on the side of larger x
+        slope_x = np.where(below, along_x - low, high - along_y)
+        slope_y = np.where(below, high - along_x, along_y - low)
+        height = low + slope_x * x + slope_y * y
+        ones = np.ones(len(points))
+        upward = np.column_stack([-slope_x / spacing[0], -slope_y / spacing[1], ones])
+        lengths = np.linalg.norm(upward, axis=1)
+        found = (points[:, 2] - height) / lengths
+        found[outside] = np.inf
+        return found, upward / lengths[:, None]
+
+
+def surfaces_of(static: Static, engine: str, features: Sequence[str]) -> list[Surface]:
+    """Return the surfaces of something that never moves.
+
+    Raises:
+        FeatureNotSupportedError: It is a mesh.
+    """
+    what = static.what
+    if isinstance(what, HeightField):
+        return [Heights(what)]
+    if isinstance(what, Ground):
+        return [Plane(np.array(what.normal), float(what.height))]
+    if isinstance(what, Stairs):
+        found: list[Surface] = [Plane(np.array([0.0, 0.0, 1.0]), 0.0)]
+        for center, size in what.boxes():
+            box = Shape("box", size, np.zeros(3), np.eye(3), "ground", 1.0, 0.0)
+            found.append(Solid(box, np.array(center), np.eye(3)))
+        return found
+    if what.kind == "mesh":
+        raise FeatureNotSupportedError(engine, "mesh_contacts", features, "Use a box instead.")
+    rotation = matrix_from_quaternion(np.array(static.orientation))
+    return [Solid(what, np.array(static.position), rotation)]
+
+
+def _directions(vectors: Vector) -> tuple[Vector, Vector]:
+    """Return lengths and directions; the direction of nothing is upward."""
+    lengths = np.linalg.norm(vectors, axis=1)
+    upward = np.array([0.0, 0.0, 1.0])
+    safe = np.where(lengths > 1e-12, lengths, 1.0)[:, None]
+    return lengths, np.where(lengths[:, None] > 1e-12, vectors / safe, upward)
+
+
+def _box(local: Vector, half: Vector) -> tuple[Vector, Vector]:
+    beyond = np.abs(local) - half
+    lengths, outward = _directions(local - np.clip(local, -half, half))
+    nearest = np.argmax(beyond, axis=1)
+    rows = np.arange(len(local))
+    inward = np.zeros_like(local)
+    inward[rows, nearest] = np.where(local[rows, nearest] < 0, -1.0, 1.0)
+    inside = beyond[rows, nearest] <= 0
+    found = np.where(inside, beyond[rows, nearest], lengths)
+    return found, np.where(inside[:, None], inward, outward)
+
+
+def _cylinder(local: Vector, radius: float, length: float) -> tuple[Vector, Vector]:
+    flat = local.copy()
+    flat[:, 2] = 0.0
+    radial, outward = _directions(flat)
+    profile = np.column_stack([radial, np.zeros(len(local)), local[:, 2]])
+    found, normals = _box(profile, np.array([radius, 1.0, 0.5 * length]))
+    along = np.array([0.0, 0.0, 1.0])
+    outward = np.where(radial[:, None] > 1e-12, outward, np.array([1.0, 0.0, 0.0]))
+    return found, normals[:, :1] * outward + normals[:, 2:] * along

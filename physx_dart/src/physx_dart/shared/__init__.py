@@ -1,0 +1,1 @@
+"""What both engines share: models, shapes, algorithms, and the common simulation."""

@@ -1,0 +1,261 @@
+"""Pinocchio's algorithms for a world's robots and objects, whatever engine simulates them.
+
+All states are those of `physx_core.simulation.layout`, all results are new arrays of float64 in
+C order, so that ``torch.from_numpy`` takes them as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+import pinocchio
+
+from physx_core.simulation import World
+from physx_core.typing import Vector
+from physx_dart.pinocchio.models import frames_of, load_model
+from physx_dart.pinocchio.resistance import Resistance
+from physx_dart.shared.parts import Mover, Parts, read_parts, static_poses
+
+_WORLD_AXES = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
+_velocity, _acceleration = pinocchio.getFrameVelocity, pinocchio.getFrameClassicalAcceleration
+
+
+class MoverAlgorithms:
+    """Pinocchio's algorithms for one robot or object.
+
+    Attributes:
+        model: Pinocchio's model, with gravity and the rotors' inertia.
+        data: What its algorithms write to.
+        frames: Frame of each link, by its place in the robot.
+        resistance: What resists its joints' motion; part of the dynamics.
+    """
+
+    def __init__(self, mover: Mover, gravity: tuple[float, ...]) -> None:
+        self.resistance = Resistance.of(mover)
+        self.model = load_model(mover, gravity, armature=self.resistance.armature)
+        self.data = self.model.createData()
+        self.frames = frames_of(self.model, mover)
+        self._first = 1 if mover.fixed_base else 2
+
+    def poses(self, q: Vector) -> Vector:
+        """Return the poses of all links, shape (links, 7)."""
+        pinocchio.forwardKinematics(self.model, self.data, q)
+        return np.array([self.pose(frame) for frame in self.frames])
+
+    def write_motion(self, frame: int, out: Vector) -> None:
+        """Write pose, velocity and acceleration of a frame after `pinocchio.forwardKinematics`.
+
+        Args:
+            frame: The frame.
+            out: Shape (19,), along the world's axes.
+        """
+        model, data = self.model, self.data
+        out[:7] = self.pose(frame)
+        out[7:13] = _velocity(model, data, frame, _WORLD_AXES).vector
+        out[13:] = _acceleration(model, data, frame, _WORLD_AXES).vector
+
+    def pose(self, frame: int) -> Vector:
+        """Return the pose of a frame, shape (7,), after `pinocchio.forwardKinematics`."""
+        placement = pinocchio.updateFramePlacement(self.model, self.data, frame)
+        pose = pinocchio.SE3ToXYZQUAT(placement)
+        if pose[6] < 0:
+            pose[3:] *= -1
+        return pose
+
+    def forward(self, q: Vector, v: Vector, tau: Vector) -> Vector:
+        """Return the accelerations that torques cause, resistance included."""
+        resisted = tau - self.resistance.torques(q, v)
+        return pinocchio.aba(self.model, self.data, q, v, resisted)
+
+    def inverse(self, q: Vector, v: Vector, a: Vector) -> Vector:
+        """Return the torques that cause accelerations, resistance included."""
+        return pinocchio.rnea(self.model, self.data, q, v, a) + self.resistance.torques(q, v)
+
+    def joint_wrenches(
+        self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
+    ) -> Vector:
+        """Return what each joint carries, shape (joints, 6); `outer` acts on links."""
+        model, data = self.model, self.data
+        if outer:
+            pinocchio.forwardKinematics(model, data, q)
+            forces = [pinocchio.Force.Zero() for _ in range(model.njoints)]
+            for link, wrench in outer.items():
+                frame = self.frames[link]
+                joint = model.frames[frame].parentJoint
+                origin = pinocchio.updateFramePlacement(model, data, frame).translation
+                place = pinocchio.SE3(np.eye(3), origin)
+                acting = place.act(pinocchio.Force(np.array(wrench)))
+                forces[joint] += data.oMi[joint].actInv(acting)
+            more = pinocchio.StdVec_Force()
+            more.extend(forces)
+            pinocchio.rnea(model, data, q, v, a, more)
+        else:
+            pinocchio.rnea(model, data, q, v, a)
+        found = [force.vector for force in data.f.tolist()[self._first :]]
+        return np.array(found).reshape(-1, 6)
+
+    def mass(self, q: Vector) -> Vector:
+        """Return the mass matrix, shape (nv, nv)."""
+        matrix = np.triu(pinocchio.crba(self.model, self.data, q))
+        return matrix + np.triu(matrix, 1).T
+
+    def jacobian(self, link: int, q: Vector, point: Vector) -> Vector:
+        """Return the Jacobian of a point of a link along the world's axes, shape (6, nv)."""
+        model, data, frame = self.model, self.data, self.frames[link]
+        found = pinocchio.computeFrameJacobian(model, data, q, frame, _WORLD_AXES)
+        pinocchio.framesForwardKinematics(model, data, q)
+        x, y, z = data.oMf[frame].rotation @ point
+        arm = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        found = np.array(found, order="C").reshape(6, -1)  # one column comes as a vector
+        found[:3] -= arm @ found[3:]
+        return found
+
+    def derivatives(self, q: Vector, v: Vector, tau: Vector) -> tuple[Vector, Vector, Vector]:
+        """Return the derivatives of `forward` by positions, velocities and torques."""
+        resisted = tau - self.resistance.torques(q, v)
+        found = pinocchio.computeABADerivatives(self.model, self.data, q, v, resisted)
+        by_q, by_v, inverse = (np.array(matrix, order="C") for matrix in found)
+        inverse = np.triu(inverse) + np.triu(inverse, 1).T
+        by_q -= inverse * self.resistance.stiffness
+        by_v -= inverse * self.resistance.damping
+        return by_q, by_v, inverse
+
+
+class Algorithms:
+    """Pinocchio's algorithms for all of a world. Arrays are not checked here.
+
+    ``Algorithms.of(world)`` makes one; the positions' quaternions must have length 1.
+
+    Attributes:
+        movers: One for each robot, then each object that moves.
+    """
+
+    def __init__(self, parts: Parts) -> None:
+        self.movers = tuple(MoverAlgorithms(each, parts.world.gravity) for each in parts.movers)
+        self._places = list(self._slices())
+        self._links = [(i, frame) for i, each in enumerate(self.movers) for frame in each.frames]
+        self._still = np.zeros((len(parts.statics), 19))
+        self._still[:, :7] = static_poses(parts)
+
+    @classmethod
+    def of(cls, world: World) -> Self:
+        """Return the algorithms of a world.
+
+        Raises:
+            ModelError: A robot cannot be loaded; the message says why.
+        """
+        return cls(read_parts(world))
+
+    def body_poses(self, q: Vector, bodies: Sequence[int]) -> Vector:
+        """Return the poses of bodies, shape (bodies, 7), by their places in `Layout.names`."""
+        found = np.empty((len(bodies), 7))
+        known: set[int] = set()
+        for row, body in zip(found, bodies, strict=True):
+            if body >= len(self._links):
+                row[:] = self._still[body - len(self._links), :7]
+                continue
+            mover, frame = self._links[body]
+            each, x, _ = self._places[mover]
+            if mover not in known:
+                pinocchio.forwardKinematics(each.model, each.data, q[x])
+                known.add(mover)
+            row[:] = each.pose(frame)
+        return found
+
+    def motions(self, q: Vector, v: Vector, a: Vector, bodies: Sequence[int]) -> Vector:
+        """Return how bodies move, shape (bodies, 19), along the world's axes.
+
+        Args:
+            q: Positions.
+            v: Velocities.
+            a: Accelerations.
+            bodies: Their places in `Layout.names`.
+
+        Returns:
+            In each row the pose (7), and velocity (6) and acceleration (6) of the body's origin.
+        """
+        found = np.empty((len(bodies), 19))
+        known: set[int] = set()
+        for row, body in zip(found, bodies, strict=True):
+            if body >= len(self._links):
+                row[:] = self._still[body - len(self._links)]
+                continue
+            mover, frame = self._links[body]
+            each, x, y = self._places[mover]
+            if mover not in known:
+                pinocchio.forwardKinematics(each.model, each.data, q[x], v[y], a[y])
+                known.add(mover)
+            each.write_motion(frame, row)
+        return found
+
+    def forward_dynamics(self, q: Vector, v: Vector, tau: Vector) -> Vector:
+        """Return the accelerations, shape (nv,), that torques (nv,) cause in a state."""
+        return np.concatenate([x.forward(q[a], v[b], tau[b]) for x, a, b in self._slices()])
+
+    def inverse_dynamics(self, q: Vector, v: Vector, acceleration: Vector) -> Vector:
+        """Return the torques, shape (nv,), that cause accelerations (nv,) in a state."""
+        slices = self._slices()
+        return np.concatenate([x.inverse(q[a], v[b], acceleration[b]) for x, a, b in slices])
+
+    def joint_wrenches(
+        self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
+    ) -> Vector:
+        """Return what the joints carry in a state, shape (joints, 6).
+
+        Args:
+            q: Positions.
+            v: Velocities.
+            a: Accelerations.
+            outer: What acts on bodies from outside, by their places: force, and torque about the
+                body's origin, 6 numbers along the world's axes.
+        """
+        found, begin = [], 0
+        for each, x, y in self._slices():
+            end = begin + len(each.frames)
+            mine = {body - begin: outer[body] for body in outer if begin <= body < end}
+            found.append(each.joint_wrenches(q[x], v[y], a[y], mine))
+            begin = end
+        return np.concatenate(found)
+
+    def mass_matrix(self, q: Vector) -> Vector:
+        """Return the mass matrix, shape (nv, nv)."""
+        return self._diagonal([each.mass(q[a]) for each, a, _ in self._slices()])
+
+    def jacobian(self, body: int, q: Vector, point: Vector) -> Vector:
+        """Return the Jacobian, shape (6, nv), of a point of a body, by its place in the layout."""
+        whole = np.zeros((6, sum(each.model.nv for each in self.movers)))
+        for each, a, b in self._slices():
+            if body < len(each.frames):
+                whole[:, b] = each.jacobian(body, q[a], point)
+                return whole
+            body -= len(each.frames)
+        return whole
+
+    def forward_dynamics_derivatives(
+        self, q: Vector, v: Vector, tau: Vector
+    ) -> tuple[Vector, Vector, Vector]:
+        """Return the derivatives of `forward_dynamics` by positions, velocities and torques."""
+        found = [each.derivatives(q[a], v[b], tau[b]) for each, a, b in self._slices()]
+        by_q, by_v, by_tau = (self._diagonal(blocks) for blocks in zip(*found, strict=True))
+        return by_q, by_v, by_tau
+
+    def _slices(self) -> Iterator[tuple[MoverAlgorithms, slice, slice]]:
+        """Return each mover, its part of the positions, and that of the velocities."""
+        nq = nv = 0
+        for each in self.movers:
+            yield each, slice(nq, nq + each.model.nq), slice(nv, nv + each.model.nv)
+            nq, nv = nq + each.model.nq, nv + each.model.nv
+
+    def _diagonal(self, blocks: Any) -> Vector:
+        """Return a matrix with square blocks along its diagonal."""
+        if len(self.movers) == 1:
+            return blocks[0]
+        whole = np.zeros((sum(map(len, blocks)),) * 2)
+        begin = 0
+        for block in blocks:
+            end = begin + len(block)
+            whole[begin:end, begin:end] = block
+            begin = end
+        return whole

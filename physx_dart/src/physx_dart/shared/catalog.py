@@ -1,0 +1,60 @@
+"""The robots that a world may name, with what can be said of each without loading a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from physx_core import PhysxError
+from physx_core.simulation import Robot, RobotInfo
+from physx_dart.shared.robot_files import mesh_path, named_robots
+from physx_dart.shared.urdf import parse_urdf, read_robot
+
+_NO_DIRS: Mapping[str, str | Path] = {}
+
+
+def robots() -> tuple[RobotInfo, ...]:
+    """Return the robots of this package, then those of ``example-robot-data`` if installed."""
+    return tuple(describe(name, path) for name, path in named_robots().items())
+
+
+def describe(name: str, path: Path) -> RobotInfo:
+    """Return what a URDF file says of a robot.
+
+    Args:
+        name: Name of the robot.
+        path: The file; if it cannot be loaded, the result says why.
+    """
+    try:
+        model = read_robot(Robot(path))
+        root = parse_urdf(path)
+    except PhysxError as error:
+        return RobotInfo(name, path, error=str(error))
+    masses = ElementTree.fromstring(model.text).iter("mass")
+    shapes = [shape for each in root.iter("collision") for shape in each.iterfind("geometry/*")]
+    meshes = [shape for shape in shapes if shape.tag == "mesh"]
+    return RobotInfo(
+        name,
+        path,
+        len(model.joints),
+        sum(float(mass.get("value", "0")) for mass in masses),
+        _kind(len(shapes) - len(meshes), len(meshes)),
+        _warning(path, meshes),
+    )
+
+
+def _kind(primitives: int, meshes: int) -> str:
+    if primitives and meshes:
+        return "both"
+    return "primitives" if primitives else "meshes" if meshes else "none"
+
+
+def _warning(path: Path, meshes: list[Element]) -> str:
+    """Return what to know of collision meshes: files are looked up, not read."""
+    if not meshes:
+        return ""
+    files = {mesh_path(path, mesh.get("filename", ""), _NO_DIRS) for mesh in meshes}
+    size = sum(file.stat().st_size for file in files if file is not None) / 1e6
+    return f"slow: {len(meshes)} collision mesh{'es' if len(meshes) > 1 else ''} ({size:.2g} MB)"

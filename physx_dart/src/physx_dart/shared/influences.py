@@ -1,0 +1,113 @@
+"""What acts on a world from outside while it is stepped: wrenches and hooks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from physx_core.errors import SimulationError
+from physx_core.simulation import AppliedWrench, Hook, Simulation, Wrench
+from physx_core.typing import Vector
+
+
+class Wrenches:
+    """The wrenches that act on a world."""
+
+    def __init__(self, period: float) -> None:
+        self._period = period
+        self._active: dict[int, AppliedWrench] = {}
+        self._next = 0
+
+    def __len__(self) -> int:
+        """Return how many act."""
+        return len(self._active)
+
+    def add(self, wrench: Wrench, frame: int) -> int:
+        """Let a wrench act from a frame on; return its number."""
+        number, self._next = self._next, self._next + 1
+        self._active[number] = AppliedWrench(number, frame, wrench)
+        return number
+
+    def remove(self, number: int) -> None:
+        """End a wrench.
+
+        Raises:
+            SimulationError: None of that number acts.
+        """
+        if number not in self._active:
+            raise SimulationError(
+                f"No wrench has the number {number!r}; those that act: {sorted(self._active)}."
+            )
+        del self._active[number]
+
+    def at(self, frame: int) -> Iterator[tuple[Wrench, Vector, Vector]]:
+        """Forget those that are over; return each other with its force and torque."""
+        for number, applied in list(self._active.items()):
+            steps = applied.wrench.steps(self._period)
+            if steps is not None and frame >= applied.begin + steps:
+                del self._active[number]
+            else:
+                time = (frame - applied.begin) * self._period
+                yield applied.wrench, *applied.wrench.at(time)
+
+    def before(self, frame: int) -> Iterator[tuple[Wrench, Vector, Vector]]:
+        """Return each that acted in the step before a frame, with its force and torque then."""
+        for applied in self._active.values():
+            steps, since = applied.wrench.steps(self._period), frame - 1 - applied.begin
+            if since >= 0 and (steps is None or since < steps):
+                yield applied.wrench, *applied.wrench.at(since * self._period)
+
+    def snapshot(self) -> tuple[AppliedWrench, ...]:
+        """Return all that act."""
+        return tuple(self._active.values())
+
+    def restore(self, applied: Iterable[AppliedWrench]) -> None:
+        """Replace all that act."""
+        self._active = {each.number: each for each in applied}
+        self._next = max([self._next, *(number + 1 for number in self._active)])
+
+
+class Hooks:
+    """Functions that are called before physics steps."""
+
+    def __init__(self) -> None:
+        self._hooks: list[tuple[Hook, int]] = []
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self._hooks)
+
+    def add(self, hook: Hook, every: int) -> None:
+        """Call a function before the steps whose frame is a multiple of `every`.
+
+        Raises:
+            SimulationError: It cannot be called.
+        """
+        if not callable(hook):
+            raise SimulationError(f"{hook!r} cannot be called, so it is no hook.")
+        self._hooks.append((hook, every))
+
+    def remove(self, hook: Hook) -> None:
+        """Call a function no longer.
+
+        Raises:
+            SimulationError: It is not called.
+        """
+        for place, (known, _) in enumerate(self._hooks):
+            if known == hook:
+                del self._hooks[place]
+                return
+        raise SimulationError(f"{hook!r} is no hook of this simulation.")
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._hooks.clear()
+
+    def pause(self, frame: int) -> int:
+        """Return after how many steps from a frame the next one is due, at least 1."""
+        return min((every - frame % every for _, every in self._hooks), default=2**30)
+
+    def call(self, simulation: Simulation, frame: int) -> None:
+        """Call those that are due at a frame."""
+        for hook, every in tuple(self._hooks):
+            if frame % every == 0:
+                hook(simulation)

@@ -1,0 +1,62 @@
+"""Mesh files: their vertices, and the boxes and capsules around them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from physx_core.errors import ModelError
+from physx_core.typing import Vector
+
+_FORMATS = (".stl", ".obj", ".dae")
+
+
+def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
+    """Return the vertices of a mesh file, shape (n, 3), in m.
+
+    Args:
+        path: Of a file in one of the formats stl, obj and dae.
+        scale: Factors of the lengths along each axis.
+
+    Raises:
+        ModelError: The file does not exist, is of another format, or cannot be read.
+    """
+    if not path.is_file():
+        raise ModelError(f"There is no mesh file {path}.")
+    if path.suffix.lower() not in _FORMATS:
+        raise ModelError(f"The mesh {path} is in none of the formats {', '.join(_FORMATS)}.")
+    import coal  # only worlds with meshes need it
+
+    try:
+        mesh = coal.MeshLoader().load(str(path), np.array(scale, np.float64))
+        vertices = np.array(mesh.vertices(), np.float64).reshape(-1, 3)
+    except (ValueError, RuntimeError, TypeError) as error:
+        raise ModelError(f"The mesh {path} cannot be read: {error}") from error
+    if not len(vertices) or not np.isfinite(vertices).all():
+        raise ModelError(f"The mesh {path} has no vertices, or such that are not finite.")
+    return vertices
+
+
+def bounding_box(vertices: Vector) -> tuple[Vector, Vector]:
+    """Return center and full size, shape (3,) each, of the box around vertices (n, 3)."""
+    lowest, highest = vertices.min(axis=0), vertices.max(axis=0)
+    return 0.5 * (lowest + highest), np.maximum(highest - lowest, 1e-4)
+
+
+def bounding_capsule(vertices: Vector) -> tuple[Vector, Vector, Vector]:
+    """Return a capsule around vertices (n, 3), along the longest edge of their bounding box.
+
+    Returns:
+        Center (3,), axes (3, 3) whose last column is the capsule's, and radius and length of the
+        cylinder alone (2,), in m; a length of 0 is a sphere.
+    """
+    center, size = bounding_box(vertices)
+    axis = int(np.argmax(size))
+    axes = np.roll(np.eye(3), 2 - axis, axis=1)
+    local = (vertices - center) @ axes
+    squares = (local[:, :2] ** 2).sum(axis=1)
+    radius = max(float(np.sqrt(squares.max())), 1e-4)
+    reach = np.abs(local[:, 2]) - np.sqrt(np.maximum(radius**2 - squares, 0.0))
+    return center, axes, np.array([radius, max(2 * float(reach.max()), 0.0)])

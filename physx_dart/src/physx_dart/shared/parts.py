@@ -1,0 +1,185 @@
+"""A world as the engines load it: everything that moves as a robot model, the rest as statics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from physx_core.errors import ModelError
+from physx_core.simulation import Ground, HeightField, Layout, Part, Stairs, World, WorldObject
+from physx_dart.shared.shapes import Shape, moments, shape_of_object
+from physx_dart.shared.urdf import Joint, RobotModel, read_robot
+
+_OBJECT = (
+    '<robot name="robot"><link name="body"><inertial><mass value="{mass!r}"/><inertia '
+    'ixx="{0!r}" iyy="{1!r}" izz="{2!r}" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
+)
+
+
+@dataclass(frozen=True)
+class Mover:
+    """A robot, or an object that moves.
+
+    Attributes:
+        name: Its name in the world.
+        model: What its file says; an object is a robot of one link named ``body``.
+        fixed_base: Whether its root link is welded to the world.
+        position: Of the root link at first, in m.
+        orientation: Likewise, quaternion x, y, z, w.
+        self_collisions: Whether its links touch each other.
+        is_object: Whether it is an object.
+    """
+
+    name: str
+    model: RobotModel
+    fixed_base: bool
+    position: tuple[float, ...]
+    orientation: tuple[float, ...]
+    self_collisions: bool = False
+    is_object: bool = False
+
+
+@dataclass(frozen=True)
+class Static:
+    """Something that never moves.
+
+    Attributes:
+        name: Its name in the world.
+        what: A shape, or the ground.
+        position: Of the shape, in m.
+        orientation: Likewise, quaternion x, y, z, w.
+    """
+
+    name: str
+    what: Shape | Ground | Stairs | HeightField
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)
+    orientation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """All of a world.
+
+    Attributes:
+        world: Its description.
+        movers: Robots, then objects that move.
+        statics: The ground, then objects that do not.
+    """
+
+    world: World
+    movers: tuple[Mover, ...]
+    statics: tuple[Static, ...]
+
+
+def read_parts(world: World) -> Parts:
+    """Read the files of a world.
+
+    Raises:
+        ModelError: A file cannot be read, or a robot has no joint and a fixed base.
+    """
+    movers = []
+    for robot in world.robots:
+        model = read_robot(robot, touching=_touches(world, robot.self_collisions))
+        if robot.fixed_base and not model.joints:
+            raise ModelError(
+                f'Robot "{robot.name}", {model.path}: it has no joint that moves and a fixed base. '
+                "Use fixed_base=False."
+            )
+        pose = robot.position, robot.orientation
+        movers.append(Mover(robot.name, model, robot.fixed_base, *pose, robot.self_collisions))
+    statics = [] if world.ground is None else [Static("ground", world.ground)]
+    for thing in world.objects:
+        if thing.static:
+            shape = shape_of_object(thing)
+            statics.append(Static(thing.name, shape, thing.position, thing.orientation))
+        else:
+            movers.append(_object(thing))
+    return Parts(world, tuple(movers), tuple(statics))
+
+
+def _touches(world: World, itself: bool) -> bool:
+    """Return whether a robot of this world can touch anything."""
+    if world.contacts == "none":
+        return False
+    static = world.ground is not None or any(thing.static for thing in world.objects)
+    moving = len(world.robots) > 1 or itself or bool(world.objects)
+    return static or (world.contacts == "all" and moving)
+
+
+def _object(thing: WorldObject) -> Mover:
+    shape = shape_of_object(thing)
+    values = (float(moment) for moment in moments(shape, thing.mass))
+    text = _OBJECT.format(*values, mass=float(thing.mass))
+    model = RobotModel(Path(thing.name), text, ("body",), (), (shape,))
+    return Mover(thing.name, model, False, thing.position, thing.orientation, is_object=True)
+
+
+def static_poses(parts: Parts) -> np.ndarray:
+    """Return the poses of what never moves, shape (statics, 7)."""
+    poses = [[*static.position, *static.orientation] for static in parts.statics]
+    found = np.array(poses, np.float64).reshape(-1, 7)
+    found[found[:, 6] < 0, 3:] *= -1
+    return found
+
+
+def layout_of(parts: Parts) -> Layout:
+    """Return names and places of everything in the state.
+
+    Raises:
+        ModelError: Two bodies have one name.
+    """
+    several = len(parts.world.robots) > 1
+    joints: list[Joint] = []
+    joint_names: list[str] = []
+    bodies: list[str] = []
+    position_index: dict[str, int] = {}
+    velocity_index: dict[str, int] = {}
+    places: dict[str, Part] = {}
+    nq = nv = 0
+    for mover in parts.movers:
+        prefix = f"{mover.name}/" if several else ""
+        begin = nq, nv, len(joint_names), len(bodies)
+        nq, nv = nq + (0 if mover.fixed_base else 7), nv + (0 if mover.fixed_base else 6)
+        for joint in mover.model.joints:
+            joint_names.append(prefix + joint.name)
+            position_index[joint_names[-1]], velocity_index[joint_names[-1]] = nq, nv
+            nq, nv = nq + 1, nv + 1
+        joints += mover.model.joints
+        bodies += [mover.name] if mover.is_object else [prefix + name for name in mover.model.links]
+        ends = nq, nv, len(joint_names), len(bodies)
+        slices = [slice(*pair) for pair in zip(begin, ends, strict=True)]
+        places[mover.name] = Part(mover.name, not mover.fixed_base, *slices)
+    statics = tuple(static.name for static in parts.statics)
+    _check_names([*bodies, *statics])
+    return Layout(
+        tuple(joint_names),
+        tuple(bodies),
+        position_index,
+        velocity_index,
+        nq,
+        nv,
+        lower=_column(joints, "lower"),
+        upper=_column(joints, "upper"),
+        max_velocity=_column(joints, "max_velocity"),
+        max_torque=_column(joints, "max_torque"),
+        parts=places,
+        statics=statics,
+        modes=tuple(joint.settings.mode for joint in joints),
+    )
+
+
+def _column(joints: Sequence[Joint], name: str) -> np.ndarray:
+    return np.array([getattr(joint, name) for joint in joints], np.float64)
+
+
+def _check_names(names: Sequence[str]) -> None:
+    if len(set(names)) == len(names):
+        return
+    name = next(name for name in names if names.count(name) > 1)
+    raise ModelError(
+        f'A link and an object, or the ground, have the same name "{name}". '
+        "Give the object another one."
+    )

@@ -1,0 +1,200 @@
+"""Collision shapes: what of a robot or object touches other things, the same for both engines."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from physx_core.errors import ModelError, listed, nearest
+from physx_core.simulation import Box, Capsule, Cylinder, Mesh, Robot, Sphere, WorldObject
+from physx_core.typing import Vector
+from physx_dart.shared.meshes import bounding_box, bounding_capsule, read_vertices
+from physx_dart.shared.robot_files import mesh_path
+from physx_dart.shared.rotations import matrix_from_quaternion
+
+_OPTIONS: dict[str, tuple[str, ...]] = {
+    "box": ("size",),
+    "sphere": ("radius",),
+    "mesh": ("filename",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+}
+"""What the element of each kind of shape says, as URDF files have it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """One shape of a body.
+
+    Attributes:
+        kind: ``box``, ``sphere``, ``capsule``, ``cylinder`` or ``mesh``.
+        size: In m: edges of a box (3,); radius of a sphere (1,); radius and length of the cylinder
+            alone (2,). For a mesh the factors of its lengths (3,).
+        position: Of its center in the body's frame, shape (3,), in m.
+        rotation: Matrix of its axes there, shape (3, 3).
+        body: Name of the link or object.
+        friction: Coefficient of friction.
+        restitution: Coefficient of restitution.
+        mesh: File of a mesh.
+    """
+
+    kind: str
+    size: tuple[float, ...]
+    position: Vector
+    rotation: Vector
+    body: str
+    friction: float
+    restitution: float
+    mesh: Path | None = None
+
+
+def shapes_of_robot(robot: Robot, path: Path, links: dict[str, Element]) -> tuple[Shape, ...]:
+    """Return the shapes with which a robot touches things.
+
+    Args:
+        robot: Its description.
+        path: Its URDF file.
+        links: Link elements by name.
+
+    Raises:
+        ModelError: A shape makes no sense, a mesh cannot be read, or a foot is no link.
+    """
+    unknown = [name for name in robot.feet if name not in links]
+    if unknown:
+        raise ModelError(
+            f'feet name "{unknown[0]}", which is no link.{nearest(unknown[0], links)} '
+            f"Links: {listed(links)}"
+        )
+    shapes: list[Shape] = []
+    for name, link in links.items():
+        if name in robot.feet:
+            size, zero = (float(robot.feet[name]),), np.zeros(3)
+            material = robot.friction, robot.restitution
+            shapes.append(Shape("sphere", size, zero, np.eye(3), name, *material))
+        elif robot.collisions != "none":
+            for element in link.findall("collision"):
+                shape = _read(robot, path, name, element)
+                shapes.append(_replaced(shape, robot.collisions))
+    return tuple(shapes)
+
+
+def shape_of_object(thing: WorldObject) -> Shape:
+    """Return the shape of an object.
+
+    Raises:
+        ModelError: Its kind is unknown, or its mesh does not exist or cannot be read.
+    """
+    mesh = None
+    if isinstance(thing, Box):
+        kind, size = "box", thing.size
+    elif isinstance(thing, Sphere):
+        kind, size = "sphere", (float(thing.radius),)
+    elif isinstance(thing, (Capsule, Cylinder)):
+        kind = type(thing).__name__.lower()
+        size = (float(thing.radius), float(thing.length))
+    elif isinstance(thing, Mesh):
+        kind, size, mesh = "mesh", (float(thing.scale),) * 3, Path(thing.path).absolute()
+        read_vertices(mesh, size)
+    else:
+        raise ModelError(f'Object "{thing.name}" is a {type(thing).__name__}, which is no shape.')
+    material = thing.friction, thing.restitution
+    return Shape(kind, size, np.zeros(3), np.eye(3), thing.name, *material, mesh)
+
+
+def moments(shape: Shape, mass: float) -> Vector:
+    """Return the principal moments of inertia of a solid body, shape (3,), in kg m²."""
+    if shape.kind == "sphere":
+        return np.full(3, 0.4 * mass * shape.size[0] ** 2)
+    if shape.kind in ("capsule", "cylinder"):
+        return np.array(_round_moments(shape, mass))
+    if shape.mesh is not None:
+        size = bounding_box(read_vertices(shape.mesh, shape.size))[1]
+    else:
+        size = np.array(shape.size)
+    squares = size**2
+    return mass / 12 * (squares.sum() - squares)
+
+
+def _round_moments(shape: Shape, mass: float) -> tuple[float, float, float]:
+    r, length = shape.size
+    body, ends = math.pi * r**2 * length, 4 / 3 * math.pi * r**3
+    if shape.kind == "cylinder":
+        ends = 0.0
+    cylinder, sphere = mass * body / (body + ends), mass * ends / (body + ends)
+    across = cylinder * (length**2 / 12 + r**2 / 4)
+    across += sphere * (0.4 * r**2 + length**2 / 4 + 3 / 8 * length * r)
+    return across, across, cylinder * r**2 / 2 + sphere * 0.4 * r**2
+
+
+def _read(robot: Robot, path: Path, link: str, element: Element) -> Shape:
+    geometry = element.find("geometry")
+    shape = None if geometry is None or not len(geometry) else geometry[0]
+    tag = "none" if shape is None else str(shape.tag)
+    if shape is None or tag not in _OPTIONS:
+        raise ModelError(f'link "{link}" has a collision shape "{tag}"; known: {listed(_OPTIONS)}')
+    if tag == "mesh":
+        size = tuple(_floats(link, "scale", shape.get("scale", "1 1 1"), 3))
+        mesh = mesh_path(path, shape.get("filename", ""), robot.package_dirs)
+    else:
+        parts = [_floats(link, name, shape.get(name, ""), None) for name in _OPTIONS[tag]]
+        size, mesh = tuple(number for part in parts for number in part), None
+        wanted = 3 if tag == "box" else len(_OPTIONS[tag])
+        if len(size) != wanted or not min(size) > 0:
+            raise ModelError(f'link "{link}" has a {tag} of size {size}')
+    origin = element.find("origin")
+    xyz, rpy = (
+        _floats(link, name, "0 0 0" if origin is None else origin.get(name, "0 0 0"), 3)
+        for name in ("xyz", "rpy")
+    )
+    material = robot.friction, robot.restitution
+    return Shape(tag, size, np.array(xyz), rotation_of(rpy), link, *material, mesh)
+
+
+def _floats(link: str, name: str, text: str, count: int | None) -> list[float]:
+    try:
+        numbers = [float(part) for part in text.split()]
+    except ValueError:
+        numbers = [math.nan]
+    if not all(map(math.isfinite, numbers)) or (count and len(numbers) != count) or not numbers:
+        raise ModelError(f'link "{link}" has a collision shape with {name}="{text}"')
+    return numbers
+
+
+def _replaced(shape: Shape, collisions: str) -> Shape:
+    """Return a mesh's bounding box or capsule, where that is wanted; else the shape itself."""
+    if shape.mesh is None:
+        return shape
+    vertices = read_vertices(shape.mesh, shape.size)
+    if collisions == "boxes":
+        center, size = bounding_box(vertices)
+        kind, axes = "box", np.eye(3)
+    elif collisions == "capsules":
+        center, axes, size = bounding_capsule(vertices)
+        kind = "capsule" if size[1] > 0 else "sphere"
+        size = size if size[1] > 0 else size[:1]
+    else:
+        return shape
+    return replace(
+        shape,
+        kind=kind,
+        size=tuple(float(length) for length in size),
+        position=shape.position + shape.rotation @ center,
+        rotation=shape.rotation @ axes,
+        mesh=None,
+    )
+
+
+def rotation_of(rpy: list[float]) -> Vector:
+    """Return the matrix, shape (3, 3), of roll, pitch and yaw as URDF files give them, in rad."""
+    if not any(rpy):
+        return np.eye(3)
+    roll, pitch, yaw = (0.5 * angle for angle in rpy)
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
+    z, w = cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy
+    return matrix_from_quaternion((x, y, z, w))

@@ -1,0 +1,323 @@
+"""Reading URDF files: the tree of links and joints, and a plain text of it for the engines.
+
+Both engines load the same text, rebuilt from the file: links with their inertia, joints with their
+place and axis. Everything else is read here, so that it means the same in both:
+
+- Shapes are left out; `physx_dart.shared.shapes` reads those for collisions. All meshes must exist.
+- A link without inertia, or of mass 0, gets 1e-9 kg and 1e-12 kg m².
+- Mimic joints are joints like any other.
+- A position limit whose ends are equal or absent, and a velocity or effort limit that is 0 or
+  absent, is no limit: many files write zeros where they know none.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+from physx_core.errors import ModelError, listed, nearest
+from physx_core.simulation import JointSettings, Robot
+from physx_dart.shared.robot_files import check_meshes, find_robot
+from physx_dart.shared.shapes import Shape, shapes_of_robot
+
+_MOVING = ("revolute", "continuous", "prismatic")
+_UNLIMITED = '<limit lower="-1e9" upper="1e9" effort="1e9" velocity="1e9"/>'
+_PLAIN = JointSettings()
+_SPECIAL = re.compile('[&<>"\t\n\r]')
+_MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+_NEGLIGIBLE = (
+    '<inertial><mass value="1e-9"/><inertia ixx="1e-12" iyy="1e-12" izz="1e-12" '
+    'ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint of one degree of freedom.
+
+    Attributes:
+        name: Name in the file.
+        lower: Lower limit of the position, in rad or m; -inf: none.
+        upper: Upper limit, likewise.
+        max_velocity: Limit of the velocity, in rad/s or m/s.
+        max_torque: Limit of the torque, in N m or N.
+        damping: Torque against the motion for each unit of velocity, in N m s/rad or N s/m.
+        friction: Coulomb friction, in N m or N.
+        settings: What else the world says of it.
+    """
+
+    name: str
+    lower: float
+    upper: float
+    max_velocity: float
+    max_torque: float
+    damping: float
+    friction: float
+    settings: JointSettings
+
+
+@dataclass(frozen=True)
+class RobotModel:
+    """What a URDF file says.
+
+    Attributes:
+        path: The file, absolute.
+        text: URDF text for the engines.
+        links: Names of all links, parents before children, in the order of the tree.
+        joints: The joints of one degree of freedom, in the order of the tree.
+        shapes: What touches other things; none where nothing can be touched.
+    """
+
+    path: Path
+    text: str
+    links: tuple[str, ...]
+    joints: tuple[Joint, ...]
+    shapes: tuple[Shape, ...] = ()
+
+
+def read_robot(robot: Robot, *, touching: bool = False) -> RobotModel:
+    """Read a robot's URDF file.
+
+    The tree is walked depth first, the children of a link in the order of their joints' names.
+
+    Args:
+        robot: The robot's description.
+        touching: Whether its collision shapes are wanted.
+
+    Raises:
+        ModelError: The file is missing or is no URDF, or its links form no tree.
+        MissingMeshesError: Mesh files that it names do not exist.
+    """
+    path = find_robot(robot.urdf)
+    root = parse_urdf(path)
+    check_meshes(path, root, robot.package_dirs)
+    try:
+        tree = _Tree(root)
+        if not robot.fixed_base and tree.links[0] == "world":
+            raise ModelError("its root link is the world, which cannot float; use fixed_base=True")
+        moving = [joint for joint in tree.joints if joint.get("type") in _MOVING]
+        joints = tuple(_joint(joint, robot.joints) for joint in moving)
+        _check_settings(robot, joints)
+        text = _engine_text(tree)
+        shapes = shapes_of_robot(robot, path, tree.elements) if touching else ()
+    except (ModelError, ValueError) as error:
+        raise ModelError(f'Robot "{robot.name}", {path}: {error}.') from error
+    return RobotModel(path, text, tuple(tree.links), joints, shapes)
+
+
+def _check_settings(robot: Robot, joints: tuple[Joint, ...]) -> None:
+    known = [joint.name for joint in joints]
+    for name in robot.joints:
+        if name not in known:
+            raise ModelError(
+                f'joints has settings for "{name}", which is no joint that moves.'
+                f"{nearest(name, known)} Joints: {listed(known)}"
+            )
+
+
+def parse_urdf(path: Path) -> Element:
+    """Return the root element of a URDF file.
+
+    Raises:
+        ModelError: The file is missing or is no URDF.
+    """
+    try:
+        text = path.read_bytes()
+    except FileNotFoundError:
+        raise ModelError(f"There is no URDF file {path}.") from None
+    except OSError as error:
+        raise ModelError(f"{path} cannot be read as a URDF file: {error}.") from error
+    if b"<!DOCTYPE" in text:
+        raise ModelError(f"{path} has a DOCTYPE; a URDF file has none, and its entities can bomb.")
+    try:
+        root = ElementTree.fromstring(text)  # without DOCTYPE there are no entities
+    except ElementTree.ParseError as error:
+        raise ModelError(f"{path} is not valid XML: {error}.") from error
+    if root.tag != "robot":
+        raise ModelError(f'{path} is no URDF: its root element is "{root.tag}", not "robot".')
+    return root
+
+
+class _Tree:
+    """Links and joint elements of a URDF in the order of the tree.
+
+    Attributes:
+        links: Names of the links, the root first.
+        elements: Link elements by name.
+        joints: Joint elements, in the order of the links that they lead to.
+    """
+
+    def __init__(self, root: Element) -> None:
+        self.elements = _by_name(root, "link")
+        children: dict[str, list[Element]] = {name: [] for name in self.elements}
+        parents: dict[str, str] = {}
+        for name, joint in sorted(_by_name(root, "joint").items()):
+            parent, child = (self._end(name, joint, end) for end in ("parent", "child"))
+            if child in parents:
+                raise ModelError(f'link "{child}" is the child of two joints, no tree')
+            parents[child] = parent
+            children[parent].append(joint)
+        if not self.elements:
+            raise ModelError("it has no link")
+        roots = [name for name in self.elements if name not in parents]
+        if len(roots) != 1:
+            found = f"links {listed(roots)} have no parent" if roots else "its joints form a circle"
+            raise ModelError(f"it needs one root link, but {found}")
+        self.links: list[str] = []
+        self.joints: list[Element] = []
+        self._walk(roots[0], children)
+        if len(self.links) != len(self.elements):
+            cut_off = self.elements.keys() - set(self.links)
+            raise ModelError(f"links {listed(cut_off)} form a circle apart from the root")
+
+    def _end(self, name: str, joint: Element, end: str) -> str:
+        element = joint.find(end)
+        link = "" if element is None else element.get("link", "")
+        if link not in self.elements:
+            raise ModelError(
+                f'joint "{name}" has {end} "{link}", which is no link; '
+                f"links: {listed(self.elements)}"
+            )
+        return link
+
+    def _walk(self, root: str, children: dict[str, list[Element]]) -> None:
+        self.links.append(root)
+        stack = list(reversed(children[root]))
+        while stack:
+            joint = stack.pop()
+            kind = joint.get("type", "")
+            if kind not in (*_MOVING, "fixed"):
+                raise ModelError(f'joint "{joint.get("name")}" has the type "{kind}", unsupported')
+            self.joints.append(joint)
+            self.links.append(link_of(joint, "child"))
+            stack.extend(reversed(children[self.links[-1]]))
+
+
+def link_of(joint: Element, end: str) -> str:
+    """Return the name of the link at one ``end``, ``parent`` or ``child``, of a joint element."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
+
+
+def _by_name(root: Element, tag: str) -> dict[str, Element]:
+    named: dict[str, Element] = {}
+    for element in root.findall(tag):
+        name = element.get("name", "")
+        if not name or name in named:
+            raise ModelError(f'a {tag} has the name "{name}", which is empty or there twice')
+        named[name] = element
+    return named
+
+
+def _joint(joint: Element, all_settings: Mapping[str, JointSettings]) -> Joint:
+    lower, upper = _number(joint, "limit", "lower"), _number(joint, "limit", "upper")
+    name = joint.get("name", "")
+    if lower > upper:
+        raise ModelError(f'joint "{name}" has the lower limit {lower} above the upper {upper}')
+    limited = joint.get("type") != "continuous" and lower < upper
+    settings = all_settings.get(name, _PLAIN)
+    damping, friction = settings.damping, settings.friction
+    return Joint(
+        name,
+        lower if limited else -math.inf,
+        upper if limited else math.inf,
+        _number(joint, "limit", "velocity") or math.inf,
+        _number(joint, "limit", "effort") or math.inf,
+        _number(joint, "dynamics", "damping") if damping is None else damping,
+        _number(joint, "dynamics", "friction") if friction is None else friction,
+        settings,
+    )
+
+
+def _number(joint: Element, tag: str, attribute: str) -> float:
+    """Return a finite number; 0 where it is absent."""
+    element = joint.find(tag)
+    text = "0" if element is None else element.get(attribute, "0")
+    signed = attribute in ("lower", "upper")
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number) or (number < 0 and not signed):
+        raise ModelError(f'joint "{joint.get("name")}" has {attribute}="{text}"')
+    return number
+
+
+def _engine_text(tree: _Tree) -> str:
+    parts = ['<robot name="robot">']
+    for name in tree.links:
+        link = _inertial(name, tree.elements[name])
+        parts.append(f"<link name={_quoted(name)}>{link}</link>")
+    for joint in tree.joints:
+        moving = joint.get("type") in _MOVING
+        kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
+        name = joint.get("name", "")
+        parts.append(f'<joint name={_quoted(name)} type="{kind if moving else "fixed"}">')
+        parts.append(_origin(f'joint "{name}"', joint))
+        for tag in ("parent", "child"):
+            parts.append(f"<{tag} link={_quoted(link_of(joint, tag))}/>")
+        if moving:
+            parts.append(f'<axis xyz="{_axis(joint)}"/>{_UNLIMITED}')
+        parts.append("</joint>")
+    return "".join([*parts, "</robot>"])
+
+
+def _quoted(name: str) -> str:
+    if not _SPECIAL.search(name):
+        return f'"{name}"'
+    from xml.sax.saxutils import quoteattr  # it loads much that is seldom needed
+
+    return quoteattr(name)
+
+
+def _inertial(name: str, link: Element) -> str:
+    """Return the text of what is known of a link's inertia, each number checked."""
+    given, where = link.find("inertial"), f'link "{name}"'
+    mass = None if given is None else given.find("mass")
+    if given is None or mass is None or _checked(where, mass, "value", "0", 1) == "0":
+        return _NEGLIGIBLE
+    if float(mass.get("value", "0")) < 0:
+        raise ModelError(f'{where} has the mass "{mass.get("value")}"')
+    inertia = given.find("inertia")
+    found = Element("none") if inertia is None else inertia
+    moments = " ".join(f'{key}="{_checked(where, found, key, "0", 1)}"' for key in _MOMENTS)
+    value = mass.get("value", "")
+    origin = _origin(where, given)
+    return f'<inertial>{origin}<mass value="{value}"/><inertia {moments}/></inertial>'
+
+
+def _origin(where: str, given: Element) -> str:
+    origin = given.find("origin")
+    if origin is None:
+        return ""
+    xyz, rpy = (_checked(where, origin, key, "0 0 0", 3) for key in ("xyz", "rpy"))
+    return f'<origin xyz="{xyz}" rpy="{rpy}"/>'
+
+
+def _checked(where: str, element: Element, attribute: str, default: str, count: int) -> str:
+    """Return an attribute's text as it is, "0" for one that is zero; it must be finite numbers."""
+    text = element.get(attribute, default)
+    try:
+        numbers = [float(part) for part in text.split()]
+    except ValueError:
+        numbers = [math.nan]
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise ModelError(f'{where} has {attribute}="{text}"')
+    return text if any(numbers) or count > 1 else "0"
+
+
+def _axis(joint: Element) -> str:
+    element = joint.find("axis")
+    text = "1 0 0" if element is None else element.get("xyz", "1 0 0")
+    axis = [float(part) for part in text.split()]
+    length = math.hypot(*axis)
+    if len(axis) != 3 or not 0 < length < math.inf:
+        raise ModelError(f'joint "{joint.get("name")}" has the axis "{text}"')
+    if length == 1.0:
+        return text
+    return " ".join(repr(part / length) for part in axis)

@@ -1,0 +1,18 @@
+"""Robots as Gymnasium environments, on any engine.
+
+The public names are imported when they are first used. Importing the package registers its
+environments with Gymnasium, ``physx/Cartpole-v0`` and others, and has OpenMP's threads rest soon,
+so that a policy's network leaves the processor to them: import it before the network's library.
+"""
+
+from __future__ import annotations
+
+import lazy_loader
+
+from physx_core import rest_soon
+from physx_gym.registration import register
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+register()
+rest_soon()

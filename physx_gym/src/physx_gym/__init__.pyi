@@ -1,0 +1,30 @@
+"""Robots as Gymnasium environments, on any engine."""
+
+from .blocks import Block as Block
+from .blocks import BodyObserver as BodyObserver
+from .blocks import ControllerBlock as ControllerBlock
+from .blocks import MahonyFilter as MahonyFilter
+from .blocks import MotorSafetyLimit as MotorSafetyLimit
+from .blocks import ObserverBlock as ObserverBlock
+from .blocks import PDAdapter as PDAdapter
+from .blocks import PDController as PDController
+from .blocks import QuantityObserver as QuantityObserver
+from .bridge.gym_environment import GymEnvironment as GymEnvironment
+from .bridge.policy import Policy as Policy
+from .build.pipeline import build_pipeline as build_pipeline
+from .build.pipeline import load_pipeline as load_pipeline
+from .env.layers.composed import ComposedEnv as ComposedEnv
+from .env.layers.controlled import ControlledEnv as ControlledEnv
+from .env.layers.layer import Layer as Layer
+from .env.layers.observed import ObservedEnv as ObservedEnv
+from .env.pipeline_env import PipelineEnv as PipelineEnv
+from .env.robot_env import RobotEnv as RobotEnv
+from .show.plotting import plot as plot
+from .show.replaying import replay as replay
+from .simulator.simulator import Simulator as Simulator
+from .simulator.states import RobotState as RobotState
+from .simulator.states import StepperState as StepperState
+from .tasks.trajectory import Trajectory as Trajectory
+from .telemetry.log import Log as Log
+from .telemetry.log_file import read_log as read_log
+from .vector.vector_env import ParallelVectorEnv as ParallelVectorEnv

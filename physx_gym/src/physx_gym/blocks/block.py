@@ -1,0 +1,208 @@
+"""Blocks: what observes or controls inside the physics loop, each at its own period."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar, cast
+
+import gymnasium
+import numpy as np
+
+from physx_core.errors import ConfigError, SimulationError
+from physx_core.typing import Vector
+from physx_gym.env.buffers import neutral
+from physx_gym.env.pipeline_env import PipelineEnv
+from physx_gym.env.shared_arrays import SharedArrays
+
+
+class Block(SharedArrays, ABC):
+    """A part of a pipeline with a period of its own; a layer puts it on an environment.
+
+    Subclasses make spaces and buffers in `connect`, prepare in `setup` what depends on the periods,
+    and begin an episode in `begin`. What they remember from one call to the next are attributes
+    named in `memory`: arrays, which are kept and updated in place, or plain numbers and lists.
+
+    Attributes:
+        name: Name within the pipeline.
+        env: The environment that the block is put on.
+        update_ratio: Period in periods of the environment below; -1: a step of the environment.
+        every: Period in physics steps; 0 before the first reset.
+        period: The same in s.
+        connected_to: Which of the simulator's builds it is connected to; -1: none yet.
+        memory: Names of the attributes that `snapshot` keeps.
+    """
+
+    memory: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, name: str, env: PipelineEnv, *, update_ratio: int = 1) -> None:
+        """Make the block for an environment.
+
+        Raises:
+            ConfigError: The name or the ratio cannot be.
+        """
+        if not isinstance(env, PipelineEnv):
+            raise ConfigError(
+                f"{type(self).__name__} is for a RobotEnv or a layer of one, not for {env!r}."
+            )
+        if not isinstance(name, str) or not name or "." in name:
+            raise ConfigError(f"The name of a block is {name!r} but must be a text without dots.")
+        is_number = isinstance(update_ratio, (int, np.integer)) and not isinstance(
+            update_ratio, bool
+        )
+        if not is_number or (update_ratio < 1 and update_ratio != -1):
+            raise ConfigError(
+                f'Block "{name}": update_ratio is {update_ratio!r} but must be a whole number of '
+                "periods of the layer below, or -1 for a step of the environment."
+            )
+        self.name, self.env, self.update_ratio = name, env, int(update_ratio)
+        self.every, self.period = 0, 0.0
+        self.connected_to = -1
+
+    def refresh_connection(self) -> None:
+        """Call `connect`, unless the simulator is as it was the last time.
+
+        Layers do so when they are made and at every reset; a constructor may, so that spaces are
+        known before there is a layer.
+        """
+        builds = self.env.simulator.builds
+        if builds != self.connected_to:
+            self.connect()
+            self.connected_to = builds
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Make spaces and buffers that fit the environment.
+
+        Called when a layer puts the block on its environment, and at a reset that changed the
+        simulator's options, so limits and sensors may be others then.
+
+        Raises:
+            ConfigError: The environment lacks what the block needs.
+        """
+
+    def setup(self) -> None:
+        """Take up the periods; called at every reset, before `begin`.
+
+        Raises:
+            ConfigError: The block's period does not divide a step of the environment.
+        """
+        physics = self.env.simulator.period
+        step = round(self.env.step_dt / physics)
+        every = step
+        if self.update_ratio > 0:
+            every = self.update_ratio * round(self._period_below() / physics)
+        if step % every:
+            raise ConfigError(
+                f'Block "{self.name}": its period of {every * physics:g} s does not divide a step '
+                f"of the environment, {self.env.step_dt:g} s. Change update_ratio."
+            )
+        self.every, self.period = every, every * physics
+
+    @abstractmethod
+    def _period_below(self) -> float:
+        """Return the period of the environment below, in s."""
+
+    def begin(self) -> None:
+        """Begin an episode: the simulation has its first state, and sensors have measured it."""
+
+    @property
+    def state_space(self) -> gymnasium.Space[Any] | None:
+        """Space of `get_state`; None: the block has no state to observe."""
+        return None
+
+    def get_state(self) -> Any:
+        """Return the state that observations show: an array, updated in place; None: none."""
+        return None
+
+    @property
+    def state_fieldnames(self) -> Any:
+        """Names of the numbers of `get_state`, nested like it; None: numbered."""
+        return None
+
+    def snapshot(self) -> Any:
+        """Return everything that `restore` needs to go on exactly from here; plain data."""
+        return {name: _copied(getattr(self, name)) for name in self.memory}
+
+    def restore(self, state: Any) -> None:
+        """Go back to a snapshot of a block that is built alike.
+
+        Raises:
+            SimulationError: It is of another block.
+        """
+        if not isinstance(state, Mapping) or set(state) != set(self.memory):
+            raise SimulationError(f'The snapshot is not of the block "{self.name}".')
+        for name in self.memory:
+            own, given = getattr(self, name), state[name]
+            if not isinstance(own, np.ndarray):
+                setattr(self, name, _copied(given))
+            elif np.shape(given) == own.shape:
+                own[...] = given
+            else:
+                raise SimulationError(
+                    f'The snapshot is not of the block "{self.name}": {name} has the shape '
+                    f"{np.shape(given)}, not {own.shape}."
+                )
+
+
+class ObserverBlock(Block):
+    """Computes features from what the environment below observes.
+
+    Attributes:
+        observation_space: Space of the features.
+        observation: The features, updated in place.
+    """
+
+    observation_space: gymnasium.Space[Any]
+    observation: Any
+
+    def _observe_in(self, space: gymnasium.Space[Any]) -> None:
+        """Set the space of the features, and make their buffer."""
+        self.observation_space, self.observation = space, neutral(space)
+
+    def _period_below(self) -> float:
+        return self.env.observe_dt
+
+    @property
+    def fieldnames(self) -> Any:
+        """Names of the features' numbers, nested like `observation`; None: numbered."""
+        return None
+
+    @abstractmethod
+    def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
+        """Bring `observation` to the present, in place; called once every period.
+
+        Args:
+            measurement: What was measured: ``t``, ``states``, ``measurements``.
+        """
+
+
+class ControllerBlock(Block):
+    """Computes the action of the environment below from an action of its own.
+
+    Attributes:
+        action_space: Space of the block's own actions.
+    """
+
+    action_space: gymnasium.Space[Any]
+
+    def _period_below(self) -> float:
+        return self.env.control_dt
+
+    @property
+    def fieldnames(self) -> Any:
+        """Names of the action's numbers, nested like it; None: numbered."""
+        return None
+
+    @abstractmethod
+    def compute_command(self, action: Any, command: Vector) -> None:
+        """Write the action of the environment below in place; called once every period.
+
+        Args:
+            action: What the block shall do, within `action_space`.
+            command: Action of the environment below.
+        """
+
+
+def _copied(value: Any) -> Any:
+    return cast(Any, value).copy() if isinstance(value, (np.ndarray, list)) else value

@@ -1,0 +1,114 @@
+"""A limit of torques that keeps joints within soft limits."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy import add, maximum, minimum, multiply, subtract
+
+from physx_core.typing import Vector
+from physx_gym.blocks.block import ControllerBlock
+from physx_gym.blocks.motor_joints import MotorJoints, per_motor
+from physx_gym.blocks.pd_controller import check_torques
+
+if TYPE_CHECKING:
+    from physx_gym.env.layers.layer import PipelineEnv
+
+
+class MotorSafetyLimit(ControllerBlock):
+    """Cuts the motors' torques so that soft limits of positions and velocities are kept.
+
+    The closer a joint is to a soft limit of its position, the slower it may move towards it:
+    its velocity shall be between ``-kp * (position - soft_limit)`` of both sides and within
+    `soft_velocity_max`. The torque may at most be ``kd`` times what is left to these velocities;
+    beyond a limit it pushes back. This is how PR2's controllers kept joints safe, see
+    http://wiki.ros.org/pr2_controller_manager/safety_limits. The motors cut what is beyond their
+    own limits.
+
+    Its action: torques, as those of the environment below.
+
+    Attributes:
+        joints: The motors' joints.
+        soft_lower: Soft lower limits of the positions, shape (motors,), in rad or m.
+        soft_upper: Soft upper limits, likewise.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        env: PipelineEnv,
+        *,
+        update_ratio: int = 1,
+        kp: Any,
+        kd: Any,
+        soft_position_margin: Any = 0.0,
+        soft_velocity_max: Any = np.inf,
+    ) -> None:
+        """Limit the torques of an environment's motors.
+
+        Args:
+            name: Name within the pipeline.
+            env: The environment below.
+            update_ratio: See `Block`.
+            kp: Velocity for each unit of distance from a soft limit, in 1/s; this and all that
+                follow: a number, or one for each motor.
+            kd: Torque at the joint for each unit of velocity, in N m s/rad or N s/m.
+            soft_position_margin: How far soft limits are within the joints' limits, in rad or m.
+            soft_velocity_max: Highest velocity, in rad/s or m/s.
+
+        Raises:
+            ConfigError: An option cannot be, or something is missing below.
+        """
+        super().__init__(name, env, update_ratio=update_ratio)
+        self.kp, self.kd = kp, kd
+        self.soft_position_margin = soft_position_margin
+        self.soft_velocity_max = soft_velocity_max
+        self.refresh_connection()
+
+    def connect(self) -> None:
+        """Take up the limits of the environment's motors."""
+        where = f'MotorSafetyLimit "{self.name}"'
+        self.joints = MotorJoints(self.env, where)
+        count = len(self.joints.names)
+        check_torques(where, self.env, count)
+        self.action_space = self.env.action_space
+        numbers = partial(per_motor, where, count)
+        kp, kd = numbers("kp", self.kp, positive=True), numbers("kd", self.kd, positive=True)
+        margin = numbers("soft_position_margin", self.soft_position_margin)
+        fastest = numbers("soft_velocity_max", self.soft_velocity_max)
+        self.soft_lower, self.soft_upper = self.joints.lower + margin, self.joints.upper - margin
+        kd = kd / np.abs(self.joints.reduction)
+        signs = np.sign(self.joints.reduction)
+        # With a shaft that turns the other way, the joint's upper limit is the shaft's lower one.
+        limits = np.sort(np.array([self.soft_lower, self.soft_upper]) * signs, axis=0)
+        self._encoders = self.joints.encoders
+        self._scaled, gains = self._encoders.buffer(), self._encoders.buffer()
+        gains[:] = np.array([kp * kd, kd]) * signs
+        self._room = np.zeros((2, count))
+        self._parts = (*self._scaled, *(kp * kd * limits), *self._room)
+        self._measured = (self._encoders.values, gains, self._scaled)
+        self._most = np.array([kd * fastest] * 2)
+        self._least = -self._most
+        self._bounded = bool(np.isfinite(self._most).any())
+
+    def compute_command(self, action: Vector, command: Vector) -> None:
+        """Write the torques that are safe, shape (motors,), in N m or N."""
+        if self._encoders.is_copy:
+            self._encoders.refresh()
+        positions, velocities, lower, upper, backward, forward = self._parts
+        multiply(*self._measured)
+        if self._bounded:
+            subtract(lower, positions, backward)
+            subtract(upper, positions, forward)
+            minimum(self._room, self._most, out=self._room)
+            maximum(self._room, self._least, out=self._room)
+            subtract(backward, velocities, backward)
+            subtract(forward, velocities, forward)
+        else:
+            add(positions, velocities, positions)
+            subtract(lower, positions, backward)
+            subtract(upper, positions, forward)
+        maximum(action, backward, out=command)
+        minimum(command, forward, out=command)

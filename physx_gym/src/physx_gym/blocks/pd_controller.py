@@ -1,0 +1,167 @@
+"""A proportional-derivative controller whose targets move within bounds."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy import add, maximum, minimum, multiply, subtract
+
+from physx_core.errors import ConfigError
+from physx_core.typing import Vector
+from physx_gym.blocks.block import ControllerBlock
+from physx_gym.blocks.motor_joints import MotorJoints, per_motor
+from physx_gym.blocks.targets import Targets
+
+if TYPE_CHECKING:
+    from physx_gym.env.layers.layer import PipelineEnv
+
+
+class PDController(ControllerBlock):
+    """Drives the motors' joints to targets that follow an action: accelerations of the targets.
+
+    In each period the targets move on, as in `Targets`, and the torques of the motors are ``kp *
+    ((target - position) + kd * (target_velocity - velocity)) / reduction``, cut at the motors'
+    limits. Positions and velocities are those that encoders measure. An episode begins with the
+    targets where the joints are.
+
+    Its action: accelerations, shape (motors,), in rad/s² or m/s². Its state: positions and
+    velocities of the targets, shape (2, motors).
+
+    Attributes:
+        joints: The motors' joints.
+        lower: Lowest positions of the targets, shape (motors,), in rad or m.
+        upper: Highest positions, likewise.
+        max_velocity: Highest velocities of the targets, in rad/s or m/s.
+        max_acceleration: Highest accelerations of the targets, in rad/s² or m/s².
+        targets: The targets.
+    """
+
+    memory: ClassVar[tuple[str, ...]] = ("target_state",)
+
+    def __init__(
+        self,
+        name: str,
+        env: PipelineEnv,
+        *,
+        update_ratio: int = 1,
+        kp: Any,
+        kd: Any,
+        joint_position_margin: Any = 0.0,
+        joint_velocity_limit: Any = np.inf,
+        joint_acceleration_limit: Any = None,
+    ) -> None:
+        """Control the motors of an environment whose action is their torques.
+
+        Args:
+            name: Name within the pipeline.
+            env: The environment below.
+            update_ratio: See `Block`.
+            kp: Torque at the joint for each unit of position error, in N m/rad or N/m; this and all
+                that follow: a number, or one for each motor.
+            kd: Damping for each unit of `kp`, in s.
+            joint_position_margin: How far targets stay from the joints' limits, in rad or m.
+            joint_velocity_limit: Highest velocity of the targets, in rad/s or m/s; those of joints
+                and motors hold too.
+            joint_acceleration_limit: Highest acceleration of the targets, in rad/s² or m/s²; None:
+                such that a step of the environment can turn the highest velocity around.
+
+        Raises:
+            ConfigError: An option cannot be, or something is missing below.
+        """
+        super().__init__(name, env, update_ratio=update_ratio)
+        self.kp, self.kd = kp, kd
+        self.joint_position_margin = joint_position_margin
+        self.joint_velocity_limit = joint_velocity_limit
+        self.joint_acceleration_limit = joint_acceleration_limit
+        self.refresh_connection()
+
+    def connect(self) -> None:
+        """Take up the limits of the environment's motors."""
+        where = f'PDController "{self.name}"'
+        self.joints = MotorJoints(self.env, where)
+        check_torques(where, self.env, len(self.joints.names))
+        numbers = partial(per_motor, where, len(self.joints.names))
+        kp, kd = numbers("kp", self.kp, positive=True), numbers("kd", self.kd)
+        margin = numbers("joint_position_margin", self.joint_position_margin)
+        fastest = numbers("joint_velocity_limit", self.joint_velocity_limit)
+        self.max_velocity = np.minimum(self.joints.max_velocity, fastest)
+        most = self.joint_acceleration_limit
+        if most is None:
+            most = 2 * self.max_velocity / self.env.step_dt
+            if not np.isfinite(most).all():
+                raise ConfigError(
+                    f"{where}: the velocities of some joints have no limit. Give "
+                    "joint_velocity_limit or joint_acceleration_limit."
+                )
+        self.max_acceleration = numbers("joint_acceleration_limit", most, positive=True)
+        self.lower, self.upper = self.joints.lower + margin, self.joints.upper - margin
+        most = self.max_acceleration
+        self.action_space = spaces.Box(-most, most, dtype=np.float64)
+        self.targets = Targets(self.lower, self.upper, self.max_velocity, self.max_acceleration)
+        self.target_state = self.targets.state
+        gains = kp / self.joints.reduction
+        self._encoders, self._errors = self.joints.encoders, np.zeros((2, len(gains)))
+        self._gains = np.array([gains, gains * kd])
+        self._least, self._most = -self.joints.max_torque, self.joints.max_torque
+        # Row by row, as what is measured may have another order in memory.
+        targets = (self.targets.positions, self.targets.velocities)
+        self._rows = (*targets, *self._encoders.values, *self._errors)
+
+    def setup(self) -> None:
+        """Take up the periods."""
+        super().setup()
+        self.targets.set_period(self.period)
+
+    def begin(self) -> None:
+        """Begin with the targets where the joints are."""
+        self._encoders.refresh()
+        self.targets.start(*self._encoders.values)
+
+    @property
+    def fieldnames(self) -> list[str]:
+        """Names of the accelerations."""
+        return [f"targetAcceleration.{name}" for name in self.joints.names]
+
+    @property
+    def state_space(self) -> spaces.Box:
+        """Space of the targets' positions and velocities."""
+        return spaces.Box(*self.targets.bounds, dtype=np.float64)
+
+    def get_state(self) -> Vector:
+        """Return positions and velocities of the targets, shape (2, motors)."""
+        return self.targets.pair
+
+    @property
+    def state_fieldnames(self) -> list[list[str]]:
+        """Names of the targets' positions and velocities."""
+        names = self.joints.names
+        return [[f"{kind}.{name}" for name in names] for kind in ("target", "targetVelocity")]
+
+    def compute_command(self, action: Vector, command: Vector) -> None:
+        """Move the targets on, and write the torques, shape (motors,), in N m or N."""
+        self.targets.step(action)
+        if self._encoders.is_copy:
+            self._encoders.refresh()
+        positions, velocities, seen, seen_velocities, errors, velocity_errors = self._rows
+        subtract(positions, seen, errors)
+        subtract(velocities, seen_velocities, velocity_errors)
+        multiply(self._errors, self._gains, self._errors)
+        add(errors, velocity_errors, command)
+        minimum(command, self._most, out=command)
+        maximum(command, self._least, out=command)
+
+
+def check_torques(where: str, env: PipelineEnv, count: int) -> None:
+    """Check that an environment's action is one torque for each motor.
+
+    Raises:
+        ConfigError: It is not.
+    """
+    if env.action_space.shape != (count,):
+        raise ConfigError(
+            f"{where}: the environment below takes the action {env.action_space}, not the torques "
+            f"of {count} motors."
+        )

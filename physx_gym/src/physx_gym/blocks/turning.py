@@ -1,0 +1,149 @@
+"""How links of a robot are turned against each other, from the angles of the joints between them.
+
+Turns are a product of exponentials (R. W. Brockett, 1984): with the axes of the joints in a pose of
+reference, ``R = exp(a1 * d1) ... exp(an * dn) * R0``, where d are the joints' ways from there.
+Quaternions are x, y, z, w, in plain numbers, as there are few of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from physx_core.errors import FeatureNotSupportedError
+from physx_core.simulation import Simulation
+from physx_core.typing import Vector
+
+Quaternion = tuple[float, float, float, float]
+Axis = tuple[float, float, float]
+
+
+def product(a: Sequence[float], b: Sequence[float]) -> Quaternion:
+    """Return the quaternion that turns by `b`, then by `a`."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        ax * bw + aw * bx + ay * bz - az * by,
+        ay * bw + aw * by + az * bx - ax * bz,
+        az * bw + aw * bz + ax * by - ay * bx,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def inverse(q: Sequence[float]) -> Quaternion:
+    """Return the quaternion that turns back."""
+    return -q[0], -q[1], -q[2], q[3]
+
+
+def turned(q: Sequence[float], vector: Sequence[float]) -> Axis:
+    """Return a vector turned by a quaternion."""
+    x, y, z, _ = product(product(q, (*vector, 0.0)), inverse(q))
+    return x, y, z
+
+
+def about(axis: Axis, angle: float) -> Quaternion:
+    """Return the turn about an axis of length 1 by an angle, in rad."""
+    s = math.sin(0.5 * angle)
+    return s * axis[0], s * axis[1], s * axis[2], math.cos(0.5 * angle)
+
+
+class Turning:
+    """How one link is turned, from how another one is.
+
+    Attributes:
+        joints: Names of the joints between them.
+    """
+
+    def __init__(self, simulation: Simulation, known: str, wanted: str) -> None:
+        """Find the way between two links of a robot.
+
+        Args:
+            simulation: Which the links are in.
+            known: Link whose attitude will be known.
+            wanted: Link whose attitude is wanted.
+
+        Raises:
+            FeatureNotSupportedError: The engine has no Jacobians, and the links are not the same.
+            SimulationError: There is no link of such a name.
+        """
+        self.joints: tuple[str, ...] = ()
+        self._up: list[tuple[int, Axis]] = []
+        self._down: list[tuple[int, Axis]] = []
+        self._before = self._after = (0.0, 0.0, 0.0, 1.0)
+        if known == wanted:
+            return
+        if "jacobian" not in simulation.features:
+            raise FeatureNotSupportedError(simulation.engine, "jacobian", simulation.features)
+        reference = _reference(simulation)
+        poses = simulation.body_poses([known, wanted], reference)[:, 3:].tolist()
+        self._before, self._after = tuple(poses[0]), tuple(poses[1])
+        first, second = (_axes(simulation, name, reference) for name in (known, wanted))
+        shared = first.keys() & second.keys()
+        chains = [{j: a for j, a in axes.items() if j not in shared} for axes in (first, second)]
+        self.joints = (*chains[0], *chains[1])
+        places = {name: place for place, name in enumerate(self.joints)}
+        self._up = [(places[name], axis) for name, axis in chains[0].items()]
+        self._down = [(places[name], axis) for name, axis in chains[1].items()]
+
+    def carry(
+        self,
+        attitude: Quaternion,
+        rate: Sequence[float],
+        angles: Sequence[float],
+        rates: Sequence[float],
+    ) -> tuple[Quaternion, Axis]:
+        """Return attitude and angular velocity of the wanted link.
+
+        Args:
+            attitude: Of the known link, in the world.
+            rate: Its angular velocity along its own axes, in rad/s.
+            angles: Of the joints, in rad.
+            rates: Of the joints, in rad/s.
+
+        Returns:
+            Quaternion in the world, and rad/s along the link's own axes.
+        """
+        if not self.joints:
+            return attitude, (rate[0], rate[1], rate[2])
+        first, back = _walked(self._up, angles, rates)
+        second, forth = _walked(self._down, angles, rates)
+        first, second = product(first, self._before), product(second, self._after)
+        common = turned(first, rate)
+        moved = [c - b + f for c, b, f in zip(common, back, forth, strict=True)]
+        whole = product(attitude, product(inverse(first), second))
+        return whole, turned(inverse(second), moved)
+
+
+def _walked(
+    chain: list[tuple[int, Axis]], angles: Sequence[float], rates: Sequence[float]
+) -> tuple[Quaternion, Axis]:
+    """Return the turn of a chain of joints, and the angular velocity at its end."""
+    turn: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    wx = wy = wz = 0.0
+    for place, axis in chain:
+        x, y, z = turned(turn, axis)
+        wx, wy, wz = wx + x * rates[place], wy + y * rates[place], wz + z * rates[place]
+        turn = product(turn, about(axis, angles[place]))
+    return turn, (wx, wy, wz)
+
+
+def _reference(simulation: Simulation) -> Vector:
+    """Return positions with all joints at 0 and all bases as the world's axes are."""
+    found = np.zeros(simulation.layout.nq)
+    for part in simulation.layout.parts.values():
+        if part.floating:
+            found[part.positions.start + 6] = 1.0
+    return found
+
+
+def _axes(simulation: Simulation, body: str, reference: Vector) -> dict[str, Axis]:
+    """Return the axes of the joints that turn a link, those close to the base first."""
+    jacobian = simulation.jacobian(body, reference)[3:]
+    found = {}
+    for name, place in simulation.layout.velocity_index.items():
+        x, y, z = jacobian[:, place].tolist()
+        if abs(x) + abs(y) + abs(z) > 0.5:
+            found[name] = (x, y, z)
+    return found

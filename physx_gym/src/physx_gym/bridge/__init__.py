@@ -1,0 +1,1 @@
+"""Gymnasium environments as physx environments, and networks as policies."""

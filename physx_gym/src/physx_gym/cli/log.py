@@ -1,0 +1,68 @@
+"""``physx log``: show recorded episodes as a table, a plot, or a replay."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from physx_gym.telemetry.log import TIME, Log
+from physx_gym.telemetry.log_file import read_log
+
+
+@dataclass
+class ShowLog:
+    """Show logs of episodes: their columns, as a plot, or in the viewer."""
+
+    files: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
+    """The log files."""
+    columns: tuple[str, ...] = ()
+    """Only columns whose names begin so."""
+    plot: str | None = None
+    """Write a plot of the columns, of all files together, to this file."""
+    replay: str | None = None
+    """Write a recording of the episodes side by side, for the viewer, to this file (.rrd)."""
+
+
+def run(words: Sequence[str]) -> None:
+    """Print each log as a table, or write a plot or a recording.
+
+    Raises:
+        LogError: A file cannot be read, or holds nothing of what is wanted.
+        MissingLibraryError: Matplotlib is not installed.
+        PluginNotFoundError: The viewer is not installed.
+    """
+    options = tyro.cli(ShowLog, args=words, prog="physx log")
+    logs = [read_log(file) for file in options.files]
+    if options.plot is not None:
+        from physx_gym.show.plotting import plot
+
+        plot(logs, path=options.plot, columns=options.columns or None, enable_block_states=True)
+        print(f"plot: {options.plot}")
+    if options.replay is not None:
+        from physx_gym.show.replaying import replay
+
+        print(f"recording: {replay(logs, path=options.replay)}")
+    if options.plot is None and options.replay is None:
+        for log in logs:
+            _print_table(log, options.columns)
+
+
+def _print_table(log: Log, columns: tuple[str, ...]) -> None:
+    """Print what the log is of, and a line for each column."""
+    rows = len(log.time)
+    duration = log.time[-1] - log.time[0] if rows else 0.0
+    of = log.constants.get("environment", "?"), log.constants.get("backend", "?")
+    print(f"{log.path}: {of[0]} on {of[1]}, seed {log.constants.get('seed', '?')}")
+    print(f"{rows} rows of {len(log.variables)} columns, {duration:g} s\n")
+    chosen = [name for name in log.variables if name.startswith(columns or "") and name != TIME]
+    width = max(map(len, chosen), default=4)
+    print(f"{'column':{width}}  {'min':>10}  {'max':>10}  {'mean':>10}  {'last':>10}  unit")
+    for name in chosen:
+        values = log.variables[name]
+        figures = (values.min(), values.max(), np.mean(values), values[-1]) if rows else ()
+        text = "  ".join(f"{figure:10.4g}" for figure in figures)
+        print(f"{name:{width}}  {text}  {log.units.get(name, '')}".rstrip())

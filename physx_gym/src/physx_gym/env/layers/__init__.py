@@ -1,0 +1,1 @@
+"""Layers that wrap an environment: observers, controllers, tasks."""

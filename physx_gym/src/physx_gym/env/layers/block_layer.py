@@ -1,0 +1,160 @@
+"""What layers with a block have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from gymnasium import spaces
+
+from physx_core.errors import ConfigError
+from physx_core.typing import Vector
+from physx_gym.blocks.block import ControllerBlock, ObserverBlock
+from physx_gym.env.layers.layer import Layer, PipelineEnv
+
+
+class Rhythm:
+    """When a block runs, and what to call: at hand in one place, as a layer's attributes are slow.
+
+    Attributes:
+        run: Runs the block.
+        act: Computes commands in the next environment below that does.
+        observe: Observes in the next environment below that does.
+        target: Action of that environment.
+        stepper: Where the episode is.
+        every: Period of the block, in physics steps.
+        last: Physics step of the episode at which the block ran last; -1: not yet.
+    """
+
+    __slots__ = ("act", "every", "last", "observe", "run", "stepper", "target")
+
+    def __init__(self, env: PipelineEnv, block: ObserverBlock | ControllerBlock) -> None:
+        acts = _next_with("compute_command", env)
+        self.act, self.target = acts.compute_command, acts.action
+        self.observe = _next_with("refresh_observation", env).refresh_observation
+        self.run: Any = (
+            block.refresh_observation if isinstance(block, ObserverBlock) else block.compute_command
+        )
+        self.stepper = env.stepper_state
+        self.every, self.last = max(block.every, 1), -1
+
+
+def _next_with(method: str, env: PipelineEnv) -> PipelineEnv:
+    """Return the next environment, from this one down, that does more than to forward a method."""
+    forwards = (getattr(Layer, method), getattr(BlockLayer, method))
+    while isinstance(env, Layer) and getattr(type(env), method) in forwards:
+        env = env.env
+    return env
+
+
+class BlockLayer(Layer):
+    """A layer that runs a block at the block's own period.
+
+    Attributes:
+        block: The block.
+    """
+
+    block: ObserverBlock | ControllerBlock
+
+    def __init__(self, env: PipelineEnv, block: ObserverBlock | ControllerBlock) -> None:
+        """Put a block on the environment that it was made for.
+
+        Raises:
+            ConfigError: It was made for another one, or its name is taken.
+        """
+        if block.env is not env:
+            raise ConfigError(
+                f'The block "{block.name}" was made for {block.env!r}, not for {env!r}. '
+                "Make a block and the layer that runs it for the same environment."
+            )
+        for below in env.layers:
+            if isinstance(below, BlockLayer) and below.block.name == block.name:
+                raise ConfigError(
+                    f'The pipeline already has a block "{block.name}". Give each block a name of '
+                    "its own."
+                )
+        self.block = block
+        self._basis: tuple[Any, ...] = ()
+        self._build = -1
+        self._rhythm = Rhythm(env, block)
+        super().__init__(env)
+
+    def _initialize_action_space(self) -> None:
+        """Let the block take up what changed in the simulator."""
+        self.block.refresh_connection()
+        self._initialize_actions()
+
+    def _initialize_actions(self) -> None:
+        """Set `action_space` and `action`."""
+        super()._initialize_action_space()
+
+    def _initialize_observation_space(self) -> None:
+        """Add the block's parts to the observation below, unless that is as it was."""
+        build = self.block.connected_to
+        basis = (self.env.observation_space, self.env.observation, self.action)
+        if build == self._build and all(a is b for a, b in zip(self._basis, basis, strict=True)):
+            return
+        self._basis, self._build = basis, build
+        super()._initialize_observation_space()
+        self._add_parts()
+        state, space = self.block.get_state(), self.block.state_space
+        if state is not None and space is not None:
+            self._add_part("states", space, state)
+            self.register_variable("state", state, self.block.state_fieldnames, self.block.name)
+
+    def _add_parts(self) -> None:
+        """Add what is observed besides the block's state."""
+
+    def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
+        """Let the layers below observe."""
+        self._rhythm.observe(measurement)
+
+    def compute_command(self, action: Any, command: Vector) -> None:
+        """Let the layers below compute the command of this layer's action."""
+        self._rhythm.act(action, command)
+
+    def _initialize_buffers(self) -> None:
+        super()._initialize_buffers()
+        self.block.setup()
+        self.block.begin()
+        self._rhythm = Rhythm(self.env, self.block)
+
+    def _memory(self) -> Any:
+        return {"block": self.block.snapshot(), "last": self._rhythm.last}
+
+    def _recall(self, memory: Any) -> None:
+        self.block.restore(memory["block"])
+        self._rhythm.last = memory["last"]
+
+    def _add_part(self, group: str, space: spaces.Space[Any], value: Any) -> None:
+        """Add a part to the observation, under the block's name."""
+        self.observation_space, self.observation = with_part(
+            self.observation_space, self.observation, (group, self.block.name), space, value
+        )
+
+
+def with_part(
+    space: spaces.Space[Any],
+    observation: Any,
+    keys: tuple[str, str],
+    part_space: spaces.Space[Any],
+    part: Any,
+) -> tuple[spaces.Space[Any], Any]:
+    """Return an observation space with one part more, and its buffer; the arrays stay the same.
+
+    Args:
+        space: Of the observation; one that is no dictionary goes under ``measurement``.
+        observation: The buffer.
+        keys: Where the part goes: the group and the name.
+        part_space: Space of the part.
+        part: Its buffer.
+    """
+    if not isinstance(space, spaces.Dict):
+        space, observation = spaces.Dict({"measurement": space}), {"measurement": observation}
+    group, name = keys
+    inner = space.spaces.get(group, spaces.Dict({}))
+    if not isinstance(inner, spaces.Dict) or name in inner.spaces:
+        raise ConfigError(f'The observation has "{group}.{name}" already.')
+    grown = spaces.Dict({**inner.spaces, name: part_space})
+    parts = {**observation.get(group, {}), name: part}
+    return spaces.Dict({**space.spaces, group: grown}), {**observation, group: parts}

@@ -1,0 +1,109 @@
+"""A layer of rewards and terminations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from physx_core.errors import ConfigError
+from physx_gym.env.layers.layer import Info, Layer, PipelineEnv
+from physx_gym.tasks.rewards import Reward
+from physx_gym.tasks.terminations import Termination
+from physx_gym.tasks.trajectory import Trajectory
+
+
+class ComposedEnv(Layer):
+    """Adds a reward and terminations to an environment.
+
+    The reward is added to that of the layers below; ``info["reward"]`` has its parts by name. An
+    episode ends where the layers below or one of the terminations say so;
+    ``info["terminations"]`` names those that did.
+
+    Attributes:
+        reward: The reward; None: none is added.
+        terminations: The terminations.
+    """
+
+    def __init__(
+        self,
+        env: PipelineEnv,
+        *,
+        reward: Reward | None = None,
+        terminations: Sequence[Termination] | Termination = (),
+        trajectory: Trajectory | None = None,
+    ) -> None:
+        """Put rewards and terminations on an environment.
+
+        Args:
+            env: The environment.
+            reward: What to add to the reward.
+            terminations: What else ends an episode: one or several, whose names differ.
+            trajectory: The reference that quantities may be compared to; None: there is none, or
+                that of a layer below.
+
+        Raises:
+            ConfigError: Something is no reward or termination, two terminations have one name, or
+                the trajectory is of another robot.
+        """
+        if isinstance(terminations, Termination):
+            terminations = (terminations,)
+        _check(reward, terminations)
+        self.reward, self.terminations = reward, tuple(terminations)
+        super().__init__(env)
+        quantities = env.quantities
+        if trajectory is not None:
+            if not isinstance(trajectory, Trajectory):
+                raise ConfigError(f"ComposedEnv.trajectory is {trajectory!r}, which is none.")
+            state = env.robot_state
+            shapes = (trajectory.positions.shape[1], trajectory.velocities.shape[1])
+            if shapes != (len(state.q), len(state.v)):
+                raise ConfigError(
+                    f"The trajectory has {shapes[0]} positions and {shapes[1]} velocities, but the "
+                    f"robot {len(state.q)} and {len(state.v)}."
+                )
+            quantities.trajectory = trajectory
+        for part in (*terminations, *(() if reward is None else (reward,))):
+            for quantity in part.watched:
+                quantities.watch(quantity)
+
+    def has_terminated(self, info: Info) -> tuple[bool, bool]:
+        """Return whether the layers below or a termination end the episode."""
+        terminated, truncated = self.env.has_terminated(info)
+        t = self.env.stepper_state.t
+        fired = [
+            each
+            for each in self.terminations
+            if t >= each.grace_period
+            and (self.unwrapped.training or not each.training_only)
+            and each.holds(self.env.quantities)
+        ]
+        if fired:
+            info["terminations"] = [*info.get("terminations", []), *(each.name for each in fired)]
+        terminated |= any(not each.is_truncation for each in fired)
+        return terminated, truncated | any(each.is_truncation for each in fired)
+
+    def compute_reward(self, terminated: bool, info: Info) -> float:
+        """Return the reward of the layers below plus the own one."""
+        total = self.env.compute_reward(terminated, info)
+        if self.reward is not None:
+            parts = info.setdefault("reward", {})
+            own = self.reward.compute(self.env.quantities, terminated, parts)
+            parts[self.reward.name] = own
+            total += own
+        return total
+
+
+def _check(reward: Any, terminations: Sequence[Any]) -> None:
+    """Check what is added to an environment.
+
+    Raises:
+        ConfigError: Something is no reward or termination, or two terminations have one name.
+    """
+    if reward is not None and not isinstance(reward, Reward):
+        raise ConfigError(f"ComposedEnv.reward is {reward!r}, which is no Reward.")
+    for each in terminations:
+        if not isinstance(each, Termination):
+            raise ConfigError(f"{each!r} is no Termination.")
+    names = [each.name for each in terminations]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"Two terminations have one name: {sorted(names)}.")

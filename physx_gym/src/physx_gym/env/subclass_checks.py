@@ -1,0 +1,125 @@
+"""What subclasses of environments say, are given, and return."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+
+from physx_core.errors import ConfigError, UnknownOptionError
+from physx_gym.show.display import has_display
+
+
+def construct_next(kind: type[Any], env: Any, options: Mapping[str, Any]) -> None:
+    """Call the constructor of the class after another one in an environment's order of classes.
+
+    Args:
+        kind: That other one.
+        env: The environment.
+        options: What the constructor is given.
+
+    Raises:
+        UnknownOptionError: There are options, but no class that takes them.
+    """
+    order = type(env).__mro__
+    after = order[order.index(kind) + 1 :]
+    takes = [each for each in after if "__init__" in vars(each) and each is not object]
+    if options and not takes:
+        raise UnknownOptionError(type(env).__name__, options, _names(kind, type(env)))
+    super(kind, env).__init__(**options)
+
+
+def _names(kind: type[Any], own: type[Any]) -> list[str]:
+    """Return the options of a class; of those that it hands on, the ones with a default."""
+    found: dict[str, None] = {}
+    for each in own.__mro__[: own.__mro__.index(kind) + 1]:
+        if "__init__" not in vars(each):
+            continue
+        first = not found
+        parameters = [*inspect.signature(vars(each)["__init__"]).parameters.values()][1:]
+        several = [one for one in parameters if one.kind in (one.VAR_KEYWORD, one.VAR_POSITIONAL)]
+        named = [one for one in parameters if one not in several]
+        found |= {one.name: None for one in named if first or one.default is not one.empty}
+        if not several:
+            break
+    return list(found)
+
+
+_PAIRS = {
+    "_sample_state": "positions and velocities",
+    "has_terminated": "whether the episode terminated, and whether it is truncated",
+}
+
+
+def check_mode(mode: Any, modes: Sequence[str]) -> None:
+    """Check a mode of rendering; None: whatever is possible.
+
+    Raises:
+        UnknownOptionError: There is no such mode.
+    """
+    if mode is not None and mode not in modes:
+        raise UnknownOptionError("render_mode", [str(mode)], modes)
+
+
+def metadata_of(kind: type[Any], step_dt: float) -> dict[str, Any]:
+    """Return what a class says of itself, with what is possible on this machine.
+
+    Args:
+        kind: Class of an environment.
+        step_dt: Time of a step, in s.
+    """
+    modes = [mode for mode in kind.metadata["render_modes"] if mode != "human" or has_display()]
+    frames = max(1, round(1 / step_dt))
+    return {"render_fps": frames, **kind.metadata, "render_modes": modes}
+
+
+def pair_of(env: Any, method: str, found: Any) -> tuple[Any, Any]:
+    """Return what a method returned, if it is two things.
+
+    Raises:
+        ConfigError: It is something else.
+    """
+    if not isinstance(found, (tuple, list)) or len(found) != 2:
+        raise ConfigError(
+            f"{type(env).__name__}.{method} returned {found!r} but must return {_PAIRS[method]}."
+        )
+    return found[0], found[1]
+
+
+def number_of(env: Any, reward: Any) -> float:
+    """Return a reward as a number.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    try:
+        return float(reward)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(
+            f"{type(env).__name__}.compute_reward returned {reward!r} but must return a number."
+        ) from error
+
+
+def check_spaces(env: Any) -> None:
+    """Check that an environment has its spaces.
+
+    Raises:
+        ConfigError: One is missing, or is none.
+    """
+    for kind in ("action_space", "observation_space"):
+        space = getattr(env, kind, None)
+        if not isinstance(space, gymnasium.Space):
+            raise ConfigError(
+                f"{type(env).__name__}.{kind} is {space!r}: _initialize_{kind} must set it to a "
+                "space of gymnasium.spaces."
+            )
+
+
+def not_written(env: Any, method: str, where: str) -> ConfigError:
+    """Return the error of a method that returned what it should have written."""
+    return ConfigError(
+        f"{type(env).__name__}.{method} returned something, but nobody reads that: write into "
+        f"`{where}` in place, and return nothing."
+    )

@@ -1,0 +1,126 @@
+"""A quadruped that learns to walk."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from physx_core.simulation import Ground, Robot, World
+from physx_core.simulation.sensors.attitudes import turned_back
+from physx_core.typing import Vector
+from physx_gym.env.layers.layer import Info
+from physx_gym.env.robot_env import RobotEnv
+from physx_gym.environments import limits
+from physx_gym.simulator.simulator import Simulator
+
+STAND = {"hip": 0.0, "thigh": 0.8, "calf": -1.6}
+RANGE = 0.4
+STIFFNESS, DAMPING = 40.0, 1.0
+LOWEST, STEEPEST = 0.12, math.cos(1.0)
+_UP = np.array([[0.0, 0.0, 1.0]])
+
+
+class QuadrupedEnv(RobotEnv):
+    """Walk forward with a Unitree A1: ``physx/Quadruped-v0``.
+
+    Needs the robots of ``physx-dart[robots]``. Action, shape (12,): where the joints shall be, as
+    shares of 0.4 rad from a standing pose; a controller of 40 N m/rad and 1 N m s/rad takes them
+    there, 200 times a second. Observation, shape (45,): the vertical in the frame of the trunk;
+    linear and angular velocity of the trunk in its frame, in m/s and rad/s; the joints' positions,
+    from the standing pose, in rad, and velocities; the last action. Reward: up to 1 for a forward
+    velocity of `speed`, up to 0.5 for going straight, 0.25 for staying up, less costs of torques
+    and of hasty actions; ``info["reward"]`` has the parts. It terminates where the trunk is below
+    0.12 m or leans by more than 1 rad, and is truncated after 1000 steps of 20 ms.
+    """
+
+    def __init__(self, *, backend: Any = "dart", speed: float = 0.6, **options: Any) -> None:
+        """Make the environment.
+
+        Args:
+            backend: Reference of the engine.
+            speed: Forward velocity that is wanted, in m/s.
+            options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
+        """
+        self.speed = float(speed)
+        world = World([Robot("a1/a1", fixed_base=False)], period=2.5e-3, ground=Ground())
+        simulator = Simulator(world, backend=backend, sensors=(), control_period=5e-3)
+        options = {"simulation_duration_max": 20.0, **options}
+        super().__init__(simulator, 0.02, **options)
+
+    def _initialize_action_space(self) -> None:
+        self.action_space = spaces.Box(-1.0, 1.0, (12,))
+        joints = self.simulator.layout.joints
+        parts = [next(part for part in STAND if part in joint) for joint in joints]
+        self._stand = np.array([STAND[part] for part in parts])
+        self._previous = np.zeros(12)
+
+    def _initialize_observation_space(self) -> None:
+        simulator = self.simulator
+        self.observation_space = limits.box(
+            np.full(3, 1.001),
+            np.full(6, limits.FASTEST),
+            limits.joint_positions(simulator) + np.abs(self._stand),
+            limits.joint_velocities(simulator),
+            np.ones(12),
+        )
+
+    def _sample_state(self) -> tuple[Vector, Vector]:
+        positions = self._neutral()
+        positions[7:] = self._stand + self.np_random.uniform(-0.05, 0.05, 12)
+        return self.simulator.grounded(positions), np.zeros(18)
+
+    def _initialize_buffers(self) -> None:
+        self._previous[:] = 0.0
+        self._haste = 0.0
+
+    def _refresh_buffers(self) -> None:
+        change = self.action - self._previous
+        self._haste = float(change @ change)
+        self._previous[:] = self.action
+
+    def _memory(self) -> Any:
+        return {"previous": self._previous.copy(), "haste": self._haste}
+
+    def _recall(self, memory: Any) -> None:
+        self._previous[:], self._haste = memory["previous"], memory["haste"]
+
+    def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
+        """Observe attitude, velocities, joints and the last action."""
+        state, seen = measurement["states"]["agent"], self.observation
+        q, v = state["q"], state["v"]
+        seen[:3] = turned_back(q[np.newaxis, 3:7], _UP)[0]
+        seen[3:9] = v[:6]
+        np.subtract(q[7:], self._stand, out=seen[9:21])
+        seen[21:33], seen[33:] = v[6:], self._previous
+
+    def compute_command(self, action: Any, command: Vector) -> None:
+        """Drive the joints to where they shall be."""
+        state = self.robot_state
+        np.multiply(action, RANGE, out=command)
+        command += self._stand
+        command -= state.q[7:]
+        command *= STIFFNESS
+        command -= DAMPING * state.v[6:]
+
+    def has_terminated(self, info: Info) -> tuple[bool, bool]:
+        """Return whether the robot fell."""
+        low = self.robot_state.q[2] < LOWEST
+        return bool(low or self.observation[2] < STEEPEST), not self.is_inside()
+
+    def compute_reward(self, terminated: bool, info: Info) -> float:
+        """Return the reward for walking."""
+        forward, left, _, _, _, turn = self.observation[3:9].tolist()
+        torques = self.robot_state.command
+        parts = {
+            "forward": math.exp(-4.0 * (forward - self.speed) ** 2),
+            "straight": 0.5 * math.exp(-4.0 * (left**2 + 0.25 * turn**2)),
+            "survival": 0.0 if terminated else 0.25,
+            "torques": -1e-4 * float(torques @ torques),
+            "haste": -0.01 * self._haste,
+        }
+        info["reward"] = parts
+        return sum(parts.values())

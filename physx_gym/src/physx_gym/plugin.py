@@ -1,0 +1,16 @@
+"""The plugin ``gym``: every environment that Gymnasium knows, by its id."""
+
+from __future__ import annotations
+
+import functools
+
+import gymnasium
+
+from physx_core.plugins import Components, hookimpl
+from physx_gym.bridge.gym_environment import GymEnvironment
+
+
+@hookimpl
+def physx_environments() -> Components:
+    """Return all environments that are registered with Gymnasium."""
+    return {id: functools.partial(GymEnvironment, id=id) for id in gymnasium.registry}

@@ -1,0 +1,1 @@
+"""Rendering, plots, replays, and interactive play."""

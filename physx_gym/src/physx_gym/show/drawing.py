@@ -1,0 +1,220 @@
+"""A simulated world as a scene: what a viewer draws of it, and how it moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physx_core.components import Factory
+from physx_core.simulation import (
+    Backend,
+    Box,
+    Capsule,
+    Cylinder,
+    Ground,
+    HeightField,
+    Layout,
+    Mesh,
+    Robot,
+    Sphere,
+    Stairs,
+    World,
+    WorldObject,
+)
+from physx_core.typing import Vector
+
+_GROUND, _MOVING, _RESTING = "#6d7885", "orange", "#a3acb6"
+_THICKNESS, _REACH = 0.01, 20.0  # of a drawn plane, and half its width, in m
+_SIDES = 32  # of a drawn cylinder
+_ROBOT = """<robot name="mesh"><link name="mesh"><visual><geometry>
+<mesh filename={} scale="{scale} {scale} {scale}"/>
+</geometry></visual></link></robot>"""
+
+
+class WorldDrawing:
+    """Draws a world with a factory: robots by their visual shapes, objects, and the ground."""
+
+    def __init__(
+        self,
+        factory: Factory,
+        world: World,
+        backend: Backend,
+        layout: Layout,
+        title: str,
+        *,
+        follow: bool = True,
+    ) -> None:
+        """Keep what is to be drawn; `add` draws it.
+
+        Args:
+            factory: What to draw with.
+            world: What to draw.
+            backend: Engine that knows the robots' names.
+            layout: Order of the bodies.
+            title: What stands above the window.
+            follow: Whether the camera moves along with the first robot whose base floats.
+        """
+        self._factory, self._world, self._layout, self._backend = factory, world, layout, backend
+        floating = (robot.name for robot in world.robots if not robot.fixed_base)
+        self._title, self._followed = title, next(floating, None) if follow else None
+        self._folder: TemporaryDirectory[str] | None = None
+
+    def add(self, poses: Vector) -> None:
+        """Add everything to the scene.
+
+        Args:
+            poses: Of all bodies, in the layout's order, shape (bodies, 7).
+        """
+        if self._world.ground is not None:
+            _add_ground(self._factory, self._world.ground)
+        self._factory.set_view(self._title, self._followed)
+        for robot in self._world.robots:
+            self._add_robot(robot, poses[self._layout.parts[robot.name].bodies])
+        for each in self._world.objects:
+            self._add_object(each, self._pose(each, poses))
+
+    def move(self, poses: Vector) -> None:
+        """Bring everything that moves to its place; see `add`."""
+        parts, factory = self._layout.parts, self._factory
+        for robot in self._world.robots:
+            factory.update_robot(robot.name, poses=poses[parts[robot.name].bodies])
+        for each in self._world.objects:
+            if not each.static:
+                self._move_object(each, self._pose(each, poses))
+
+    def close(self) -> None:
+        """Delete what was only there to be drawn."""
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
+
+    def _pose(self, each: WorldObject, poses: Vector) -> Vector:
+        """Return where an object is: x, y, z and quaternion x, y, z, w."""
+        if each.static:
+            return np.array([*each.position, *each.orientation])
+        pose: Vector = poses[self._layout.parts[each.name].bodies.start]
+        return pose
+
+    def _add_robot(self, robot: Robot, poses: Vector) -> None:
+        bodies = self._layout.bodies[self._layout.parts[robot.name].bodies]
+        names = [body.removeprefix(f"{robot.name}/") for body in bodies]
+        packages = {name: str(folder) for name, folder in robot.package_dirs.items()}
+        urdf = str(self._model(robot.urdf))
+        self._factory.add_robot(robot.name, urdf, names, package_dirs=packages, poses=poses)
+
+    def _model(self, urdf: str | Path) -> Path:
+        """Return the file of a robot, which may be given by a name that the backend knows."""
+        path = Path(urdf)
+        if isinstance(urdf, Path) or urdf.lower().endswith(".urdf") or path.is_file():
+            return path
+        named = (info.path for info in self._backend.robots() if info.name == urdf)
+        return next(named, path)
+
+    def _add_object(self, each: WorldObject, pose: Vector) -> None:
+        factory, color = self._factory, _RESTING if each.static else _MOVING
+        if isinstance(each, Mesh):
+            urdf = str(self._as_robot(each))
+            factory.add_robot(each.name, urdf, ["mesh"], color=color, poses=pose[None])
+        elif isinstance(each, Cylinder):
+            points, cells = cylinder(each.radius, each.length)
+            factory.add_mesh(each.name, _moved(points, pose), cells, color=color)
+        else:
+            look: dict[str, Any] = {"position": pose[:3], "orientation": pose[3:], "color": color}
+            if isinstance(each, Box):
+                factory.add_box(each.name, 0.5 * np.array(each.size), **look)
+            elif isinstance(each, Sphere):
+                factory.add_sphere(each.name, each.radius, **look)
+            elif isinstance(each, Capsule):
+                factory.add_capsule(each.name, each.radius, each.length, **look)
+
+    def _as_robot(self, each: Mesh) -> Path:
+        """Return a URDF file with a mesh, as that is the form in which viewers load mesh files."""
+        if self._folder is None:
+            self._folder = TemporaryDirectory(prefix="physx-drawing-")
+        file = Path(self._folder.name) / f"{len(list(Path(self._folder.name).iterdir()))}.urdf"
+        text = _ROBOT.format(quoteattr(str(Path(each.path).absolute())), scale=each.scale)
+        file.write_text(text, encoding="utf-8")
+        return file
+
+    def _move_object(self, each: WorldObject, pose: Vector) -> None:
+        factory = self._factory
+        if isinstance(each, Mesh):
+            factory.update_robot(each.name, poses=pose[None])
+        elif isinstance(each, Cylinder):
+            corners = cylinder(each.radius, each.length)[0]
+            factory.update_mesh(each.name, positions=_moved(corners, pose))
+        else:
+            place = {"position": pose[:3], "orientation": pose[3:]}
+            if isinstance(each, Box):
+                factory.update_box(each.name, **place)
+            elif isinstance(each, Sphere):
+                factory.update_sphere(each.name, **place)
+            elif isinstance(each, Capsule):
+                factory.update_capsule(each.name, **place)
+
+
+def _add_ground(factory: Factory, ground: Ground | Stairs | HeightField) -> None:
+    if isinstance(ground, HeightField):
+        factory.add_mesh("ground", *_field(ground), color=_GROUND)
+        return
+    plane = ground if isinstance(ground, Ground) else Ground()
+    if isinstance(ground, Stairs):
+        for number, (center, size) in enumerate(ground.boxes()):
+            half = 0.5 * np.array(size)
+            factory.add_box(f"stairs/{number}", half, position=center, color=_RESTING)
+    normal = np.array(plane.normal)
+    # Slightly below what it stands for, so that a viewer's own grid stays visible.
+    place = normal * (plane.height - 0.5 * _THICKNESS - 1e-3)
+    look: dict[str, Any] = {"position": place, "orientation": _upright(normal), "color": _GROUND}
+    factory.add_box("ground", (_REACH, _REACH, 0.5 * _THICKNESS), **look)
+
+
+def _upright(normal: Vector) -> Vector:
+    """Return the quaternion x, y, z, w that turns the z axis to a normal."""
+    axis = np.cross([0.0, 0.0, 1.0], normal)
+    turn = np.array([*axis, 1.0 + normal[2]])
+    length = float(np.linalg.norm(turn))
+    return turn / length if length > 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def _field(ground: HeightField) -> tuple[Vector, NDArray[np.int32]]:
+    """Return vertices and triangles of a field of heights."""
+    nx, ny = ground.heights.shape
+    begin, spacing = ground.corner(), ground.spacing
+    x, y = (begin[i] + spacing[i] * np.arange(n) for i, n in enumerate((nx, ny)))
+    points = np.stack([*np.meshgrid(x, y, indexing="ij"), ground.heights], axis=-1)
+    first = (np.arange(nx - 1)[:, None] * ny + np.arange(ny - 1)).ravel()
+    corners = np.stack([first, first + ny, first + ny + 1, first, first + ny + 1, first + 1], 1)
+    return points.reshape(-1, 3), corners.reshape(-1, 3).astype(np.int32)
+
+
+def cylinder(radius: float, length: float) -> tuple[Vector, NDArray[np.int32]]:
+    """Return vertices, shape (n, 3), and triangles, shape (m, 3), of a cylinder along z.
+
+    Sides and caps have vertices of their own, so that edges look sharp.
+    """
+    angles = np.arange(_SIDES) * (2 * np.pi / _SIDES)
+    circle = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    low, high = (np.column_stack([circle, np.full(_SIDES, z * length)]) for z in (-0.5, 0.5))
+    points = np.concatenate([low, high, low, high])
+    here = np.arange(_SIDES)
+    ahead = (here + 1) % _SIDES
+    fan = np.arange(1, _SIDES - 1)
+    wall = [(here, ahead, ahead + _SIDES), (here, ahead + _SIDES, here + _SIDES)]
+    caps = [(0 * fan, fan + 1, fan), (0 * fan + _SIDES, fan + _SIDES, fan + 1 + _SIDES)]
+    ends = [np.stack(cap, axis=1) + 2 * _SIDES for cap in caps]
+    cells = np.concatenate([*(np.stack(side, axis=1) for side in wall), *ends])
+    return points, cells.astype(np.int32)
+
+
+def _moved(points: Vector, pose: Vector) -> Vector:
+    """Return points, shape (n, 3), at a pose: x, y, z and quaternion x, y, z, w."""
+    axis, w = pose[3:6], pose[6]
+    across = 2 * np.cross(axis, points)
+    moved: Vector = points + w * across + np.cross(axis, across) + pose[:3]
+    return moved

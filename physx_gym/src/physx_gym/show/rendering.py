@@ -1,0 +1,135 @@
+"""Rendering: pictures of a running environment, or a viewer's window that follows it."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physx_core import plugins
+from physx_core.components import Factory, Visualizer
+from physx_core.errors import UnknownOptionError, VisualizerError
+from physx_core.simulation import World
+from physx_gym.show.display import has_display
+from physx_gym.show.drawing import WorldDrawing
+
+if TYPE_CHECKING:
+    from physx_gym.env.pipeline_env import PipelineEnv
+
+MODES = ("human", "rgb_array")
+VIEWER = "rerun"
+"""Visualizer that is used unless another one is named."""
+PICTURE_SIZE = (640, 480)
+"""Width and height of a picture, in pixels, unless ``viewer_kwargs`` says otherwise."""
+
+Picture = NDArray[np.uint8]
+
+
+def open_viewer(title: str, instances: int = 1, **options: Any) -> Visualizer:
+    """Open a viewer.
+
+    Args:
+        title: What its recording is called.
+        instances: How many worlds are shown.
+        options: Of the visualizer; ``visualizer`` is its reference, `VIEWER` without it.
+
+    Raises:
+        PluginNotFoundError: It is not installed; the message says how to install it.
+        UnknownOptionError: It does not have such an option.
+        VisualizerError: It cannot be opened.
+    """
+    options = dict(options)
+    kind: Any = plugins.resolve("visualizer", options.pop("visualizer", VIEWER))
+    viewer: Visualizer = kind(**options)
+    viewer.open(title, Path(tempfile.gettempdir()), instances)
+    return viewer
+
+
+class Renderer:
+    """Shows an environment as its ``render_mode`` says, with the options ``viewer_kwargs``.
+
+    ``"rgb_array"`` makes pictures without a window, ``"human"`` opens a viewer; None opens a viewer
+    where there is a display, and makes pictures elsewhere.
+    """
+
+    def __init__(self, env: PipelineEnv, mode: str | None = None, *, follow: bool = True) -> None:
+        """Keep the environment; the viewer is opened at the first frame.
+
+        Args:
+            env: What to show.
+            mode: Instead of the environment's ``render_mode``.
+            follow: Whether the camera follows a robot whose base floats.
+
+        Raises:
+            UnknownOptionError: There is no such ``render_mode``.
+        """
+        mode = mode or env.render_mode or ("human" if has_display() else "rgb_array")
+        if mode not in MODES:
+            raise UnknownOptionError("render_mode", [str(mode)], MODES)
+        self.mode = mode
+        self._env, self._follow = env, follow
+        self._viewer: Visualizer | None = None
+        self._factory = Factory()
+        self._drawing: WorldDrawing | None = None
+        self._world: World | None = None
+        self._frames = 0
+
+    def frame(self) -> Picture | None:
+        """Show the present state.
+
+        Returns:
+            A picture, shape (height, width, 3); None in the mode ``"human"``.
+
+        Raises:
+            PluginNotFoundError: The viewer is not installed; the message says how to install it.
+            VisualizerError: It cannot draw; the message says what is missing.
+        """
+        simulator = self._env.simulator
+        own: Any = self._env.unwrapped  # the `RobotEnv` below all layers
+        poses = simulator.simulation.body_poses()
+        if self._world is not simulator.world:
+            self.close()
+        if self._drawing is None or self._viewer is None:
+            self._world, self._factory = simulator.world, Factory()
+            self._viewer = self._open()
+            backend = plugins.resolve("backend", simulator.backend)
+            self._drawing = WorldDrawing(
+                self._factory,
+                simulator.world,
+                backend,
+                simulator.layout,
+                type(self._env).__name__,
+                follow=self._follow,
+            )
+            self._drawing.add(poses)
+            own._draw(self._factory)
+        else:
+            self._drawing.move(poses)
+            own._redraw(self._factory)
+        self._viewer.events(1, self._frames, self._factory.take_events())
+        self._frames += 1
+        if self.mode == "human":
+            return None
+        picture = self._viewer.capture()
+        if picture is None:
+            raise VisualizerError(f"{type(self._viewer).__name__} makes no pictures.")
+        return picture
+
+    def _open(self) -> Visualizer:
+        options = {"save": False} | dict(self._env.viewer_kwargs)
+        if self.mode == "human":
+            options = {"mode": "spawn"} | options
+        else:
+            options = {"mode": "offscreen", "picture_size": PICTURE_SIZE} | options
+        return open_viewer(type(self._env).__name__, **options)
+
+    def close(self) -> None:
+        """Let the viewer go; the next frame opens another one."""
+        if self._drawing is not None:
+            self._drawing.close()
+        if self._viewer is not None:
+            self._viewer.close()
+        self._drawing = self._viewer = self._world = None

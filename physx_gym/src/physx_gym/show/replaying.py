@@ -1,0 +1,144 @@
+"""Replaying: recorded episodes in a viewer, in a recording's file, or as a film."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core import checks, plugins
+from physx_core.components import Factory, Visualizer
+from physx_core.errors import LogError, VisualizerError
+from physx_core.simulation import Backend
+from physx_gym.show.drawing import WorldDrawing
+from physx_gym.show.film import write_film
+from physx_gym.show.rendering import PICTURE_SIZE, Picture, open_viewer
+from physx_gym.telemetry.log import Log
+from physx_gym.telemetry.log_file import Source, as_logs
+
+
+def replay(
+    logs: Source | Sequence[Source],
+    *,
+    compare: Sequence[Source] = (),
+    path: str | Path | None = None,
+    record_video_path: str | Path | None = None,
+    frame_rate: float = 30.0,
+    backend: Any = None,
+    **viewer: Any,
+) -> Path | None:
+    """Show episodes side by side, all from their beginning.
+
+    Without a path they are shown in a viewer's window.
+
+    Args:
+        logs: Logs, their files, or what `RobotEnv.log_data` gave; one or several.
+        compare: More of them.
+        path: Recording to write for the viewer, ``.rrd``.
+        record_video_path: Film to write: ``.gif``, ``.webp`` or ``.png``.
+        frame_rate: Frames for each simulated second. The viewer plays 30 a second.
+        backend: Reference of the engine that knows the robots' links; None: the log's.
+        viewer: Options of the viewer, as in ``RobotEnv.viewer_kwargs``.
+
+    Returns:
+        The file, None where none is written.
+
+    Raises:
+        LogError: A log cannot be read, or holds no states.
+        PluginNotFoundError: The viewer is not installed; the message says how to install it.
+        VisualizerError: The viewer cannot be opened, or cannot draw.
+        ConfigError: An option makes no sense.
+    """
+    checks.positive("frame_rate", frame_rate)
+    chosen = as_logs(logs, compare)
+    motions = [_Motion(number, log, backend) for number, log in enumerate(chosen, 1)]
+    count = 1 + max(int(motion.duration * frame_rate + 1e-9) for motion in motions)
+    options: dict[str, Any] = {"max_instances": len(motions), **viewer}
+    if record_video_path is not None:
+        options = {"mode": "offscreen", "save": False, "picture_size": PICTURE_SIZE} | options
+    elif path is not None:
+        options = {"mode": "save", "path": path} | options
+    else:
+        options = {"mode": "spawn", "save": False} | options
+    shown = open_viewer("replay", len(motions), **options)
+    try:
+        frames = _frames(shown, motions, count, frame_rate)
+        if record_video_path is not None:
+            return write_film(map(_picture, frames), Path(record_video_path), frame_rate)
+        for _ in frames:
+            pass
+    finally:
+        for motion in motions:
+            motion.close()
+        shown.close()
+    return None if path is None else Path(path)
+
+
+def _frames(
+    shown: Visualizer, motions: Sequence[_Motion], count: int, frame_rate: float
+) -> Iterator[Visualizer]:
+    """Draw one frame after another."""
+    for frame in range(count):
+        for motion in motions:
+            motion.draw(shown, frame, frame / frame_rate)
+        yield shown
+
+
+def _picture(shown: Visualizer) -> Picture:
+    picture = shown.capture()
+    if picture is None:
+        raise VisualizerError(f"{type(shown).__name__} makes no pictures, so there is no film.")
+    return picture
+
+
+class _Motion:
+    """A log on its way to a viewer."""
+
+    def __init__(self, number: int, log: Log, backend: Any) -> None:
+        """Work out where all bodies are."""
+        self._number = number
+        states = log.trajectory()
+        self._times, self._positions = states.times, states.positions
+        self.duration = float(self._times[-1] - self._times[0])
+        world, engine = log.world(), _backend(log, backend)
+        self._simulation = engine.build(world)
+        layout = self._simulation.layout
+        if layout.nq != self._positions.shape[1]:
+            raise LogError(
+                f'The log "{log.label}" has {self._positions.shape[1]} positions, but its world '
+                f"has {layout.nq}: the robot's file is another one than it was."
+            )
+        self._factory = Factory()
+        title = f"{number}: {log.label}"
+        self._drawing = WorldDrawing(self._factory, world, engine, layout, title)
+
+    def draw(self, shown: Visualizer, frame: int, time: float) -> None:
+        """Draw what was at a time after the beginning, in s."""
+        moment = self._times[0] + time + 1e-9
+        row = max(int(np.searchsorted(self._times, moment, "right")) - 1, 0)
+        poses = self._simulation.body_poses(None, self._positions[row])
+        if frame == 0:
+            self._drawing.add(poses)
+        else:
+            self._drawing.move(poses)
+        shown.events(self._number, frame, self._factory.take_events())
+
+    def close(self) -> None:
+        """Free what it took."""
+        self._drawing.close()
+        self._simulation.close()
+
+
+def _backend(log: Log, given: Any) -> Backend:
+    """Return the engine of a log; a file may only name installed plugins, not code."""
+    reference = given if given is not None else log.constants.get("backend")
+    is_told = given is not None or log.path is None
+    if not is_told and not (isinstance(reference, str) and ":" not in reference):
+        raise LogError(
+            f"The log {log.path} is of the engine {reference!r}, which is no installed plugin. If "
+            'you trust it, name it: replay(..., backend="...").'
+        )
+    found: Backend = plugins.resolve("backend", reference)
+    return found

@@ -1,0 +1,1 @@
+"""The simulated world of an environment with its motors and sensors."""

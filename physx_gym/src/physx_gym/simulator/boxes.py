@@ -1,0 +1,85 @@
+"""The spaces and buffers that a simulator's motors and measurements have by themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from physx_core.typing import Vector
+from physx_gym.env.buffers import leaves, neutral
+from physx_gym.simulator.simulator import Simulator
+
+_MARGIN = 0.01
+"""How far beyond their limits positions are still within the space, as a share of the range."""
+_FAR = 1e9
+"""What stands for no limit: beyond it the engines give up. Gymnasium warns of infinite bounds."""
+
+
+def action_space_of(simulator: Simulator) -> spaces.Box:
+    """Return the torques that the motors can give."""
+    most = np.minimum(simulator.max_commands(), _FAR)
+    return spaces.Box(-most, most, dtype=np.float64)
+
+
+def observation_space_of(simulator: Simulator, longest: float) -> spaces.Dict:
+    """Return the space of the measurements: time, state of the robot, sensors by kind.
+
+    Args:
+        simulator: What is measured.
+        longest: Time at which every episode is over, in s.
+    """
+    inside: dict[str, spaces.Space[Any]] = {
+        "t": spaces.Box(0.0, longest, (), np.float64),
+        "states": spaces.Dict({"agent": spaces.Dict(_state(simulator))}),
+    }
+    sensors = {kind: _unbounded(array) for kind, array in simulator.sensed.items()}
+    if sensors:
+        inside["measurements"] = spaces.Dict(sensors)
+    return spaces.Dict(inside)
+
+
+def _state(simulator: Simulator) -> dict[str, spaces.Space[Any]]:
+    part, layout = simulator.robot, simulator.layout
+    lower, upper = layout.lower[part.joints], layout.upper[part.joints]
+    spread = upper - lower
+    margin = _MARGIN * np.where(np.isfinite(spread), spread, 0.0)
+    low, high = np.maximum(lower - margin, -_FAR), np.minimum(upper + margin, _FAR)
+    if part.floating:
+        low = np.concatenate([[-_FAR] * 3, [-1.0 - _MARGIN] * 4, low])
+        high = np.concatenate([[_FAR] * 3, [1.0 + _MARGIN] * 4, high])
+    velocities = _unbounded(simulator.robot_state.v)
+    return {"q": spaces.Box(low, high, dtype=np.float64), "v": velocities}
+
+
+def _unbounded(array: Vector) -> spaces.Space[Any]:
+    return spaces.Box(-_FAR, _FAR, array.shape, np.float64)
+
+
+def observed(simulator: Simulator) -> tuple[Any, Vector, dict[str, Any]]:
+    """Return the default observation as a buffer.
+
+    Returns:
+        The place of each observed number in the simulator's values; the memory of the observation,
+        in the order of its space; and the observation, whose arrays are parts of that.
+    """
+    space = observation_space_of(simulator, 1.0)
+    numbers = simulator.views_of(np.arange(len(simulator.values), dtype=np.float64))
+    places = [np.ravel(_at(numbers, path)) for path, _ in leaves(space)]
+    index = np.concatenate(places).astype(np.intp)
+    flat, begin = simulator.values[index], 0
+    observation = neutral(space)
+    for path, box in leaves(space):
+        end = begin + int(np.prod(box.shape or ()))
+        *parents, key = path
+        _at(observation, parents)[key] = flat[begin:end].reshape(box.shape or ())
+        begin = end
+    return index, flat, observation
+
+
+def _at(tree: Any, path: Sequence[Any]) -> Any:
+    for key in path:
+        tree = tree[key]
+    return tree

@@ -1,0 +1,1 @@
+"""Quantities, rewards, and terminations."""

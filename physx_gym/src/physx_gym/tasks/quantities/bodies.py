@@ -1,0 +1,225 @@
+"""Where bodies are and how they move."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from physx_core.errors import ConfigError
+from physx_core.simulation.sensors.attitudes import turned_back
+from physx_core.typing import Vector
+from physx_gym.tasks.quantities import geometry
+from physx_gym.tasks.quantities.combined import Rate
+from physx_gym.tasks.quantities.quantity import Moment, Quantity
+
+Form = Literal["quaternion", "roll_pitch_yaw", "matrix"]
+
+
+@dataclass(frozen=True)
+class BodyPoses(Quantity):
+    """Poses of bodies in the world, shape (bodies, 7): position in m, quaternion x, y, z, w.
+
+    Attributes:
+        bodies: Names in the layout.
+    """
+
+    bodies: tuple[str, ...]
+
+    def compute(self, moment: Moment) -> Vector:
+        """Return the poses."""
+        return moment.body_poses(self.bodies)
+
+
+@dataclass(frozen=True)
+class BodyPositions(Quantity):
+    """Positions of bodies in the world, shape (bodies, 3), in m.
+
+    Attributes:
+        bodies: Names in the layout.
+    """
+
+    bodies: tuple[str, ...]
+
+    def compute(self, moment: Moment) -> Vector:
+        """Return the positions."""
+        return np.asarray(moment.get(BodyPoses(self.bodies))[:, :3])
+
+
+@dataclass(frozen=True)
+class BodyOrientations(Quantity):
+    """Orientations of bodies in the world.
+
+    Attributes:
+        bodies: Names in the layout.
+        form: ``"quaternion"``, shape (bodies, 4); ``"roll_pitch_yaw"``, (bodies, 3), in rad; or
+            ``"matrix"``, (bodies, 3, 3).
+    """
+
+    bodies: tuple[str, ...]
+    form: Form = "quaternion"
+
+    def compute(self, moment: Moment) -> Vector:
+        """Return the orientations."""
+        quaternions = moment.get(BodyPoses(self.bodies))[:, 3:]
+        if self.form == "quaternion":
+            return np.asarray(quaternions)
+        if self.form == "matrix":
+            return geometry.matrices(quaternions)
+        return geometry.roll_pitch_yaw(quaternions)
+
+
+@dataclass(frozen=True)
+class BodyVelocities(Quantity):
+    """Velocities of bodies' origins, shape (bodies, 6): linear in m/s, then angular in rad/s.
+
+    Attributes:
+        bodies: Names in the layout.
+        frame: ``"world"``: along the world's axes; ``"body"``: along each body's own.
+    """
+
+    bodies: tuple[str, ...]
+    frame: Literal["world", "body"] = "world"
+
+    def compute(self, moment: Moment) -> Vector:
+        """Return the velocities."""
+        velocities = moment.body_velocities(self.bodies)
+        if self.frame == "world":
+            return velocities
+        turn = moment.get(BodyPoses(self.bodies))[:, 3:]
+        parts = [turned_back(turn, velocities[:, :3]), turned_back(turn, velocities[:, 3:])]
+        return np.concatenate(parts, axis=1)
+
+
+@dataclass(frozen=True)
+class MeanBodyVelocities(Quantity):
+    """Velocities of bodies over the last step, shape (bodies, 6), along the world's axes.
+
+    Attributes:
+        bodies: Names in the layout.
+    """
+
+    bodies: tuple[str, ...]
+
+    def compute(self, moment: Moment) -> Vector:
+        """Return displacement and rotation of the step by its duration."""
+        return np.asarray(moment.get(Rate(BodyPoses(self.bodies), geometry.pose_difference)))
+
+
+@dataclass(frozen=True)
+class MeanPose(Quantity):
+    """The mean of several bodies' poses, shape (7,), for example of all feet.
+
+    Attributes:
+        bodies: Names in the layout.
+    """
+
+    bodies: tuple[str, ...]
+
+    def compute(self, moment: Moment) -> Vector:
+        """Return mean position and mean orientation."""
+        poses = moment.get(BodyPoses(self.bodies))
+        return np.concatenate([poses[:, :3].mean(0), geometry.mean_quaternion(poses[:, 3:])])
+
+
+@dataclass(frozen=True)
+class RelativePoses(Quantity):
+    """Poses of bodies as seen from their mean pose, shape (bodies, 7).
+
+    Attributes:
+        bodies: At least two names in the layout.
+    """
+
+    bodies: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        """Check that there is something to compare."""
+        super().__post_init__()
+        if len(self.bodies) < 2:
+            raise ConfigError(f"RelativePoses needs at least two bodies, not {self.bodies}.")
+
+    def compute(self, moment: Moment) -> Vector:
+        """Return the poses."""
+        poses = moment.get(BodyPoses(self.bodies))
+        return geometry.relative_poses(poses, moment.get(MeanPose(self.bodies)))
+
+
+@dataclass(frozen=True)
+class MeanOdometry(Quantity):
+    """Mean position on the ground and heading of bodies: x and y in m, yaw in rad, shape (3,).
+
+    Attributes:
+        bodies: Names in the layout.
+    """
+
+    bodies: tuple[str, ...]
+
+    def compute(self, moment: Moment) -> Vector:
+        """Return the planar pose."""
+        pose = moment.get(MeanPose(self.bodies))
+        return np.array([pose[0], pose[1], geometry.yaw_of(pose[3:])])
+
+
+def root_of(moment: Moment) -> str:
+    """Return the root link of the robot that acts."""
+    root: str = moment.simulator.layout.bodies[moment.robot.bodies][0]
+    return root
+
+
+@dataclass(frozen=True)
+class RollPitch(Quantity):
+    """Roll and pitch of the robot's root link in rad, shape (2,)."""
+
+    def compute(self, moment: Moment) -> Vector:
+        """Return the angles."""
+        return np.asarray(moment.get(BodyOrientations((root_of(moment),), "roll_pitch_yaw"))[0, :2])
+
+
+@dataclass(frozen=True)
+class BaseHeight(Quantity):
+    """Height of the robot's root link, in m: over z = 0, or over the lowest of some bodies.
+
+    Attributes:
+        over: Names in the layout, for example the feet; none: z = 0.
+    """
+
+    over: tuple[str, ...] = ()
+
+    def compute(self, moment: Moment) -> float:
+        """Return the height."""
+        height = float(moment.get(BodyPoses((root_of(moment),)))[0, 2])
+        if self.over:
+            height -= float(moment.get(BodyPositions(self.over))[:, 2].min())
+        return height
+
+
+@dataclass(frozen=True)
+class Odometry(Quantity):
+    """Position on the ground and heading of the root link: x and y in m, yaw in rad, shape (3,)."""
+
+    def compute(self, moment: Moment) -> Vector:
+        """Return the planar pose."""
+        pose = moment.get(BodyPoses((root_of(moment),)))[0]
+        return np.array([pose[0], pose[1], geometry.yaw_of(pose[3:])])
+
+
+@dataclass(frozen=True)
+class BaseVelocity(Quantity):
+    """Velocity of the root link in its own frame: linear in m/s, angular in rad/s, shape (6,)."""
+
+    def compute(self, moment: Moment) -> Vector:
+        """Return the velocity."""
+        return np.asarray(moment.get(BodyVelocities((root_of(moment),), "body"))[0])
+
+
+@dataclass(frozen=True)
+class OdometryVelocity(Quantity):
+    """Velocity over the last step: forward and to the left in m/s, yaw rate in rad/s, shape (3,).
+
+    Along the heading half way between begin and end of the step.
+    """
+
+    def compute(self, moment: Moment) -> Vector:
+        """Return the velocity."""
+        return np.asarray(moment.get(Rate(Odometry(), geometry.odometry_difference)))

@@ -1,0 +1,141 @@
+"""Quantities that are made of others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from physx_core.errors import ConfigError
+from physx_gym.tasks.quantities.quantity import Moment, Quantity, Remembering, as_array
+
+
+@dataclass(frozen=True)
+class Masked(Quantity):
+    """Some entries of another quantity, flat.
+
+    Attributes:
+        quantity: An array.
+        entries: Places in the flat array.
+    """
+
+    quantity: Quantity
+    entries: tuple[int, ...]
+
+    def compute(self, moment: Moment) -> Any:
+        """Return the entries, shape (entries,)."""
+        return as_array(moment.get(self.quantity)).ravel()[list(self.entries)]
+
+
+@dataclass(frozen=True)
+class Joined(Quantity):
+    """Several quantities as one flat array, one after the other.
+
+    Attributes:
+        quantities: Numbers or arrays.
+    """
+
+    quantities: tuple[Quantity, ...]
+
+    def compute(self, moment: Moment) -> Any:
+        """Return all entries in one array."""
+        return np.concatenate([as_array(moment.get(each)).ravel() for each in self.quantities])
+
+
+@dataclass(frozen=True)
+class Computed(Quantity):
+    """A function of other quantities.
+
+    Attributes:
+        function: Called with their values; a named function, so that equal ones are one.
+        quantities: Its arguments.
+    """
+
+    function: Callable[..., Any]
+    quantities: tuple[Quantity, ...]
+
+    def compute(self, moment: Moment) -> Any:
+        """Return what the function gives."""
+        return self.function(*(moment.get(each) for each in self.quantities))
+
+
+@dataclass(frozen=True)
+class Stacked(Remembering):
+    """The values of another quantity after the last steps, the latest last.
+
+    Attributes:
+        quantity: A number or array.
+        steps: How many; at the begin there are fewer.
+    """
+
+    quantity: Quantity
+    steps: int
+
+    def __post_init__(self) -> None:
+        """Check the number of steps."""
+        super().__post_init__()
+        if self.steps < 1:
+            raise ConfigError(f"Stacked needs at least 1 step, not {self.steps}.")
+
+    def advance(self, memory: Any, moment: Moment) -> tuple[Any, Any]:
+        """Add the present value: shape (steps so far, *shape)."""
+        value = as_array(moment.get(self.quantity))[np.newaxis].copy()
+        stack = value if memory is None else np.concatenate([memory, value])[-self.steps :]
+        return stack, stack
+
+
+@dataclass(frozen=True)
+class Delta(Remembering):
+    """How much another quantity changed over the last steps; 0 at the begin.
+
+    Attributes:
+        quantity: A number or array.
+        steps: Over how many steps, or as many as there were.
+        difference: Takes the later and the earlier value; for angles, one that goes the short way.
+    """
+
+    quantity: Quantity
+    steps: int = 1
+    difference: Callable[[Any, Any], Any] = np.subtract
+
+    def advance(self, memory: Any, moment: Moment) -> tuple[Any, Any]:
+        """Return the change."""
+        value = as_array(moment.get(self.quantity))[np.newaxis].copy()
+        stack = value if memory is None else np.concatenate([memory, value])[-self.steps - 1 :]
+        return as_array(self.difference(stack[-1], stack[0])), stack
+
+
+@dataclass(frozen=True)
+class Rate(Quantity):
+    """How fast another quantity changed in the last step, per second.
+
+    Attributes:
+        quantity: A number or array.
+        difference: As in `Delta`.
+    """
+
+    quantity: Quantity
+    difference: Callable[[Any, Any], Any] = np.subtract
+
+    def compute(self, moment: Moment) -> Any:
+        """Return the mean velocity of the step."""
+        return moment.get(Delta(self.quantity, 1, self.difference)) / moment.step_dt
+
+
+@dataclass(frozen=True)
+class Mean(Quantity):
+    """The mean of another quantity over the last steps.
+
+    Attributes:
+        quantity: A number or array.
+        steps: Over how many steps, or as many as there were.
+    """
+
+    quantity: Quantity
+    steps: int
+
+    def compute(self, moment: Moment) -> Any:
+        """Return the mean."""
+        return moment.get(Stacked(self.quantity, self.steps)).mean(axis=0)

@@ -1,0 +1,190 @@
+"""What a termination is, and those of one quantity."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from physx_core import checks
+from physx_core.errors import ConfigError, UnknownOptionError
+from physx_gym.tasks.quantities import Computed, Delta, Quantities, Quantity, Reference, Stacked
+from physx_gym.tasks.quantities.quantity import as_array, check_quantity
+
+
+class Termination(ABC):
+    """A condition that ends an episode.
+
+    Attributes:
+        name: Its name in the info of the step.
+        grace_period: Time from the begin of an episode in which it does not hold, in s.
+        is_truncation: Whether it cuts the episode off, rather than being part of the task.
+        training_only: Whether it does not hold in evaluation.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        grace_period: float = 0.0,
+        is_truncation: bool = False,
+        training_only: bool = False,
+        **unknown: Any,
+    ) -> None:
+        """Keep the options.
+
+        Raises:
+            UnknownOptionError: There is no option of a name.
+        """
+        if unknown:
+            known = ("grace_period", "is_truncation", "training_only")
+            raise UnknownOptionError(f'The termination "{name}"', unknown, known)
+        if not isinstance(name, str) or not name:
+            raise ConfigError(f"The name of a termination must be a text, not {name!r}.")
+        self.name = name
+        self.grace_period = checks.not_negative(f'grace_period of "{name}"', grace_period)
+        self.is_truncation, self.training_only = bool(is_truncation), bool(training_only)
+
+    @property
+    def watched(self) -> tuple[Quantity, ...]:
+        """The quantities that it is judged by."""
+        return ()
+
+    @abstractmethod
+    def holds(self, quantities: Quantities) -> bool:
+        """Return whether the condition holds after this step."""
+
+
+class OutOfBounds(Termination):
+    """Ends the episode where an entry of a quantity leaves its bounds."""
+
+    def __init__(
+        self,
+        quantity: Quantity,
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
+        name: str | None = None,
+        **options: Any,
+    ) -> None:
+        """Choose the quantity.
+
+        Args:
+            quantity: A number or array.
+            low: Lowest value, in the quantity's unit, for all entries or for each; None: none.
+            high: Highest value, likewise.
+            name: None: that of the quantity's class.
+            options: Those of `Termination`.
+
+        Raises:
+            ConfigError: It is no quantity, there are no bounds, or the lower is above the higher.
+        """
+        self.quantity = check_quantity(f"{type(self).__name__}.quantity", quantity)
+        super().__init__(name or type(quantity).__name__, **options)
+        try:
+            self.low = as_array(-np.inf if low is None else low)
+            self.high = as_array(np.inf if high is None else high)
+            fits = bool((self.low <= self.high).all())
+        except (TypeError, ValueError):
+            fits = False
+        if not fits or (low is None and high is None):
+            raise ConfigError(
+                f'The bounds of "{self.name}" are {low!r} and {high!r}, but must be numbers, one '
+                "of them at least, the lower one first."
+            )
+
+    @property
+    def watched(self) -> tuple[Quantity, ...]:
+        """The quantity."""
+        return (self.quantity,)
+
+    def holds(self, quantities: Quantities) -> bool:
+        """Return whether an entry is out of bounds."""
+        return self._is_out(quantities.get_value(self.quantity))
+
+    def _is_out(self, value: Any) -> bool:
+        try:
+            return bool(((value < self.low) | (value > self.high)).any())
+        except ValueError as error:
+            raise ConfigError(
+                f'The termination "{self.name}" compares {np.shape(value)} numbers with bounds of '
+                f"{self.low.shape} and {self.high.shape}: {error}"
+            ) from error
+
+
+class Drift(OutOfBounds):
+    """Ends the episode where a quantity changes otherwise than its reference.
+
+    Judged is how much more it changed over a horizon than the reference trajectory does.
+    """
+
+    def __init__(
+        self,
+        quantity: Quantity,
+        steps: int,
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
+        name: str | None = None,
+        *,
+        difference: Callable[[Any, Any], Any] = np.subtract,
+        **options: Any,
+    ) -> None:
+        """Choose the quantity.
+
+        Args:
+            quantity: A number or array.
+            steps: The horizon, in steps of the environment.
+            low: Bounds of the excess, as in `OutOfBounds`.
+            high: Likewise.
+            name: None: that of the quantity's class.
+            difference: Takes two values; for angles, one that goes the short way.
+            options: Those of `Termination`.
+        """
+        own = Delta(quantity, steps, difference)
+        wanted = Delta(Reference(quantity), steps, difference)
+        drift = Computed(np.subtract, (own, wanted))
+        super().__init__(drift, low, high, name or f"{type(quantity).__name__}_drift", **options)
+
+
+class Shift(Termination):
+    """Ends the episode where a quantity was too far from its reference during a whole horizon."""
+
+    def __init__(
+        self,
+        quantity: Quantity,
+        steps: int,
+        farthest: float,
+        name: str | None = None,
+        *,
+        difference: Callable[[Any, Any], Any] = np.subtract,
+        **options: Any,
+    ) -> None:
+        """Choose the quantity.
+
+        Args:
+            quantity: A number or array.
+            steps: The horizon, in steps of the environment.
+            farthest: Largest Euclidean distance, in the quantity's unit.
+            name: None: that of the quantity's class.
+            difference: Takes two values; for angles, one that goes the short way.
+            options: Those of `Termination`.
+        """
+        super().__init__(name or f"{type(quantity).__name__}_shift", **options)
+        error = Computed(difference, (quantity, Reference(quantity)))
+        self.steps, self._errors = steps, Stacked(error, steps)
+        self.farthest = checks.not_negative(f'farthest of "{self.name}"', farthest)
+
+    @property
+    def watched(self) -> tuple[Quantity, ...]:
+        """The errors of the horizon."""
+        return (self._errors,)
+
+    def holds(self, quantities: Quantities) -> bool:
+        """Return whether every error of a full horizon is too large."""
+        errors = quantities.get_value(self._errors)
+        if len(errors) < self.steps:
+            return False
+        distances = np.linalg.norm(errors.reshape(len(errors), -1), axis=1)
+        return bool(distances.min() > self.farthest)

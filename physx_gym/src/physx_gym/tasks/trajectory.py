@@ -1,0 +1,135 @@
+"""A motion of a robot in time, to follow or to look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import h5py
+import numpy as np
+
+from physx_core.errors import ConfigError, LogError
+from physx_core.fields import is_finite
+from physx_core.typing import Vector
+
+Beyond = Literal["raise", "wrap", "clip"]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """How a robot, or everything in a world, moved.
+
+    Between two rows positions and velocities are on the line between them; a quaternion turns the
+    short way.
+
+    Attributes:
+        times: Growing, shape (rows,), in s.
+        positions: Shape (rows, nq), in the convention of `physx_core.simulation.layout`.
+        velocities: Shape (rows, nv), likewise.
+        beyond: What is before the first and behind the last row: ``"raise"``, an error; ``"wrap"``,
+            the motion begins anew, from where it ended on the ground; ``"clip"``, it rests.
+    """
+
+    times: Vector
+    positions: Vector
+    velocities: Vector
+    beyond: Beyond = "raise"
+
+    def __post_init__(self) -> None:
+        """Check that the arrays fit together.
+
+        Raises:
+            ConfigError: They do not.
+        """
+        rows = len(self.times)
+        shapes = [np.shape(a) for a in (self.times, self.positions, self.velocities)]
+        if len(shapes[0]) != 1 or not rows or any(len(s) != 2 or s[0] != rows for s in shapes[1:]):
+            raise ConfigError(
+                "A trajectory needs times (rows,), positions (rows, nq) and velocities (rows, nv), "
+                f"not {shapes}."
+            )
+        if not all(is_finite(np.asarray(a)) for a in (self.times, self.positions, self.velocities)):
+            raise ConfigError("A trajectory must be finite numbers.")
+        if (np.diff(self.times) < 0).any():
+            raise ConfigError("The times of a trajectory must grow.")
+        if self.beyond not in ("raise", "wrap", "clip"):
+            raise ConfigError(f'beyond is "{self.beyond}", not "raise", "wrap" or "clip".')
+
+    @property
+    def duration(self) -> float:
+        """Time from the first to the last row, in s."""
+        return float(self.times[-1] - self.times[0])
+
+    def at(self, t: float) -> tuple[Vector, Vector]:
+        """Return positions (nq,) and velocities (nv,) at a time, in s.
+
+        Raises:
+            ConfigError: It is beyond the trajectory, where that is an error; or there is more than
+                one floating base in the positions.
+        """
+        first, last = float(self.times[0]), float(self.times[-1])
+        laps = 0
+        if self.beyond == "wrap" and self.duration > 0:
+            laps = int((t - first) // self.duration)
+            t -= laps * self.duration
+        elif self.beyond == "raise" and not first - 1e-9 <= t <= last + 1e-9:
+            raise ConfigError(
+                f"The trajectory is from {first:g} s to {last:g} s, but {t:g} s is asked for: "
+                'choose beyond="clip" or "wrap".'
+            )
+        t = min(max(t, first), last)
+        row = min(max(int(np.searchsorted(self.times, t, "right")) - 1, 0), len(self.times) - 1)
+        after = min(row + 1, len(self.times) - 1)
+        span = float(self.times[after] - self.times[row])
+        share = (t - float(self.times[row])) / span if span > 0 else 0.0
+        q = _between(self.positions[row], self.positions[after], share)
+        if self._floats:
+            here, there = self.positions[row, 3:7], self.positions[after, 3:7]
+            turn = _between(here, there if here @ there >= 0 else -there, share)
+            q[3:7] = turn / np.linalg.norm(turn)
+            q[:2] += laps * (self.positions[-1, :2] - self.positions[0, :2])
+        return q, _between(self.velocities[row], self.velocities[after], share)
+
+    @property
+    def _floats(self) -> bool:
+        """Whether it is of a robot whose base floats."""
+        more = self.positions.shape[1] - self.velocities.shape[1]
+        if more > 1:
+            raise ConfigError(
+                "This trajectory is of several floating bases; take that of one robot, for example "
+                "Log.trajectory(robot)."
+            )
+        return bool(more == 1)
+
+    def save(self, path: str | Path) -> None:
+        """Write the trajectory to an HDF5 file."""
+        with h5py.File(path, "w") as file:
+            file.attrs["format"], file.attrs["beyond"] = "physx trajectory", self.beyond
+            for name in ("times", "positions", "velocities"):
+                file.create_dataset(name, data=getattr(self, name))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Trajectory:
+        """Read what `save` wrote.
+
+        Raises:
+            LogError: It is not such a file.
+        """
+        try:
+            with h5py.File(path, "r") as file:
+                if file.attrs.get("format") != "physx trajectory":
+                    raise LogError(f"{path} is no trajectory.")
+                names = ("times", "positions", "velocities")
+                if not all(isinstance(file.get(n, getlink=True), h5py.HardLink) for n in names):
+                    raise LogError(f"{path} is no trajectory: it has parts elsewhere, or none.")
+                times, positions, velocities = (np.asarray(file[n], float) for n in names)
+                beyond: Any = file.attrs["beyond"]
+                return cls(times, positions, velocities, beyond)
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            raise LogError(f"{path} cannot be read as a trajectory: {error}") from error
+
+
+def _between(first: Vector, second: Vector, share: float) -> Vector:
+    between: Vector = first + share * (second - first)
+    return between

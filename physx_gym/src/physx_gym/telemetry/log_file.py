@@ -1,0 +1,154 @@
+"""Reading log files: every claim in the file is checked, and nothing in it is run."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.errors import LogError
+from physx_gym.telemetry.log import FORMAT, TIME, VERSION, Column, Log
+
+_NAMES_WIDTH = 4096
+
+
+def read_log(path: str | Path) -> Log:
+    """Read a log file.
+
+    Args:
+        path: What `Log.write` wrote: the environment's ``log_path``.
+
+    Raises:
+        LogError: It is missing, is no log, or is damaged.
+    """
+    import h5py
+
+    path = Path(path)
+    if not path.is_file():
+        raise LogError(f"There is no log {path}.")
+    try:
+        with h5py.File(path, "r") as file:
+            return _Reader(path, file).read()
+    except LogError:
+        raise
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise LogError(f"{path} cannot be read as a log: {error}.") from error
+
+
+Source = Log | Mapping[str, Any] | str | Path
+
+
+def as_logs(sources: Source | Sequence[Source], more: Sequence[Source] = ()) -> list[Log]:
+    """Return logs, their files, or what `RobotEnv.log_data` gave, as logs.
+
+    Args:
+        sources: One, or several.
+        more: Several.
+
+    Raises:
+        LogError: Something is none of them, a file cannot be read, or nothing was recorded.
+    """
+    several = isinstance(sources, Sequence) and not isinstance(sources, str)
+    given: Any = sources if several else [sources]
+    logs = [_log(each) for each in (*given, *more)]
+    if not logs:
+        raise LogError("There is no log: give one or several.")
+    return logs
+
+
+def _log(source: Any) -> Log:
+    if isinstance(source, (str, Path)):
+        return read_log(source)
+    if isinstance(source, Mapping):
+        source = Log(source.get("constants", {}), source.get("variables", {}))
+    if not isinstance(source, Log):
+        raise LogError(f"{source!r} is no log, no log_data and no path of a log.")
+    if not len(source.variables.get(TIME, ())):
+        raise LogError(
+            "Nothing was recorded of the episode. In training only variables with "
+            "is_eval_only=False are; for all, call eval() before reset."
+        )
+    return source
+
+
+class _Reader:
+    """Reads one open file."""
+
+    def __init__(self, path: Path, file: Any) -> None:
+        self._path, self._file = path, file
+        self._size = path.stat().st_size
+
+    def read(self) -> Log:
+        """Return the log."""
+        if self._file.attrs.get("format") != FORMAT:
+            raise self._error("is no log of physx")
+        version = self._file.attrs.get("version")
+        if version != VERSION:
+            raise self._error(f"has the version {version}; this physx reads version {VERSION}")
+        constants = json.loads(self._values(self._file, "constants", "u1", 1).tobytes())
+        if not isinstance(constants, dict):
+            raise self._error("has constants that are no dictionary")
+        variables: dict[str, Column] = {}
+        units: dict[str, str] = {}
+        for dtype in ("float64", "int64"):
+            if dtype in self._file:
+                self._table(dtype, variables, units)
+        if next(iter(variables), None) != TIME:
+            raise self._error("has no column of the time")
+        if len({len(each) for each in variables.values()}) != 1:
+            raise self._error("has columns of different lengths")
+        return Log({**constants, "units": units}, variables, self._path)
+
+    def _table(self, dtype: str, variables: dict[str, Column], units: dict[str, str]) -> None:
+        """Read the columns of one type."""
+        group = self._item(self._file, dtype)
+        values = self._values(group, "values", dtype, 2)
+        names, own = (self._texts(group, name) for name in ("names", "units"))
+        if not len(names) == len(own) == values.shape[1]:
+            raise self._error(f"has {values.shape[1]} columns of {dtype} but {len(names)} names")
+        if len(set(names)) != len(names) or set(names) & set(variables):
+            raise self._error("has two columns of one name")
+        variables |= {name: values[:, number] for number, name in enumerate(names)}
+        units |= {name: unit for name, unit in zip(names, own, strict=True) if unit}
+
+    def _item(self, group: Any, name: str) -> Any:
+        """Return a member of a group; links that lead elsewhere are not followed."""
+        import h5py
+
+        if not isinstance(group, h5py.Group) or name not in group:
+            raise self._error(f'lacks "{name}"')
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            raise self._error(f'has a link in the place of "{name}"')
+        return group[name]
+
+    def _values(self, group: Any, name: str, dtype: str | None, axes: int) -> Any:
+        """Return a dataset that lies in one piece within this file.
+
+        So nothing is unpacked, and nothing larger than the file is allocated.
+        """
+        import h5py
+
+        item = self._item(group, name)
+        if not isinstance(item, h5py.Dataset) or item.shape is None or item.ndim != axes:
+            raise self._error(f'has no array of {axes} axes in the place of "{name}"')
+        if dtype is not None and item.dtype != np.dtype(dtype):
+            raise self._error(f'has numbers of the type {item.dtype} in "{name}"')
+        if item.chunks is not None or item.is_virtual or item.external:
+            raise self._error(f'has "{name}" not in one piece')
+        needed, offset = item.size * item.dtype.itemsize, item.id.get_offset()
+        if needed and (offset is None or offset + needed > self._size):
+            raise self._error(f'was cut: "{name}" is not all there')
+        return item[()]
+
+    def _texts(self, group: Any, name: str) -> list[str]:
+        texts = self._values(group, name, None, 1)
+        if texts.dtype.kind != "S" or texts.dtype.itemsize > _NAMES_WIDTH:
+            raise self._error(f'has no texts in the place of "{name}"')
+        return [text.decode() for text in texts.tolist()]
+
+    def _error(self, what: str) -> LogError:
+        return LogError(f"{os.fspath(self._path)} cannot be read: it {what}.")

@@ -1,0 +1,219 @@
+"""Variables of the telemetry: nested arrays, the names of their numbers, and their memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from physx_core.errors import ConfigError
+from physx_gym.env.shared_arrays import SharedArrays
+
+Array = NDArray[Any]
+Leaf = tuple[tuple[Any, ...], Array]
+"""The keys that lead to an array in nested containers, and the array."""
+
+TYPES = ("float64", "int64")
+"""Types of the numbers that can be recorded."""
+
+
+@dataclass(frozen=True)
+class Variable(SharedArrays):
+    """A registered variable.
+
+    Attributes:
+        name: Its name, with the namespace.
+        value: The arrays, nested in dictionaries and sequences; the user's own.
+        fieldnames: Names of its columns, nested likewise.
+        arrays: The arrays in the order of the columns.
+        columns: Names of the columns of each array.
+        units: Units of the columns; empty where nobody knows.
+        is_eval_only: Whether it is left out in training.
+    """
+
+    name: str
+    value: Any
+    fieldnames: Any
+    arrays: tuple[Array, ...]
+    columns: tuple[tuple[str, ...], ...]
+    units: tuple[str, ...]
+    is_eval_only: bool
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        value: Any,
+        fieldnames: Any,
+        namespace: str | None,
+        unit: str | Sequence[str],
+        is_eval_only: bool,
+    ) -> Variable:
+        """Check a variable and name its columns; see `Telemetry.register`.
+
+        Raises:
+            ConfigError: A type, shape or name is wrong.
+        """
+        for text in (name, namespace):
+            if not isinstance(text, (str, type(None))):
+                raise ConfigError(f"A variable's name is a text, not {text!r}.")
+        full = f"{namespace}.{name}" if namespace else name
+        if not name:
+            raise ConfigError("A variable of the telemetry needs a name.")
+        found = list(leaves(value, full))
+        names = [_names(full, leaf, fieldnames) for leaf in found]
+        size = sum(each.size for each in names)
+        units = (unit,) * size if isinstance(unit, str) else tuple(unit)
+        if len(units) != size:
+            raise ConfigError(f'"{full}" has {size} numbers, but {len(units)} units.')
+        return cls(
+            full,
+            value,
+            _nested(value, iter(names)),
+            tuple(array for _, array in found),
+            tuple(tuple(each.ravel().tolist()) for each in names),
+            units,
+            is_eval_only,
+        )
+
+    def is_of(self, other: Variable) -> bool:
+        """Return whether the other is the same: the same arrays under the same names."""
+        same = len(self.arrays) == len(other.arrays) and self.columns == other.columns
+        pairs = zip(self.arrays, other.arrays, strict=True) if same else ()
+        return same and all(_memory(mine) == _memory(its) for mine, its in pairs)
+
+
+def leaves(value: Any, name: str, keys: tuple[Any, ...] = ()) -> Iterator[Leaf]:
+    """Return the arrays in nested containers, in their order.
+
+    Raises:
+        ConfigError: Something in it is no array of float64 or int64.
+    """
+    where = ".".join([name, *map(str, keys)])
+    if isinstance(value, Mapping):
+        for key, each in value.items():
+            yield from leaves(each, name, (*keys, key))
+    elif isinstance(value, (list, tuple)):
+        for number, each in enumerate(value):
+            yield from leaves(each, name, (*keys, number))
+    elif isinstance(value, np.ndarray):
+        if value.dtype.name not in TYPES or not value.dtype.isnative:
+            raise ConfigError(
+                f'"{where}" is an array of {value.dtype}; only float64 and int64 can be recorded. '
+                "Keep the numbers in an array of one of them, and register that."
+            )
+        yield keys, value
+    else:
+        raise ConfigError(
+            f'"{where}" is {value!r}, a {type(value).__name__}. Variables are registered by '
+            "reference: keep the numbers in an array of float64 or int64, and register that."
+        )
+
+
+def _names(name: str, leaf: Leaf, fieldnames: Any) -> Array:
+    """Return the names of an array's numbers as an array of its shape."""
+    keys, array = leaf
+    if fieldnames is None:
+        prefix = ".".join([name, *map(str, keys)])
+        numbers = np.ndindex(array.shape)
+        flat = [".".join([prefix, *map(str, number)]) for number in numbers]
+    else:
+        flat = [f"{name}.{own}" for own in _flat(_below(name, fieldnames, keys), name, array)]
+    named = np.empty(array.size, object)
+    named[:] = flat
+    return named.reshape(array.shape)
+
+
+def _below(name: str, fieldnames: Any, keys: tuple[Any, ...]) -> Any:
+    for key in keys:
+        try:
+            fieldnames = fieldnames[key]
+        except (KeyError, IndexError, TypeError) as error:
+            raise ConfigError(
+                f'The fieldnames of "{name}" lack {key!r}: they are nested like the value.'
+            ) from error
+    return fieldnames
+
+
+def _flat(fieldnames: Any, name: str, array: Array) -> Sequence[str]:
+    """Return the own names of an array's numbers.
+
+    A text is the name of a single number; otherwise there are nested sequences of the array's
+    shape, or one sequence for all numbers.
+    """
+    names = np.array([fieldnames] if isinstance(fieldnames, str) else fieldnames, object)
+    fits = names.shape == array.shape or (names.ndim == 1 and names.size == array.size)
+    if not fits:
+        raise ConfigError(
+            f'"{name}" has an array of shape {array.shape}, but fieldnames of shape {names.shape}.'
+        )
+    flat: list[Any] = names.ravel().tolist()
+    wrong = [each for each in flat if not isinstance(each, str) or not each]
+    if wrong:
+        raise ConfigError(f'A fieldname of "{name}" is {wrong[0]!r}, not a text.')
+    return flat
+
+
+def _nested(value: Any, names: Iterator[Array]) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _nested(each, names) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_nested(each, names) for each in value]
+    return next(names).tolist()
+
+
+# Memory -------------------------------------------------------------------------------------
+
+WORD = np.dtype(np.int64)
+"""What numbers are copied as: 8 bytes, whatever they mean."""
+
+
+def words_of(arrays: Iterable[Array]) -> list[NDArray[np.int64]]:
+    """Return one-dimensional views, as few as possible, that are all numbers in order."""
+    found: list[NDArray[np.int64]] = []
+    for view in (view for array in arrays for view in _flat_views(array) if view.size):
+        both = _joined(found[-1], view) if found else None
+        if both is None:
+            found.append(view)
+        else:
+            found[-1] = both
+    return found
+
+
+def _flat_views(array: Array) -> Iterator[NDArray[np.int64]]:
+    if array.ndim <= 1 or array.flags.c_contiguous:
+        yield array.reshape(-1).view(WORD)
+    else:
+        for part in array:
+            yield from _flat_views(part)
+
+
+def _joined(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """Return two views as one, where they follow each other in one owner's memory."""
+    owner, step = _owner(first), WORD.itemsize
+    if _owner(second) is not owner or not owner.flags.c_contiguous or owner.itemsize != step:
+        return None
+    if any(view.size > 1 and view.strides != (step,) for view in (first, second)):
+        return None
+    begin = _address(first) - _address(owner)
+    if _address(second) - _address(owner) != begin + first.size * step:
+        return None
+    words = owner.reshape(-1).view(WORD)
+    return words[begin // step : begin // step + first.size + second.size]
+
+
+def _owner(array: Array) -> Array:
+    while type(array.base) is np.ndarray:
+        array = array.base
+    return array
+
+
+def _memory(array: Array) -> tuple[Any, ...]:
+    return _address(array), array.shape, array.strides
+
+
+def _address(array: Array) -> int:
+    return int(array.__array_interface__["data"][0])

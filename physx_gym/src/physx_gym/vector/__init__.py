@@ -1,0 +1,1 @@
+"""Vector environments in worker processes."""

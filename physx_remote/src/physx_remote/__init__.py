@@ -1,0 +1,7 @@
+"""Environments in other processes: serving them, and driving those that others serve."""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

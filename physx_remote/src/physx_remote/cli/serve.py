@@ -1,0 +1,172 @@
+"""``physx serve``: serve an environment to other processes: Godot clients, trainers, physx."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import secrets
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from physx_core.cli.pipeline_options import argument_registry
+from physx_core.errors import ConfigError, UsageError
+from physx_core.net import TOKEN_VARIABLE
+from physx_remote.endpoints import serve
+from physx_remote.godot_rl.launch import write_launcher
+from physx_remote.serving.protocol import Service
+from physx_remote.serving.service import LOG
+
+_PORTS = {"godot-gym": 9090, "godot-rl": 0, "physx": 0}
+_WITH_TOKEN = "physx"
+_WITH_LAUNCHER = "godot-rl"
+
+
+@dataclass
+class Serve:
+    """Let other processes drive an environment, until Ctrl-C.
+
+    The protocol physx asks clients for a token. It is the content of --token-file, which is made if
+    it does not exist; or in the environment variable PHYSX_TOKEN; or in a new file that is removed
+    in the end.
+    """
+
+    environment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENVIRONMENT")]
+    """"physx/Cartpole-v0", "gym/CartPole-v1", "dart/arm", "script.py:Class" ..."""
+    protocol: str = "physx"
+    """godot-gym, godot-rl, physx, or "package.module:Class"."""
+    address: str = "127.0.0.1"
+    """Where to listen; for godot-rl where the trainer listens."""
+    port: int | None = None
+    """Port; by default 9090 for godot-gym, the trainer's 11008 for godot-rl, and any free one."""
+    num_worlds: int = 1
+    """How many worlds to serve on one connection."""
+    token_file: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """File with the token of the protocol physx, readable by you alone."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Arguments of the environment."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """The protocol's own options, for example clients=serve for godot-gym."""
+    write_launcher: Annotated[Path | None, tyro.conf.arg(metavar="FILE.x86_64")] = None
+    """Only for godot-rl: write a file that a trainer starts as env_path, and end."""
+
+
+def run(words: Sequence[str]) -> None:
+    """Serve as the words say.
+
+    Raises:
+        PhysxError: The environment cannot be made or served there.
+        KeyboardInterrupt: The user ended it; all is closed.
+    """
+    with argument_registry():
+        chosen = tyro.cli(Serve, args=words, prog="physx serve")
+    if chosen.write_launcher is not None:
+        _write_launcher(chosen)
+        return
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_log_on_screen())
+        before = signal.signal(signal.SIGTERM, lambda *args: sys.exit(128 + signal.SIGTERM))
+        stack.callback(signal.signal, signal.SIGTERM, before)
+        options = dict(chosen.options)
+        if chosen.protocol == _WITH_TOKEN:
+            options["token_file"] = stack.enter_context(_token_file(chosen.token_file))
+        elif chosen.token_file is not None:
+            raise UsageError(f'--token-file is for the protocol "{_WITH_TOKEN}".')
+        port = _PORTS.get(chosen.protocol, 0) if chosen.port is None else chosen.port
+        service = stack.enter_context(
+            serve(
+                chosen.environment,
+                chosen.protocol,
+                address=chosen.address,
+                port=port,
+                num_worlds=chosen.num_worlds,
+                env_kwargs=chosen.env_kwargs,
+                **options,
+            )
+        )
+        _say(chosen, service, options.get("token_file"))
+        while service.poll(None):  # Ctrl-C passes: the command tells it by its status
+            continue
+
+
+@contextlib.contextmanager
+def _log_on_screen() -> Iterator[None]:
+    """Show what services say."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("physx serve: %(message)s"))
+    before = LOG.level
+    LOG.addHandler(handler)
+    LOG.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        LOG.removeHandler(handler)
+        LOG.setLevel(before)
+
+
+def _say(chosen: Serve, service: Service, token_file: str | None) -> None:
+    host, port = service.address
+    verb = "connected to" if chosen.protocol == _WITH_LAUNCHER else "listening at"
+    print(f"{chosen.environment} over {chosen.protocol}, {verb} {host}:{port}", flush=True)
+    if chosen.protocol == _WITH_TOKEN:
+        place = token_file or f"the environment variable {TOKEN_VARIABLE}"
+        print(f"token: {place}", flush=True)
+        given = f', token_file="{token_file}"' if token_file else ""
+        print(f'  physx_remote.connect("{host}:{port}"{given})', flush=True)
+    print("Ctrl-C ends it.", flush=True)
+
+
+@contextlib.contextmanager
+def _token_file(given: Path | None) -> Iterator[str | None]:
+    """Yield the file with the token, None if it is in the environment; a made-up one goes again.
+
+    Raises:
+        ConfigError: The file cannot be made.
+    """
+    if given is None and TOKEN_VARIABLE in os.environ:
+        yield None
+    elif given is not None:
+        try:
+            with contextlib.suppress(FileExistsError):
+                _write_token(given)
+        except OSError as error:
+            raise ConfigError(f"The token file {given} cannot be written: {error}.") from error
+        yield str(given.absolute())
+    else:
+        folder = os.environ.get("XDG_RUNTIME_DIR")
+        usable = folder if folder and os.access(folder, os.W_OK) else None
+        with tempfile.TemporaryDirectory(prefix="physx-", dir=usable) as made:
+            place = Path(made) / "token"
+            _write_token(place)
+            yield str(place)
+
+
+def _write_token(path: Path) -> None:
+    """Write a new token into a new file that nobody else may read."""
+    opened = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(opened, "w", encoding="ascii") as file:
+        file.write(secrets.token_hex(32) + "\n")
+
+
+def _write_launcher(chosen: Serve) -> None:
+    if chosen.protocol != _WITH_LAUNCHER:
+        raise UsageError(
+            f"--write-launcher is for trainers of godot-rl: add --protocol {_WITH_LAUNCHER}."
+        )
+    if chosen.options.keys() - {"action_repeat"}:
+        raise UsageError("A launcher keeps the option action_repeat only.")
+    path = write_launcher(
+        chosen.write_launcher or "",
+        chosen.environment,
+        num_worlds=chosen.num_worlds,
+        env_kwargs=chosen.env_kwargs,
+        **chosen.options,
+    )
+    print(f'{path}\n  GodotEnv(env_path="{path}") starts it.')

@@ -1,0 +1,233 @@
+"""Communication: the server of an `RLEnvironment`, and what goes over its wire."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, get_args
+
+from physx_core.errors import ConfigError, RequestError, UsageError
+from physx_remote.godot_gym.frames_timer import Signal
+from physx_remote.godot_gym.messages import ERROR, encoded_extension
+from physx_remote.godot_gym.requests import JsonReader, parse_request
+from physx_remote.serving.connection import Connection
+from physx_remote.serving.framing import MAX_REQUEST, FrameReader, Reader, framed
+from physx_remote.serving.protocol import check_place
+from physx_remote.serving.service import LOG, SocketService, Work
+
+Clients = Literal["queue", "refuse", "serve"]
+Reply = Literal["always", "observation-only"]
+RequestFraming = Literal["framed", "bare-json"]
+Errors = Literal["tell", "close"]
+
+
+class Communication(SocketService):
+    """Serves clients that send requests as JSON, one after the other.
+
+    A request is answered exactly once: with what `put_message` is given, and otherwise with an
+    empty message. One that cannot be carried out is logged, and answered with the part ``error``
+    of `physx_remote.godot_gym.messages`; the environment lives on.
+
+    Attributes:
+        got_connection: Signal with a request, a dictionary. A function that is connected may
+            return a generator: it yields how long it wants to be left alone, in s.
+    """
+
+    def __init__(
+        self,
+        *,
+        clients: Clients = "queue",
+        reply: Reply = "always",
+        request_framing: RequestFraming = "framed",
+        errors: Errors = "tell",
+        max_request: int = MAX_REQUEST,
+        patience: float | None = None,
+        max_clients: int = 256,
+    ) -> None:
+        """Keep the options.
+
+        Args:
+            clients: What happens to a second client while one is served, which is from its first
+                request until it leaves: ``"queue"``, it waits; ``"refuse"``, it is closed at once;
+                ``"serve"``, its requests are answered in turn with those of the first.
+            reply: ``"always"``, or ``"observation-only"``: only requests for an observation are
+                answered, as in the first version of the protocol.
+            request_framing: ``"framed"``, or ``"bare-json"``: requests have no length before them,
+                as in the first version.
+            errors: ``"tell"``, or ``"close"``: who sends a request that cannot be carried out is
+                closed.
+            max_request: Longest request in bytes; who sends a longer one is closed.
+            patience: How long a client may be silent, in s, while another waits for it; None: for
+                ever.
+            max_clients: How many clients are connected at most; who comes then is closed at once.
+
+        Raises:
+            ConfigError: A value is none of these.
+        """
+        super().__init__(max_clients=max_clients)
+        choices = (
+            ("clients", clients, Clients),
+            ("reply", reply, Reply),
+            ("errors", errors, Errors),
+            ("request_framing", request_framing, RequestFraming),
+        )
+        for name, value, kinds in choices:
+            if value not in get_args(kinds):
+                known = ", ".join(f'"{kind}"' for kind in get_args(kinds))
+                raise ConfigError(f"{name} is {value!r} but must be one of {known}.")
+        for name, number in (("max_request", max_request), ("max_clients", max_clients)):
+            if type(number) is not int or number < 1:
+                raise ConfigError(f"{name} is {number!r} but must be a whole number, at least 1.")
+        if patience is not None and (type(patience) not in (int, float) or not patience > 0):
+            raise ConfigError(f"patience is {patience!r} but must be a number of s above 0.")
+        self.got_connection = Signal()
+        self._clients, self._reply, self._errors = clients, reply, errors
+        self._framing, self._max_request, self._patience = request_framing, max_request, patience
+        self._served: Connection | None = None
+        self._asking: Connection | None = None
+        self._answered = False
+
+    @property
+    def message_processing(self) -> bool:
+        """Whether a request is being carried out."""
+        return self._asking is not None
+
+    @property
+    def is_abandoned(self) -> bool:
+        """Whether nobody waits for the answer to the request that is being carried out.
+
+        A client that sends no more may still read; it counts as gone once another one waits.
+        """
+        asking = self._asking
+        if asking is None or not asking.ended:
+            return asking is not None and asking.closed
+        return any(other.body is not None for other in self.connections if other is not asking)
+
+    @property
+    def is_listening(self) -> bool:
+        """Whether `start_server` was called."""
+        return self._listener is not None
+
+    def start_server(self, port: int, address: str = "127.0.0.1") -> None:
+        """Begin to listen.
+
+        Args:
+            port: Port, 0 for any that is free.
+            address: Address of this machine. Whoever reaches it drives the environment: nobody has
+                to say who he is.
+
+        Raises:
+            UsageError: It listens already, or is closed.
+            ConfigError: Port or address is none.
+            RemoteError: It cannot listen there.
+        """
+        check_place(address, port)
+        if self.is_listening:
+            raise UsageError(f"The server listens already, at {self.address}.")
+        if self._over:
+            raise UsageError("What was closed does not serve again: make another environment.")
+        self.listen(address, port)
+        LOG.info("Listening at %s:%s", *self.address)
+        if self._patience is not None:
+            self.after(self._patience / 4, self._look_for_silence)
+
+    def server_poll(self, timeout: float | None = 0.0) -> bool:
+        """Handle what has arrived; see `Service.poll`."""
+        return self.poll(timeout)
+
+    def put_message(self, message: Any = None) -> None:
+        """Answer the request that is being carried out.
+
+        Args:
+            message: A message of protobuf, or its bytes; None: nothing was asked for.
+
+        Raises:
+            UsageError: No request is being carried out, or it is answered already.
+        """
+        if self._asking is None:
+            raise UsageError("put_message() answers a request, and there is none.")
+        if self._answered:
+            raise UsageError("A request is answered once, and this one is answered already.")
+        self._answered = True
+        if message is None:
+            if self._reply == "observation-only":
+                return
+            message = b""
+        body = message if isinstance(message, bytes) else message.SerializeToString()
+        self.send(self._asking, framed(body))
+
+    # What the loop calls --------------------------------------------------------------------
+
+    def new_reader(self) -> Reader:
+        """Return what cuts requests out of a stream."""
+        kind = JsonReader if self._framing == "bare-json" else FrameReader
+        return kind(self._max_request)
+
+    def opened(self, connection: Connection) -> None:
+        """Turn a client away, or tell the log that it waits."""
+        if self._served is None or self._clients == "serve":
+            LOG.info("%s connected", connection.name)
+        elif self._clients == "refuse" and not self._served.ended:
+            self.drop(connection, f"turned away while {self._served.name} is served")
+        else:
+            LOG.info("%s waits until %s leaves", connection.name, self._served.name)
+
+    def closed(self, connection: Connection) -> None:
+        """Make room for the next client."""
+        if connection is self._served:
+            LOG.info("%s left", connection.name)
+            self._served = None
+
+    def admits(self, connection: Connection) -> bool:
+        """Return whether it is this client's turn."""
+        return self._clients == "serve" or self._served in (None, connection)
+
+    def received(self, connection: Connection, body: bytes) -> Work:
+        """Carry out one request."""
+        if self._served is None:
+            self._serve_only(connection)
+        self._asking, self._answered = connection, False
+        try:
+            request = parse_request(body)
+            for work in self.got_connection.emit(request):
+                if work is not None:
+                    yield from work
+            if not self._answered:
+                self.put_message()
+        except Exception as error:
+            self._report(connection, error)
+        finally:
+            self._asking = None
+
+    def _serve_only(self, connection: Connection) -> None:
+        if self._clients == "serve":
+            return
+        self._served = connection
+        if self._clients == "refuse":
+            for other in [*self.connections]:
+                if other is not connection:
+                    self.drop(other, f"turned away while {connection.name} is served")
+
+    def _report(self, connection: Connection, error: Exception) -> None:
+        """Say what went wrong, here and to the client."""
+        expected = isinstance(error, RequestError)
+        text = str(error) if expected else f"{type(error).__name__}: {error}"
+        LOG.error(
+            "A request of %s failed: %s",
+            connection.name,
+            text,
+            exc_info=None if expected else error,
+        )
+        if self._answered:
+            return
+        if self._errors == "close":
+            self.drop(connection, "its request failed")
+        elif self._reply == "always":
+            self.put_message(encoded_extension(ERROR, text))
+
+    def _look_for_silence(self) -> None:
+        """Close a client that keeps others waiting."""
+        patience, served = self._patience or 0.0, self._served
+        self.after(patience / 4, self._look_for_silence)
+        others = any(c is not served for c in self.connections)
+        idle = served is not None and self._asking is None and served.body is None
+        if served is not None and idle and others and served.silence > patience:
+            self.drop(served, f"silent for {patience:g} s while another waits")

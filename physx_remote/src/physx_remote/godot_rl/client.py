@@ -1,0 +1,342 @@
+"""Clients of godot-rl: the trainer's side, for applications that use its plugin, and for physx."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
+
+from physx_core.errors import RemoteError, RemoteProtocolError, RemoteTimeoutError, UsageError
+from physx_core.typing import Array
+from physx_remote.godot_rl.json_spaces import ACTION, IMAGE, OBSERVATION
+from physx_remote.serving.client_link import Link
+from physx_remote.serving.framing import MAX_ANSWER, framed
+from physx_remote.serving.spaces import Space
+
+VERSION = {"major_version": "0", "minor_version": "7"}
+"""Version of the protocol, as the handshake tells it."""
+
+
+class _Incoming(Link):
+    """The connection of the application that comes to an address."""
+
+    def _connected(self, address: tuple[str, int], patience: float) -> socket.socket:
+        try:
+            listener = socket.create_server(address)
+        except (OSError, OverflowError) as error:
+            raise RemoteError(
+                f"Nothing can listen at {self.name}: {error}. A trainer that runs already, or "
+                "another program, may have the port."
+            ) from error
+        with listener:
+            listener.settimeout(patience)
+            try:
+                return listener.accept()[0]
+            except TimeoutError as error:
+                raise RemoteTimeoutError(
+                    f"No application came to {self.name} within {patience:g} s. Start it with this "
+                    "port, or give a longer connect_timeout."
+                ) from error
+
+    def tell(self, body: bytes) -> None:
+        """Send a message that nobody answers."""
+        self._socket.sendall(framed(body))
+
+
+class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
+    """The agents of an application that comes to an address: the side of godot-rl that trains.
+
+    Observations and actions are dictionaries by the application's keys; a single key ``obs`` or
+    ``action`` is left out. Agents whose episode ends go on with the next one by themselves. Where
+    the application tells them, as services of physx do, terminated and truncated are told apart and
+    ``final_obs`` is in the infos; otherwise an episode that is done counts as terminated.
+    """
+
+    def __init__(
+        self,
+        address: tuple[str, int] = ("127.0.0.1", 11008),
+        *,
+        timeout: float | None = 60.0,
+        connect_timeout: float = 60.0,
+        max_answer: int = MAX_ANSWER,
+    ) -> None:
+        """Wait for the application and ask for its spaces.
+
+        Args:
+            address: Host and port where the application is expected.
+            timeout: How long an answer may take, in s; None: for ever.
+            connect_timeout: How long to wait for the application, in s.
+            max_answer: Longest answer in bytes that is taken.
+
+        Raises:
+            RemoteError: The port is taken, no application came, or its agents differ.
+        """
+        self._link = _Incoming(
+            address, timeout=timeout, connect_timeout=connect_timeout, max_answer=max_answer
+        )
+        try:
+            self._link.tell(json.dumps({"type": "handshake", **VERSION}).encode())
+            told = self._ask({"type": "env_info"}, "env_info")
+            self.num_envs = _count(told)
+            self._observed = _parts(told, "observation_space", self.num_envs, _observed)
+            self._acted = _parts(told, "action_space", self.num_envs, _acted)
+        except BaseException:
+            self._link.close()
+            raise
+        self.agent_policy_names = told.get("agent_policy_names", [""] * self.num_envs)
+        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}
+        self.single_observation_space = _whole(self._observed, OBSERVATION)
+        self.single_action_space = _whole(self._acted, ACTION)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin new episodes everywhere.
+
+        Args:
+            seed: Seed of the application; services of physx know it, others let it be.
+            options: Must be empty.
+
+        Raises:
+            UsageError: There are options, or the seed is no number.
+            RemoteError: The application reports an error, is gone, or does not answer in time.
+        """
+        if options:
+            raise UsageError(f"godot-rl has no options of a reset: {list(options)}.")
+        if seed is not None and not isinstance(seed, (int, np.integer)):
+            raise UsageError(f"The seed is one number for all agents, not {seed!r}.")
+        super().reset(seed=None if seed is None else int(seed))
+        observations, each = self.reset_each(None if seed is None else int(seed))
+        return self._batched(observations), self._joined(each)
+
+    def reset_each(self, seed: int | None) -> tuple[list[Any], list[dict[str, Any]]]:
+        """Begin new episodes everywhere; return each agent's observation and info."""
+        told = self._ask({"type": "reset"} | ({} if seed is None else {"seed": seed}), "reset")
+        seen = _each(told, "obs", self.num_envs)
+        return [self._observation(one) for one in seen], self._infos(told)
+
+    def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
+        """Have all agents act.
+
+        Raises:
+            RemoteError: The application reports an error, is gone, or does not answer in time.
+        """
+        by_name = isinstance(self.single_action_space, spaces.Dict)
+        entries = actions if by_name else {ACTION: actions}
+        columns = self.plain_actions(entries)
+        acted = [{n: column[i] for n, column in columns.items()} for i in range(self.num_envs)]
+        observations, rewards, terminated, truncated, each = self.step_each(acted)
+        return self._batched(observations), rewards, terminated, truncated, self._joined(each)
+
+    def plain_actions(self, entries: Mapping[str, Any]) -> dict[str, Any]:
+        """Return actions by the application's keys as numbers and lists of numbers."""
+        parts = self._acted.items()
+        return {n: np.asarray(entries[n], space.dtype).tolist() for n, space in parts}
+
+    def step_each(
+        self, acted: list[dict[str, Any]]
+    ) -> tuple[list[Any], Array, Array, Array, list[dict[str, Any]]]:
+        """Have all agents act.
+
+        Args:
+            acted: Each agent's action by the application's keys, as numbers and lists of numbers.
+
+        Returns:
+            Each agent's observation, reward, terminated, truncated and info.
+        """
+        told = self._ask({"type": "action", "action": acted}, "step")
+        observations = [self._observation(one) for one in _each(told, "obs", self.num_envs)]
+        rewards = np.array(_each(told, "reward", self.num_envs, (int, float)), np.float64)
+        done = np.array(_each(told, "done", self.num_envs, (bool, int, float)), bool)
+        infos = self._infos(told)
+        for info in infos:
+            if "terminal_observation" in info:
+                info["final_obs"] = self._observation(info.pop("terminal_observation"))
+        cut = [bool(i.get("truncated")) and not i.get("terminated") for i in infos]
+        truncated = done & np.array(cut)
+        return observations, rewards, done & ~truncated, truncated, infos
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call a method of all agents that takes nothing, and return what they answer."""
+        if args or kwargs:
+            raise UsageError("godot-rl calls methods without arguments only.")
+        return tuple(self._ask({"type": "call", "method": name}, "call")["returns"])
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Have the application end, and end the connection."""
+        try:
+            self._link.tell(b'{"type": "close"}')
+        except OSError:
+            pass  # it is gone already
+        finally:
+            self._link.close()
+
+    # ----------------------------------------------------------------------------------------
+
+    def _ask(self, message: Mapping[str, Any], kind: str) -> dict[str, Any]:
+        body = self._link.exchange(json.dumps(message).encode())
+        try:
+            told = json.loads(body)
+        except (ValueError, RecursionError) as error:
+            raise RemoteProtocolError(f"{self._link.name} answered no JSON: {error}.") from error
+        if isinstance(told, dict) and told.get("type") == kind:
+            return told
+        if isinstance(told, dict) and told.get("type") == "error":
+            raise RemoteError(f"{self._link.name}: {told.get('error')}: {told.get('message')}")
+        raise RemoteProtocolError(f"{self._link.name} answered {body[:100]!r}, not a {kind}.")
+
+    def _infos(self, told: Mapping[str, Any]) -> list[dict[str, Any]]:
+        """Return each agent's info; older applications tell none."""
+        if "info" not in told:
+            return [{} for _ in range(self.num_envs)]
+        return [dict(info) for info in _each(told, "info", self.num_envs)]
+
+    def _joined(self, each: list[dict[str, Any]]) -> dict[str, Any]:
+        infos: dict[str, Any] = {}
+        for agent, info in enumerate(each):
+            infos = self._add_info(infos, info, agent)
+        return infos
+
+    def _batched(self, observations: list[Any]) -> Any:
+        space = self.single_observation_space
+        batch: Any = create_empty_array(space, self.num_envs)
+        return concatenate(space, observations, batch)
+
+    def _observation(self, told: Any) -> Any:
+        """Return what one agent sees."""
+        try:
+            values = {n: _value(n, part, told[n]) for n, part in self._observed.items()}
+        except (KeyError, TypeError, ValueError) as error:
+            raise RemoteProtocolError(
+                f"The application told the observation {told!r:.100}, which does not fit its "
+                f"description {self._observed}: {error!r}."
+            ) from error
+        return (
+            values
+            if isinstance(self.single_observation_space, spaces.Dict)
+            else values[OBSERVATION]
+        )
+
+
+class GodotRLEnv(gymnasium.Env[Any, Any]):
+    """The one agent of an application that comes to an address: see `GodotRLVectorEnv`.
+
+    Attributes:
+        agents: The vector environment that has it.
+    """
+
+    def __init__(self, address: tuple[str, int] = ("127.0.0.1", 11008), **options: Any) -> None:
+        """Wait for the application.
+
+        Args:
+            address: Host and port where the application is expected.
+            options: Those of `GodotRLVectorEnv`.
+
+        Raises:
+            RemoteError: See `GodotRLVectorEnv`; or it has several agents.
+        """
+        self.agents = GodotRLVectorEnv(address, **options)
+        if self.agents.num_envs != 1:
+            self.agents.close()
+            raise RemoteError(
+                f"The application has {self.agents.num_envs} agents: use connect_vector()."
+            )
+        self.observation_space = self.agents.single_observation_space
+        self.action_space = self.agents.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode: see `GodotRLVectorEnv.reset`."""
+        super().reset(seed=seed)
+        if options:
+            raise UsageError(f"godot-rl has no options of a reset: {list(options)}.")
+        observations, infos = self.agents.reset_each(seed)
+        return observations[0], infos[0]
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Act: see `GodotRLVectorEnv.step`; at the end of an episode its last observation."""
+        entries = action if isinstance(self.action_space, spaces.Dict) else {ACTION: action}
+        told = self.agents.step_each([self.agents.plain_actions(entries)])
+        observations, rewards, terminated, truncated, infos = told
+        seen = infos[0].pop("final_obs", observations[0])
+        return seen, float(rewards[0]), bool(terminated[0]), bool(truncated[0]), infos[0]
+
+    def close(self) -> None:
+        """Have the application end, and end the connection."""
+        self.agents.close()
+
+
+def _each(told: Mapping[str, Any], key: str, count: int, kind: Any = dict) -> list[Any]:
+    """Return what an answer tells of each agent, values of a kind."""
+    values = told.get(key)
+    is_list = isinstance(values, list) and len(values) == count
+    if not is_list or not all(isinstance(value, kind) for value in values or ()):
+        raise RemoteProtocolError(
+            f'The application told "{key}" as {values!r:.100}, which is no list of {count}.'
+        )
+    return list(values or ())
+
+
+def _count(told: Mapping[str, Any]) -> int:
+    count: Any = told.get("n_agents")
+    if type(count) in (int, float) and 1 <= count < 1 << 20:  # Godot tells whole numbers as 2.0
+        return int(count)
+    raise RemoteProtocolError(f"The application told {count!r} agents.")
+
+
+def _parts(told: Mapping[str, Any], key: str, count: int, make: Any) -> dict[str, Space]:
+    """Return the spaces of the entries of each agent, which are the same for all."""
+    given: Any = told.get(key)
+    each = given if isinstance(given, list) else [given] * count
+    if len(each) != count or any(one != each[0] for one in each):
+        raise RemoteError(
+            f"The application's agents do not all have the same {key}, and only those that do can "
+            f"be driven together: {given!r:.200}"
+        )
+    try:
+        return {name: make(name, entry) for name, entry in each[0].items()}
+    except (AttributeError, KeyError, TypeError, ValueError, AssertionError) as error:
+        raise RemoteProtocolError(f"The {key} {each[0]!r:.200} is none: {error!r}.") from error
+
+
+def _observed(name: str, entry: Mapping[str, Any]) -> Space:
+    if entry["space"] == "discrete":
+        return spaces.Discrete(int(entry["size"]))
+    if entry["space"] != "box":
+        raise ValueError(f"there is no space {entry['space']!r}")
+    shape = tuple(int(size) for size in entry["size"])
+    if IMAGE in name:
+        return spaces.Box(0, 255, shape, np.uint8)
+    low, high = entry.get("low", -np.inf), entry.get("high", np.inf)
+    return spaces.Box(float(low), float(high), shape, np.float64)
+
+
+def _acted(name: str, entry: Mapping[str, Any]) -> Space:
+    size = int(entry["size"])
+    if entry["action_type"] == "discrete":
+        return spaces.Discrete(size)
+    if entry["action_type"] != "continuous":
+        raise ValueError(f"there is no action_type {entry['action_type']!r}")
+    return spaces.Box(-1.0, 1.0, (size,), np.float32)
+
+
+def _whole(parts: dict[str, Space], alone: str) -> Space:
+    return parts[alone] if parts.keys() == {alone} else spaces.Dict(parts)
+
+
+def _value(name: str, space: Space, told: Any) -> Any:
+    if isinstance(space, spaces.Discrete):
+        return np.int64(told)
+    if IMAGE in name:
+        return np.frombuffer(bytes.fromhex(told), np.uint8).reshape(space.shape or ())
+    return np.array(told, np.float64).reshape(space.shape or ())

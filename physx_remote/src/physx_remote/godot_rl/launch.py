@@ -1,0 +1,196 @@
+"""What a trainer of godot-rl starts: the command ``physx-godot-rl`` and files that call it.
+
+``GodotEnv(env_path=FILE)`` runs a file whose name ends with ``.x86_64`` and hands it the flags of a
+Godot application. `write_launcher` makes such a file for any environment.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from physx_core import PhysxError
+from physx_core.config import reference_of
+from physx_core.errors import ConfigError, UsageError
+from physx_remote.endpoints import serve
+from physx_remote.godot_rl.protocol import PORT, GodotRL
+
+SUFFIX = ".x86_64"
+"""How the name of an application ends that godot-rl starts on Linux."""
+
+COMMAND = "physx-godot-rl"
+
+USAGE = f"""usage: {COMMAND} ENVIRONMENT [FLAGS]
+
+Connects an environment to a trainer of godot-rl that listens on this machine, and serves it until
+the trainer ends. ENVIRONMENT: "gym/CartPole-v1", "toy/spring", "script.py:Class" ...
+
+  --port=N            where the trainer listens; {PORT} unless given
+  --env_seed=N        seed of the first episodes
+  --action_repeat=N   steps of the environment in one step of the trainer; 1 unless given
+  --num_worlds=N      agents, each with a world of its own; 1 unless given
+  --timeout=S         how long to try to reach the trainer, in s; 60 unless given
+  --NAME=VALUE        any other name: an argument of the environment
+  --headless, --disable-render-loop, --fixed-fps N, --speedup=X
+                      taken, as godot-rl gives them, and without effect: no window is opened, and
+                      physics runs as fast as it can, in steps of the environment's own length
+"""
+
+_WITHOUT_EFFECT = ("headless", "disable-render-loop", "fixed-fps", "speedup")
+_NUMBERS = {
+    "port": int,
+    "env_seed": int,
+    "action_repeat": int,
+    "num_worlds": int,
+    "timeout": float,
+    "fixed-fps": float,
+    "speedup": float,
+}
+
+
+@dataclass(frozen=True)
+class Launch:
+    """What the flags of a launch say.
+
+    Attributes:
+        port: Port where the trainer listens.
+        seed: Seed of the first episodes, None for none.
+        action_repeat: Steps of the environment in one step of the trainer.
+        num_worlds: How many agents there are.
+        timeout: How long to try to reach the trainer, in s.
+        env_kwargs: Arguments of the environment.
+    """
+
+    port: int = PORT
+    seed: int | None = None
+    action_repeat: int = 1
+    num_worlds: int = 1
+    timeout: float = 60.0
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+
+
+def parse_flags(words: Sequence[str]) -> Launch:
+    """Return what the flags say that godot-rl gives an application; the last of a name counts.
+
+    Args:
+        words: ``--name=value``, ``--name value`` for a known name, or ``--name``.
+
+    Raises:
+        UsageError: A word is no flag, or a flag's value is no number.
+    """
+    given: dict[str, Any] = {}
+    env_kwargs: dict[str, Any] = {}
+    rest = list(words)
+    while rest:
+        word = rest.pop(0)
+        name, equals, text = word.removeprefix("--").partition("=")
+        if not word.startswith("--") or not name:
+            raise UsageError(f'"{word}" is no flag: flags are --name=value. See {COMMAND} --help.')
+        if name in _NUMBERS:
+            if not equals:
+                text = rest.pop(0) if rest else ""
+            given[name] = _number(name, text)
+        elif name not in _WITHOUT_EFFECT:
+            env_kwargs[name] = _value(text) if equals else True
+    seed = given.pop("env_seed", None)
+    known = {name: value for name, value in given.items() if name not in _WITHOUT_EFFECT}
+    return Launch(seed=seed, env_kwargs=env_kwargs, **known)
+
+
+def _number(name: str, text: str) -> Any:
+    try:
+        return _NUMBERS[name](text)
+    except ValueError:
+        raise UsageError(f'--{name} takes a number, not "{text}".') from None
+
+
+def _value(text: str) -> Any:
+    """Return a value that Python wrote as text: a TOML value, True, False, None, or the text."""
+    words = {"True": True, "False": False, "None": None}
+    if text in words:
+        return words[text]
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def write_launcher(
+    path: str | Path,
+    environment: str | type[Any],
+    *,
+    num_worlds: int = 1,
+    action_repeat: int = 1,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write a file that godot-rl takes as ``env_path``; what it is started with comes on top.
+
+    Args:
+        path: Where to write it; the name must end with ``.x86_64``.
+        environment: Reference of the environment, or its class.
+        num_worlds: How many agents there are.
+        action_repeat: Steps of the environment in one step of the trainer.
+        env_kwargs: Arguments of the environment: numbers, booleans and texts.
+
+    Returns:
+        The absolute path.
+
+    Raises:
+        ConfigError: godot-rl could not start a file of this name.
+        UsageError: The class is one that no other process can find.
+    """
+    path = Path(path).absolute()
+    if path.suffix != SUFFIX or " " in str(path):
+        raise ConfigError(
+            f'godot-rl starts files whose name ends with "{SUFFIX}" and whose path has no space, '
+            f'and "{path}" is none.'
+        )
+    reference = reference_of(environment)
+    place, colon, name = reference.rpartition(":")
+    if colon and place.endswith(".py"):
+        reference = f"{Path(place).absolute()}:{name}"
+    flags = {"num_worlds": num_worlds, "action_repeat": action_repeat, **(env_kwargs or {})}
+    words = [
+        *(sys.executable, "-m", __name__, reference),
+        *(f"--{key}={value}" for key, value in flags.items()),
+    ]
+    path.write_text(f'#!/bin/sh\nexec {shlex.join(words)} "$@"\n', encoding="utf-8")
+    path.chmod(0o755)
+    return path
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit status: 0, 1 after an error, 130 after Ctrl-C."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help"):
+        print(USAGE, end="")  # noqa: T201 - it is a command
+        return 0
+    try:
+        launch = parse_flags(words[1:])
+        with serve(
+            words[0],
+            GodotRL,
+            port=launch.port,
+            num_worlds=launch.num_worlds,
+            env_kwargs=launch.env_kwargs,
+            action_repeat=launch.action_repeat,
+            seed=launch.seed,
+            timeout=launch.timeout,
+        ) as service:
+            while service.poll(None):
+                continue
+    except PhysxError as error:
+        print(f"{COMMAND}: {type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,258 @@
+"""The protocol of godot_rl_agents: the service is the application that a trainer drives.
+
+The trainer listens and the application connects to it. Each message is 4 bytes of length and a
+JSON object, whose ``type`` says what it is. One agent of the trainer is one world.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import time
+from typing import Any, ClassVar
+
+import gymnasium
+from gymnasium.vector import VectorEnv
+
+from physx_core.errors import (
+    ActionError,
+    ConfigError,
+    RemoteError,
+    RemoteProtocolError,
+    RequestError,
+    listed,
+)
+from physx_remote.godot_rl.agents import Agents, Answer
+from physx_remote.serving.connection import Connection
+from physx_remote.serving.framing import MAX_REQUEST, FrameReader, framed
+from physx_remote.serving.protocol import Protocol, Service, check_options
+from physx_remote.serving.service import LOG, SocketService, Work
+from physx_remote.serving.worlds import Worlds
+
+PORT = 11008
+"""Port where a trainer listens unless told otherwise."""
+
+MAJOR_VERSION = "0"
+"""Version of the protocol that is spoken here."""
+
+_JSON = json.JSONEncoder(separators=(",", ":"), check_circular=False)
+
+_RETRY = 0.05
+
+
+class GodotRL(Protocol):
+    """Lets a trainer of godot_rl_agents drive worlds."""
+
+    name: ClassVar[str] = "godot-rl"
+
+    def __init__(
+        self,
+        *,
+        action_repeat: int = 1,
+        seed: int | None = None,
+        timeout: float = 60.0,
+        max_request: int = MAX_REQUEST,
+        **options: Any,
+    ) -> None:
+        """Check the options.
+
+        Args:
+            action_repeat: Steps of the environment in one step of the trainer; rewards are added,
+                and the end of an episode ends it.
+            seed: Seed of the first episodes: world 0 gets the seed itself, the others get seeds
+                derived from it. None: no seed.
+            timeout: How long to try to reach the trainer, in s.
+            max_request: Longest message in bytes that is taken.
+            options: Must be empty.
+
+        Raises:
+            ConfigError: A number is out of its range.
+            UnknownOptionError: An option that the protocol does not have.
+        """
+        super().__init__(**options)
+        sizes = {"action_repeat": action_repeat, "max_request": max_request}
+        for option, value in sizes.items():
+            if type(value) is not int or value < 1:
+                raise ConfigError(f"{option} is {value!r} but must be a whole number from 1.")
+        if seed is not None and (type(seed) is not int or seed < 0):
+            raise ConfigError(f"seed is {seed!r} but must be a whole number from 0, or None.")
+        if type(timeout) not in (int, float) or not timeout >= 0:
+            raise ConfigError(f"timeout is {timeout!r} but must be a number of seconds from 0.")
+        self.action_repeat, self.seed = action_repeat, seed
+        self.timeout, self.max_request = timeout, max_request
+
+    def service(self, worlds: Any, *, address: str = "127.0.0.1", port: int = 0) -> Service:
+        """Connect to a trainer and return the service of the worlds.
+
+        Args:
+            worlds: One world for each agent of the trainer.
+            address: Where the trainer listens.
+            port: Likewise; 0: 11008.
+
+        Raises:
+            RemoteError: Nothing listens there, or the worlds cannot be served so.
+            PhysxError: godot-rl has nothing for a space of the worlds.
+        """
+        if not isinstance(worlds, Worlds):
+            raise RemoteError(
+                f'The protocol "{self.name}" serves Gymnasium environments and environments of '
+                f"physx, which say what their spaces are; {type(worlds).__name__} does not."
+            )
+        agents = Agents(worlds, self.action_repeat, self.seed)
+        trainer = _connected(address, port or PORT, self.timeout)
+        try:
+            return _GodotRLService(worlds, agents, trainer, self.max_request)
+        except OSError as error:  # it has no other side any more
+            trainer.close()
+            raise RemoteError(f"The trainer at {address} left at once: {error}.") from error
+
+    @classmethod
+    def connect(cls, host: str, port: int, **options: Any) -> gymnasium.Env[Any, Any]:
+        """Wait for an application with one agent: see `GodotRLEnv`."""
+        from physx_remote.godot_rl.client import GodotRLEnv, GodotRLVectorEnv
+
+        check_options("A client of godot-rl", options, GodotRLVectorEnv)
+        return GodotRLEnv((host, port or PORT), **options)
+
+    @classmethod
+    def connect_vector(cls, host: str, port: int, **options: Any) -> VectorEnv[Any, Any, Any]:
+        """Wait for an application with any number of agents: see `GodotRLVectorEnv`."""
+        from physx_remote.godot_rl.client import GodotRLVectorEnv
+
+        check_options("A client of godot-rl", options, GodotRLVectorEnv)
+        return GodotRLVectorEnv((host, port or PORT), **options)
+
+
+def _connected(address: str, port: int, timeout: float) -> socket.socket:
+    """Return a socket that is connected to a trainer; it may begin to listen a little later."""
+    deadline = time.monotonic() + timeout
+    while True:
+        left = max(deadline - time.monotonic(), _RETRY)
+        try:
+            trainer = socket.create_connection((address, port), timeout=left)
+        except (socket.gaierror, OverflowError, UnicodeError) as error:
+            raise RemoteError(f"There is no address {address} port {port}: {error}.") from error
+        except OSError as error:
+            reason: OSError | None = error
+        else:
+            if not _met_itself(trainer):
+                return trainer
+            trainer.close()
+            reason = None
+        if time.monotonic() + _RETRY > deadline:
+            raise RemoteError(
+                f"No trainer of godot-rl listens at {address} port {port}; it was tried for "
+                f"{timeout:g} s ({reason}). With godot-rl the trainer listens and the environment "
+                f"connects: start the trainer, for example GodotEnv(port={port}), and then this; "
+                "or let the trainer start it, with a launcher file as its env_path."
+            ) from reason
+        time.sleep(_RETRY)
+
+
+def _met_itself(connected: socket.socket) -> bool:
+    """Return whether the system gave a socket the very port that it was to reach."""
+    with contextlib.suppress(OSError):
+        return bool(connected.getsockname() == connected.getpeername())
+    return False
+
+
+class _GodotRLService(SocketService):
+    """Agents that a trainer drives; over when the trainer closes it or is gone."""
+
+    def __init__(
+        self, worlds: Worlds, agents: Agents, trainer: socket.socket, max_request: int
+    ) -> None:
+        """Take the trainer's connection."""
+        super().__init__()
+        self._worlds, self._agents = worlds, agents
+        self._max_request = max_request
+        self.adopt(trainer)
+        self.address = trainer.getpeername()[:2]
+
+    def new_reader(self) -> FrameReader:
+        """Return a reader with this protocol's limit."""
+        return FrameReader(self._max_request)
+
+    def poll(self, timeout: float | None = 0.0) -> bool:
+        """Handle what has arrived; see `Service.poll`."""
+        goes_on = super().poll(timeout)
+        if not goes_on:
+            self._worlds.close()
+        return goes_on
+
+    def close(self) -> None:
+        """End the connection and close the worlds, after the request that is being handled."""
+        super().close()
+        if self._released:
+            self._worlds.close()
+
+    def closed(self, connection: Connection) -> None:
+        """End with the trainer."""
+        LOG.info("The trainer at %s is gone", connection.name)
+        self.close()
+
+    def received(self, connection: Connection, body: bytes) -> Work | None:
+        """Answer one message."""
+        try:
+            message = _message(body)
+            if message["type"] == "close":
+                self.close()
+                return None
+            if message["type"] == "handshake":
+                _check_version(message)
+                return None
+            request = self._agents.requests.get(message["type"])
+            if request is None:
+                known = [*self._agents.requests, "close", "handshake"]
+                raise RequestError(
+                    f'There is no message of type "{message["type"]}"; there are: {listed(known)}.'
+                )
+        except RemoteError as error:
+            self._refuse(connection, error)
+            return None
+        return self._worked(connection, request(message))
+
+    def _worked(self, connection: Connection, answer: Answer) -> Work:
+        """Send the answer to a request once it is there, or what went wrong."""
+        try:
+            told = yield from answer
+        except Exception as error:  # the environment's own code may raise anything
+            self._refuse(connection, error)
+        else:
+            self._send(connection, told)
+
+    def _refuse(self, connection: Connection, error: Exception) -> None:
+        """Say what went wrong, here and to the trainer, which knows no such answer and ends."""
+        text = "; ".join([str(error), *getattr(error, "__notes__", [])])
+        is_foreign = not isinstance(error, (RemoteError, ActionError))
+        LOG.error("The trainer's request failed: %s", text, exc_info=error if is_foreign else None)
+        name = type(error).__name__
+        self._send(connection, {"type": "error", "error": name, "message": text})
+
+    def _send(self, connection: Connection, answer: dict[str, Any]) -> None:
+        self.send(connection, framed(_JSON.encode(answer).encode("utf-8")))
+
+
+def _message(body: bytes) -> dict[str, Any]:
+    try:
+        message = json.loads(body)
+    except (ValueError, RecursionError) as error:
+        raise RemoteProtocolError(
+            f"A message is no JSON text: {str(error)[:200]}. It begins with {body[:80]!r}."
+        ) from None
+    if not isinstance(message, dict) or not isinstance(message.get("type"), str):
+        raise RemoteProtocolError(
+            f'A message must be a JSON object with a text "type", not {body[:80]!r}.'
+        )
+    return message
+
+
+def _check_version(message: dict[str, Any]) -> None:
+    version = f"{message.get('major_version')}.{message.get('minor_version')}"
+    if str(message.get("major_version")) != MAJOR_VERSION:
+        LOG.warning(
+            "The trainer speaks version %s of godot-rl's protocol, and physx speaks %s.x",
+            version,
+            MAJOR_VERSION,
+        )

@@ -1,0 +1,268 @@
+"""PhysxLink: a client's authenticated connection; every wait has an end."""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from typing import Any, ClassVar
+
+from physx_core.errors import (
+    ConfigError,
+    ConnectionRefusedByPeerError,
+    RemoteClosedError,
+    RemoteError,
+    RemoteProtocolError,
+    RemoteTimeoutError,
+    UnansweredError,
+)
+from physx_core.net import (
+    TOKEN_VARIABLE,
+    Frame,
+    FrameReader,
+    Kind,
+    checked_token,
+    decode,
+    decode_error,
+    given_token,
+    introduce,
+)
+from physx_remote.physx.wire import OBSERVE, SERVICE, VERSION
+from physx_remote.serving.client_connection import Connection
+from physx_remote.serving.framing import MAX_ANSWER
+
+_BACKLOG = 1 << 16
+
+
+class PhysxLink(Connection):
+    """A connection to a service of the protocol physx.
+
+    After any failure it is closed: a late answer must not be taken for that of another request.
+
+    Attributes:
+        name: The service as ``host:port``.
+        timeout: How long an answer may take, in s; None: for ever.
+        introduction: What the service says about itself.
+    """
+
+    _server: ClassVar[str] = "service"
+
+    def __init__(
+        self,
+        address: tuple[str, int],
+        role: int,
+        *,
+        token: str | None = None,
+        token_file: str | None = None,
+        timeout: float | None = 60.0,
+        connect_timeout: float = 10.0,
+        max_answer: int = MAX_ANSWER,
+    ) -> None:
+        """Connect; as long as nobody listens it is tried again.
+
+        Args:
+            address: Host and port.
+            role: Whether to act or to look on.
+            token: What the service must be known by; None: what is in `token_file`, and without
+                that in the environment variable ``PHYSX_TOKEN``.
+            token_file: File that holds the token; readable by you alone.
+            timeout: How long an answer may take, in s; None: for ever.
+            connect_timeout: How long to try to connect, in s.
+            max_answer: Longest answer in bytes that is taken.
+
+        Raises:
+            ConfigError: There is no token.
+            RemoteError: Nothing answers, or it does not take this client.
+        """
+        super().__init__(address)
+        self.timeout = timeout
+        found = checked_token(token, "token") if token is not None else given_token(token_file)
+        if found is None:
+            raise ConfigError(
+                f"A client of {self.name} needs the token of the service: set {TOKEN_VARIABLE}, or "
+                "give token_file=, the file that holds it, or token=."
+            )
+        until = time.monotonic() + connect_timeout
+        self._socket = self._reached(lambda left: _opened(address, role, left), connect_timeout)
+        try:
+            self._reader = self._introduced(found, role, max(until - time.monotonic(), 1.0))
+            self._reader.limit = max_answer
+            self._poll = select.poll()
+            self._poll.register(self._socket, select.POLLIN)
+            self._socket.setblocking(False)
+            self.introduction = self._welcome(connect_timeout)
+        except BaseException:
+            self._socket.close()
+            raise
+
+    def _introduced(self, token: str, role: int, patience: float) -> FrameReader:
+        """Prove that both sides know the token."""
+        self._socket.settimeout(patience)
+        try:
+            return introduce(self._socket, token, role)
+        except UnansweredError as error:
+            raise RemoteClosedError(
+                f"{self.name} did not answer as a service of physx does: {error} It may have "
+                "closed because it knows another token, because too many are connected, or "
+                "because it speaks another protocol."
+            ) from error
+        except ConnectionRefusedByPeerError as error:
+            raise RemoteError(
+                f"{self.name} cannot be trusted: it does not know this client's token, or is no "
+                "service of this version of physx. Give the token of the service: "
+                f"{TOKEN_VARIABLE}, token_file= or token=."
+            ) from error
+
+    def _welcome(self, patience: float) -> dict[str, Any]:
+        """Return what the service says about itself."""
+        frame = self.receive(patience)
+        if frame.kind is Kind.ERROR:
+            error = decode_error(frame.payload)
+            self.close(str(error))
+            raise error
+        told = self.decoded(frame) if frame.kind is Kind.SETUP else None
+        if not isinstance(told, dict) or told.get("service") != SERVICE:
+            raise RemoteError(
+                f"What listens at {self.name} serves no environments; it may be the server of a "
+                "run, for physx client."
+            )
+        if told.get("version") != VERSION:
+            raise RemoteError(
+                f"The service at {self.name} speaks version {told.get('version')} of the protocol, "
+                f"this client version {VERSION}. Install the same version of physx-core on both "
+                "sides."
+            )
+        return told
+
+    # ----------------------------------------------------------------------------------------
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether nothing can be sent and received any more."""
+        return bool(self._why_closed)
+
+    def send(self, message: bytes) -> None:
+        """Send a message.
+
+        Raises:
+            RemoteTimeoutError: The service does not take it in time.
+            RemoteClosedError: The connection has ended, or is closed already.
+        """
+        self._check_open()
+        try:
+            sent = self._socket.send(message)
+            if sent < len(message):
+                self._send_rest(memoryview(message)[sent:])
+        except BlockingIOError:
+            self._send_rest(memoryview(message))
+        except OSError as error:
+            raise self._broken(error) from error
+
+    def _send_rest(self, rest: memoryview) -> None:
+        poll = select.poll()
+        poll.register(self._socket, select.POLLOUT)
+        try:
+            while rest:
+                if not poll.poll(_milliseconds(self.timeout)):
+                    raise self._late()
+                rest = rest[self._socket.send(rest) :]
+        except OSError as error:
+            raise self._broken(error) from error
+
+    def receive(self, patience: float | None = None) -> Frame:
+        """Return the next message.
+
+        Args:
+            patience: How long to wait at most, in s; None: as long as an answer may take.
+
+        Raises:
+            RemoteTimeoutError: There is none in time.
+            RemoteClosedError: The connection has ended, or is closed already.
+            RemoteProtocolError: It is none, or too long.
+        """
+        frame = self.look(self.timeout if patience is None else patience)
+        if frame is None:
+            raise self._late()
+        return frame
+
+    def look(self, patience: float | None) -> Frame | None:
+        """Return the next message, or None if there is none in time.
+
+        Args:
+            patience: How long to wait, in s; None: for ever.
+
+        Raises:
+            RemoteClosedError: The connection has ended, or is closed already.
+            RemoteProtocolError: It is none, or too long.
+        """
+        self._check_open()
+        until, left = None, patience
+        try:
+            while True:
+                if not self._reader.has_buffered and not self._poll.poll(_milliseconds(left)):
+                    return None
+                frame = self._reader.read(self._socket)
+                if frame is not None:
+                    return frame
+                if patience is not None:
+                    until = time.monotonic() + patience if until is None else until
+                    left = until - time.monotonic()
+                    if left <= 0:
+                        return None
+        except EOFError as error:
+            raise self._broken(error) from error
+        except ConnectionRefusedByPeerError as error:
+            self.close(str(error))
+            raise RemoteProtocolError(f"{self.name}: {error}") from error
+        except BaseException as error:
+            self.close(f"{type(error).__name__} {error}".rstrip())
+            raise
+
+    def decoded(self, frame: Frame) -> Any:
+        """Return the value in a message.
+
+        Raises:
+            RemoteProtocolError: It is damaged; the connection is closed.
+            PhysxError: It is an error of the service, which is raised here.
+        """
+        try:
+            if frame.kind is not Kind.REFUSAL:
+                return decode(frame.payload)
+            refusal = decode_error(frame.payload)
+        except ConnectionRefusedByPeerError as error:
+            self.close(str(error))
+            raise RemoteProtocolError(f"{self.name}: {error}") from error
+        raise refusal
+
+    def _late(self) -> RemoteTimeoutError:
+        self.close(f"an answer took longer than {self.timeout} s")
+        return RemoteTimeoutError(
+            f"{self.name} did not answer in time ({self.timeout} s). The connection is closed; "
+            "give a longer timeout if its steps take that long."
+        )
+
+    def _broken(self, error: Exception) -> RemoteClosedError:
+        self.close(str(error))
+        return RemoteClosedError(f"{self.name} ended the connection: {error}.")
+
+
+def _opened(address: tuple[str, int], role: int, patience: float) -> socket.socket:
+    """Return a connection; one that looks on keeps little of what was not read."""
+    error: OSError = OSError("the host has no address")
+    for family, kind, proto, _, place in socket.getaddrinfo(*address, type=socket.SOCK_STREAM):
+        opened = socket.socket(family, kind, proto)
+        try:
+            if role == OBSERVE:
+                opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BACKLOG)
+            opened.settimeout(patience)
+            opened.connect(place)
+            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return opened
+        except OSError as failed:
+            opened.close()
+            error = failed
+    raise error
+
+
+def _milliseconds(seconds: float | None) -> float | None:
+    return None if seconds is None else max(0.0, 1000 * seconds)

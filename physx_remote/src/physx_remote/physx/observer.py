@@ -1,0 +1,159 @@
+"""PhysxObserver: looks on while another client drives the worlds of a service."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from physx_core import Closing
+from physx_core.errors import RemoteProtocolError
+from physx_core.net import Frame, Kind, pack_value
+from physx_core.typing import Array
+from physx_remote.physx.client import introduced_leaves
+from physx_remote.physx.link import PhysxLink
+from physx_remote.physx.wire import (
+    COUNT,
+    IS_RESET,
+    OBSERVE,
+    REWARD,
+    TERMINATED,
+    TRUNCATED,
+    WORLDS,
+    infos_of,
+)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What became of some worlds. The arrays have a leading axis of these worlds.
+
+    Attributes:
+        number: How many requests changed worlds until then; some may have been skipped.
+        worlds: Numbers of the worlds.
+        is_reset: Whether their episodes began just then.
+        observation: Value of the batched space of observations.
+        action: Likewise of the actions that were taken; None where it is not told.
+        reward: Rewards.
+        terminated: Whether the episodes are terminated.
+        truncated: Whether they are truncated.
+        infos: Info of each world.
+    """
+
+    number: int
+    worlds: Array
+    is_reset: bool
+    observation: Any
+    action: Any
+    reward: Array
+    terminated: Array
+    truncated: Array
+    infos: list[dict[str, Any]]
+
+
+class PhysxObserver(Closing):
+    """Gets what the acting client's requests give. A context manager.
+
+    Who does not keep up loses what came in between and goes on with the present state of all
+    worlds.
+
+    Attributes:
+        num_worlds: How many worlds there are.
+        observation_space: Space of one world's observations.
+        action_space: Space of one world's actions.
+    """
+
+    def __init__(self, address: tuple[str, int] | str, **options: Any) -> None:
+        """Connect.
+
+        Args:
+            address: Host and port, or ``"host:port"``.
+            options: Those of `PhysxLink`: ``token``, ``token_file``, ``timeout``,
+                ``connect_timeout``, ``max_answer``.
+
+        Raises:
+            ConfigError: There is no token.
+            RemoteError: Nothing answers, or the tokens differ.
+        """
+        from physx_remote.serving.protocol import parse_address
+
+        place = parse_address(address) if isinstance(address, str) else address
+        self._link = PhysxLink(place, OBSERVE, **options)
+        self._observations, self._actions = introduced_leaves(self._link.introduction)
+        self.observation_space = self._observations.space
+        self.action_space = self._actions.space
+        self.num_worlds = int(self._link.introduction["num_worlds"])
+        self._notes: Frame | None = None
+        self._asked = 0
+
+    def next(self, timeout: float | None = None) -> Seen | None:
+        """Wait for what happens next.
+
+        Args:
+            timeout: How long to wait, in s; None: for ever.
+
+        Returns:
+            What happened, or None if nothing did in time.
+
+        Raises:
+            RemoteClosedError: The service has ended.
+        """
+        while True:
+            frame = self._link.look(timeout)
+            if frame is None:
+                return None
+            if frame.kind is Kind.SEEN:
+                return self._seen(frame)
+            if frame.kind is not Kind.NOTES:
+                raise self._nonsense(frame)
+            self._notes = frame
+
+    def last(self) -> Seen:
+        """Return what is known of all worlds that have begun; what happened before is skipped.
+
+        Raises:
+            RemoteError: The service has ended, or does not answer in time.
+        """
+        self._asked += 1
+        self._link.send(pack_value(Kind.REQUEST, {"do": "last"}, "request", self._asked))
+        while True:
+            frame = self._link.receive()
+            if frame.kind in (Kind.ANSWER, Kind.REFUSAL):
+                return self._seen(frame)
+            self._notes = frame if frame.kind is Kind.NOTES else None
+
+    def close(self) -> None:
+        """End the connection; calling it again does nothing."""
+        self._link.close()
+
+    def _seen(self, frame: Frame) -> Seen:
+        arrays: Mapping[str, Any] = self._link.decoded(frame)
+        notes, self._notes = self._notes, None
+        try:
+            worlds = arrays[WORLDS]
+            infos: list[dict[str, Any]] = [{} for _ in worlds]
+            if notes is not None and notes.number == frame.number:
+                infos, _ = infos_of(self._link.decoded(notes), len(worlds))
+            names = self._actions.names
+            has_actions = bool(names) and names[0] in arrays
+            return Seen(
+                number=int(arrays.get(COUNT, frame.number)),
+                worlds=worlds,
+                is_reset=bool(arrays[IS_RESET]),
+                observation=self._observations.batch(arrays),
+                action=self._actions.batch(arrays) if has_actions else None,
+                reward=arrays[REWARD],
+                terminated=np.asarray(arrays[TERMINATED]),
+                truncated=np.asarray(arrays[TRUNCATED]),
+                infos=infos,
+            )
+        except (KeyError, TypeError) as error:
+            raise self._nonsense(frame) from error
+
+    def _nonsense(self, frame: Frame) -> RemoteProtocolError:
+        self.close()
+        return RemoteProtocolError(
+            f"{self._link.name} sent a message {frame.kind.name} that says nothing to who looks on."
+        )

@@ -1,0 +1,135 @@
+"""physx: authenticated, arrays as they are, several worlds on one connection, and onlookers."""
+
+from __future__ import annotations
+
+import secrets
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from physx_core.errors import ConfigError, UsageError
+from physx_core.net import MAX_PAYLOAD, checked_token, given_token
+from physx_remote.physx.service import PhysxService
+from physx_remote.serving.framing import MAX_REQUEST
+from physx_remote.serving.protocol import Protocol
+from physx_remote.serving.worlds import Worlds
+
+if TYPE_CHECKING:
+    from physx_remote.godot_gym.environment import RLEnvironment
+    from physx_remote.physx.client import PhysxEnv
+    from physx_remote.physx.vector_env import PhysxVectorEnv
+
+
+class Physx(Protocol):
+    """Serves worlds to one client that acts, and to any number that look on.
+
+    Both sides prove that they know a token. What a client asks for is answered with the result, or
+    with the error and its traceback; the worlds live on, and stay as they are when a client leaves.
+    """
+
+    name: ClassVar[str] = "physx"
+
+    def __init__(
+        self,
+        *,
+        token: str | None = None,
+        token_file: str | None = None,
+        handshake_timeout: float = 10.0,
+        max_request: int = MAX_REQUEST,
+        max_clients: int = 256,
+        max_snapshots: int = 256,
+        **options: Any,
+    ) -> None:
+        """Keep the options.
+
+        Args:
+            token: What clients must know, at least 16 characters. None: what is in `token_file`;
+                without that what is in the environment variable ``PHYSX_TOKEN``; without that a
+                random one, `PhysxService.token`.
+            token_file: File that holds the token; readable by you alone.
+            handshake_timeout: How long a client may take to prove that it knows the token, in s.
+            max_request: Longest request in bytes; who sends a longer one is closed.
+            max_clients: How many clients are connected at most; who comes then is closed at once.
+            max_snapshots: How many snapshots are kept at most.
+            options: None that are known.
+
+        Raises:
+            ConfigError: A value cannot be, or the file cannot be used.
+        """
+        super().__init__(**options)
+        if not handshake_timeout > 0:
+            raise ConfigError(
+                f"handshake_timeout is {handshake_timeout} but must be more than 0 s."
+            )
+        if not 1 <= max_request <= MAX_PAYLOAD:
+            raise ConfigError(f"max_request is {max_request} but must be in 1 .. {MAX_PAYLOAD}.")
+        for option, value in (("max_clients", max_clients), ("max_snapshots", max_snapshots)):
+            if value < 1:
+                raise ConfigError(f"{option} is {value} but must be at least 1.")
+        found = checked_token(token, "token") if token is not None else given_token(token_file)
+        self.token = secrets.token_hex(32) if found is None else found
+        self._options: dict[str, Any] = {
+            "handshake_timeout": handshake_timeout,
+            "max_request": max_request,
+            "max_clients": max_clients,
+            "max_snapshots": max_snapshots,
+        }
+
+    def service(self, worlds: Worlds | RLEnvironment, *, address: str, port: int) -> PhysxService:
+        """Return a service that listens; see `Protocol.service`.
+
+        Raises:
+            UsageError: It is an `RLEnvironment`, or a space has no fixed layout.
+            RemoteError: It cannot listen there.
+        """
+        if not isinstance(worlds, Worlds):
+            raise UsageError(
+                f"{type(worlds).__name__} is an RLEnvironment, which has no spaces of its own: "
+                'serve it with the protocol "godot-gym".'
+            )
+        service = PhysxService(worlds, self.token, **self._options)
+        try:
+            service.listen(address, port)
+        except BaseException:
+            service.close()
+            raise
+        return service
+
+    @classmethod
+    def connect(cls, host: str, port: int, *, world: int = 0, **options: Any) -> PhysxEnv:
+        """Return one world of a service.
+
+        Args:
+            host: Host of the service.
+            port: Its port.
+            world: Number of the world.
+            options: Those of `PhysxClient`.
+        """
+        from physx_remote.physx.client import PhysxClient, PhysxEnv
+
+        client = PhysxClient((host, port), **options)
+        try:
+            return PhysxEnv(client, world)
+        except BaseException:
+            client.close()
+            raise
+
+    @classmethod
+    def connect_vector(
+        cls, host: str, port: int, *, autoreset_mode: Any = "NextStep", **options: Any
+    ) -> PhysxVectorEnv:
+        """Return all worlds of a service.
+
+        Args:
+            host: Host of the service.
+            port: Its port.
+            autoreset_mode: What happens after the end of an episode: see `PhysxVectorEnv`.
+            options: Those of `PhysxClient`.
+        """
+        from physx_remote.physx.client import PhysxClient
+        from physx_remote.physx.vector_env import PhysxVectorEnv
+
+        client = PhysxClient((host, port), **options)
+        try:
+            return PhysxVectorEnv(client, autoreset_mode=autoreset_mode)
+        except BaseException:
+            client.close()
+            raise

@@ -1,0 +1,325 @@
+"""The service of the protocol physx: who is connected, and what is sent to whom."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from physx_core import PhysxError
+from physx_core.errors import ConnectionRefusedByPeerError, RemoteError, RequestError
+from physx_core.net import (
+    HEADER,
+    Frame,
+    Kind,
+    ServerHandshake,
+    decode,
+    encode_error,
+    flat_prefix,
+    header,
+    pack,
+    pack_value,
+)
+from physx_core.typing import Array
+from physx_remote.physx.wire import (
+    ACT,
+    COUNT,
+    IS_RESET,
+    OBSERVE,
+    SERVICE,
+    VERSION,
+    WORLDS,
+    PhysxReader,
+    encoded_infos,
+)
+from physx_remote.physx.world_requests import Outcome, Requests, reported
+from physx_remote.serving.connection import Connection
+from physx_remote.serving.framing import Reader
+from physx_remote.serving.service import LOG, SocketService, Work
+from physx_remote.serving.spaces import describe_space
+from physx_remote.serving.worlds import Worlds
+
+_BACKLOG = 1 << 16
+_LARGE = 1 << 15
+_MOST_PARTS = 512  # a system call takes no more than 1024
+
+
+class PhysxService(SocketService):
+    """Worlds at work for one client that acts; others look on. Closing it closes the worlds.
+
+    Attributes:
+        token: What clients must know.
+    """
+
+    def __init__(
+        self,
+        worlds: Worlds,
+        token: str,
+        *,
+        handshake_timeout: float,
+        max_request: int,
+        max_clients: int,
+        max_snapshots: int,
+    ) -> None:
+        """Keep what is served; see `Physx`.
+
+        Raises:
+            UsageError: A space has no fixed layout.
+        """
+        super().__init__(max_clients=max_clients)
+        self.token = token
+        self._worlds = worlds
+        self._requests = Requests(worlds, max_snapshots)
+        self._introduction = self._introduced()
+        self._timeout, self._max_request = handshake_timeout, max_request
+        self._strangers: dict[Connection, ServerHandshake] = {}
+        self._actor: Connection | None = None
+        self._observers: dict[Connection, bool] = {}  # whether something was not sent
+        self._seen = 0
+        self._is_watching = False
+
+    def _release(self) -> None:
+        """Close the worlds too, once no request is being carried out."""
+        super()._release()
+        self._worlds.close()
+
+    def _introduced(self) -> dict[str, Any]:
+        worlds = self._worlds
+        first = worlds.environments[0]
+        modes = first.metadata.get("render_modes", [])
+        return {
+            "service": SERVICE,
+            "version": VERSION,
+            "name": worlds.name,
+            "observation_space": describe_space(worlds.observation_space),
+            "action_space": describe_space(worlds.action_space),
+            "num_worlds": worlds.num_worlds,
+            "snapshot": worlds.has_snapshots,
+            "render_mode": first.render_mode,
+            "render_modes": [str(mode) for mode in modes],
+            "render_fps": _number(first.metadata.get("render_fps")),
+        }
+
+    # What the loop calls --------------------------------------------------------------------
+
+    def new_reader(self) -> Reader:
+        """Return what cuts frames out of a stream."""
+        return PhysxReader()
+
+    def opened(self, connection: Connection) -> None:
+        """Give a stranger some time to prove that it knows the token."""
+        self._strangers[connection] = ServerHandshake(self.token)
+        if not self._is_watching:
+            self._is_watching = True
+            self.after(self._timeout, self._look_for_silence)
+
+    def closed(self, connection: Connection) -> None:
+        """Forget a client; the worlds stay as they are."""
+        self._strangers.pop(connection, None)
+        self._observers.pop(connection, None)
+        if connection is self._actor:
+            LOG.info("%s acts no longer", connection.name)
+            self._actor = None
+            self._requests.forget_snapshots()
+
+    def drained(self, connection: Connection) -> None:
+        """Bring an observer to the present that could not follow."""
+        if self._observers.get(connection):
+            self._observers[connection] = False
+            self.send(connection, self._present(Kind.SEEN, self._seen))
+
+    def received(self, connection: Connection, body: bytes) -> Work | None:
+        """Handle one frame."""
+        _, kind, _, number = HEADER.unpack_from(body)
+        payload = memoryview(body)[HEADER.size :]
+        if connection in self._strangers:
+            self._greet(connection, Frame(Kind(kind), number, bytearray(payload)))
+            return None
+        try:
+            if kind == Kind.ACTIONS and connection is self._actor:
+                steps = self._requests.steps(_arrays(decode(payload)))
+                return self._done(connection, number, steps)
+            if kind != Kind.REQUEST:
+                raise RequestError("Only the client that acts may step.")
+            return self._asked(connection, number, decode(payload))
+        except ConnectionRefusedByPeerError as error:
+            self.drop(connection, str(error))
+        except Exception as error:
+            self._refuse(connection, number, error)
+        return None
+
+    # Handshake ------------------------------------------------------------------------------
+
+    def _greet(self, connection: Connection, frame: Frame) -> None:
+        """Go on with the handshake."""
+        handshake = self._strangers[connection]
+        try:
+            answer = handshake.answer(frame)
+        except ConnectionRefusedByPeerError as error:
+            self.drop(connection, str(error))
+            return
+        if handshake.instance_id is None:
+            self.send(connection, answer)
+            return
+        del self._strangers[connection]
+        if isinstance(connection.reader, PhysxReader):
+            connection.reader.limit = self._max_request
+        try:
+            self._admit(connection, handshake.instance_id)
+        except RemoteError as error:
+            self.send(connection, pack(Kind.ERROR, encode_error(error)))
+            self.drop(connection, f"turned away: {error}")
+            return
+        self.send(connection, pack_value(Kind.SETUP, self._introduction, "introduction"))
+
+    def _admit(self, connection: Connection, role: int) -> None:
+        """Give a client its place.
+
+        Raises:
+            RemoteError: Another one acts, or it wants what there is not.
+        """
+        if role == OBSERVE:
+            LOG.info("%s looks on", connection.name)
+            connection.limit_backlog(_BACKLOG)
+            self._observers[connection] = False
+            return
+        if role != ACT:
+            raise RemoteError(
+                "This is a service of environments, and not the server of a run: connect with "
+                "physx_remote.connect."
+            )
+        actor = self._actor
+        if actor is not None and not actor.ended:
+            raise RemoteError(
+                f"{actor.name} acts here already, and one client at a time does. Try again when "
+                "it has left, or look on with physx_remote.PhysxObserver."
+            )
+        if actor is not None:
+            self.drop(actor)
+        LOG.info("%s acts", connection.name)
+        self._actor = connection
+
+    def _look_for_silence(self) -> None:
+        """Close strangers that take too long."""
+        for connection in [*self._strangers]:
+            if connection.age > self._timeout:
+                self.drop(connection, f"no handshake within {self._timeout:g} s")
+        self._is_watching = bool(self._strangers)
+        if self._is_watching:
+            self.after(self._timeout / 4, self._look_for_silence)
+
+    # Requests -------------------------------------------------------------------------------
+
+    def _asked(self, connection: Connection, number: int, request: Any) -> Work | None:
+        """Do what is asked for; return the rest of the work if it is not done at once.
+
+        Raises:
+            Exception: It cannot be done.
+        """
+        if not isinstance(request, dict):
+            raise RequestError("A request is a dictionary.")
+        what = request.get("do")
+        if what == "last":
+            self.send(connection, self._present(Kind.ANSWER, number))
+            return None
+        if connection is not self._actor:
+            raise RequestError(f'Who looks on may ask for what was "last", not for "{what}".')
+        if what == "reset":
+            return self._done(connection, number, self._requests.resets(request))
+        if what == "restore":
+            world = self._requests.restore(request)
+            self._tell(connection, number, Outcome([world], is_reset=True))
+            return None
+        answer = self._requests.answer(what, request)
+        self.send(connection, pack_value(Kind.ANSWER, answer, f'The answer to "{what}"', number))
+        return None
+
+    def _done(self, connection: Connection, number: int, outcome: Outcome) -> Work:
+        """Carry out what changes worlds, and answer."""
+        try:
+            for wait in outcome.work:
+                yield wait
+                if connection.closed:
+                    LOG.info("%s left in the middle of a request", connection.name)
+                    return
+            self._tell(connection, number, outcome)
+        except Exception as error:
+            self._refuse(connection, number, error)
+
+    def _refuse(self, connection: Connection, number: int, error: Exception) -> None:
+        """Say what went wrong, here and to the client."""
+        told = error if isinstance(error, PhysxError) else reported(error)
+        is_own_fault = not isinstance(error, RequestError)
+        LOG.error(
+            "A request of %s failed: %s", connection.name, told,
+            exc_info=error if is_own_fault else None,
+        )  # fmt: skip
+        self.send(connection, pack(Kind.REFUSAL, encode_error(told), number))
+
+    # Answers --------------------------------------------------------------------------------
+
+    def _tell(self, connection: Connection, number: int, outcome: Outcome) -> None:
+        """Answer with what became of worlds, and show it to those who look on."""
+        board = self._requests.board
+        rows = board.rows(outcome.worlds)
+        infos = [board.infos[world] for world in outcome.worlds]
+        notes = encoded_infos(infos) if any(infos) else b""
+        self.send(connection, *_message(Kind.ANSWER, number, notes, rows))
+        self._seen += 1
+        if not self._observers:
+            return
+        shown: dict[str, Array | np.generic] = {
+            WORLDS: np.array(outcome.worlds, np.int64),
+            IS_RESET: np.bool_(outcome.is_reset),
+            **rows,
+            **outcome.actions,
+        }
+        message = b"".join(_message(Kind.SEEN, self._seen, notes, shown))
+        for observer in [*self._observers]:
+            if observer.outgoing:
+                self._observers[observer] = True
+            else:
+                self.send(observer, message)
+
+    def _present(self, kind: Kind, number: int) -> bytes:
+        """Return a message with what is known of all worlds."""
+        board = self._requests.board
+        worlds = np.flatnonzero(board.known)
+        rows = board.rows(worlds.tolist())
+        infos = [board.infos[world] for world in worlds]
+        notes = encoded_infos(infos) if any(infos) else b""
+        shown: dict[str, Array | np.generic] = {
+            WORLDS: worlds.astype(np.int64),
+            IS_RESET: np.bool_(False),
+            COUNT: np.int64(self._seen),
+            **rows,
+        }
+        return b"".join(_message(kind, number, notes, shown))
+
+
+def _message(
+    kind: Kind, number: int, notes: bytes, arrays: Mapping[str, Array | np.generic]
+) -> Sequence[bytes | memoryview]:
+    """Return a message as the parts to send; long arrays are not copied."""
+    first = pack(Kind.NOTES, notes, number) if notes else b""
+    whole = dict(arrays)
+    prefix, length = flat_prefix(whole)
+    if length < _LARGE or len(whole) > _MOST_PARTS:
+        message = pack_value(kind, whole, "observations", number)
+        return [first + message]
+    opening = first + header(kind, length, number) + prefix
+    return [opening, *(np.ascontiguousarray(array).data for array in whole.values())]
+
+
+def _arrays(value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise RequestError("Actions are a dictionary of arrays.")
+    return value
+
+
+def _number(value: Any) -> float | None:
+    with contextlib.suppress(TypeError, ValueError):
+        return float(value)
+    return None

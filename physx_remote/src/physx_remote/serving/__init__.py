@@ -1,0 +1,1 @@
+"""Sockets, requests, and worlds that all protocols share."""

@@ -1,0 +1,1 @@
+"""Conversion of scene events to Rerun archetypes."""

@@ -1,0 +1,233 @@
+"""Layout: the windows of the viewer, made from what was drawn."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from physx_core.typing import Array
+from physx_rerun.drawing.rows import TIME
+
+_VIEW_FROM = np.array([1.0, -1.1, 0.65]) / np.linalg.norm([1.0, -1.1, 0.65])
+_BACKGROUND = (25, 28, 36)
+_GRID = (58, 63, 76)
+
+_ROW = 3  # so many scenes fit beside one another
+_COLUMN = 4  # so many plots fit one above the other
+_LEGEND = 8  # so many names fit into a plot
+
+Container = rrb.Grid | rrb.Vertical | rrb.Horizontal | rrb.Tabs
+Box = tuple[Array, Array]
+"""Lower and upper corner, each of shape (3,)."""
+
+
+@dataclass
+class Layout:
+    """What there is to see, and how the viewer's windows are laid out for it.
+
+    Attributes:
+        instance_nb: How many environment instances may draw.
+        changed: Whether something was added since `blueprint` was asked for.
+        has_time_panel: Whether the panel with the time is shown.
+    """
+
+    instance_nb: int
+    changed: bool = False
+    has_time_panel: bool = True
+    _kinds: set[tuple[str, str]] = field(default_factory=set)
+    _scenes: dict[int, dict[str, Box]] = field(default_factory=dict)
+    _plots: dict[str, dict[str, int]] = field(default_factory=dict)
+    _histograms: dict[str, dict[str, str]] = field(default_factory=dict)
+    _texts: dict[str, dict[int, str]] = field(default_factory=dict)
+    _timelines: set[str] = field(default_factory=set)
+    _titles: dict[int, str] = field(default_factory=dict)
+    _cameras: dict[int, dict[str, Array]] = field(default_factory=dict)
+    _followed: dict[int, str] = field(default_factory=dict)
+
+    def set_view(self, instance_id: int, title: str, **camera: Array) -> None:
+        """Name the window of an instance and place its camera."""
+        self._titles[instance_id] = title
+        self._cameras[instance_id] = camera
+        self._kinds.add(("view", title))
+        self.changed = True
+
+    def follow(self, instance_id: int, entity: str) -> None:
+        """Let the camera of an instance move along with an entity."""
+        self._followed[instance_id] = entity
+        self._kinds.add(("follow", entity))
+        self.changed = True
+
+    def title(self, instance_id: int) -> str:
+        """Return what an instance is called: its number, if it did not name itself."""
+        return self._titles.get(instance_id, str(instance_id))
+
+    def add_object(self, instance_id: int, kind: str, name: str) -> None:
+        """Make room for a shape in the scene of an instance."""
+        self.changed |= instance_id not in self._scenes
+        self._scenes.setdefault(instance_id, {})
+        self._kinds.add((kind, name))
+
+    def add_plot(self, name: str, entity: str, timeline: str, curve_nb: int) -> None:
+        """Make room for an entity with some curves in the plot of that name."""
+        self._plots.setdefault(name, {})[entity] = curve_nb
+        self._timelines.add(timeline)
+        self._kinds.add(("plot", name))
+        self.changed = True
+
+    def add_histogram(self, group: str, label: str, entity: str) -> None:
+        """Make room for an entity with the bars of a distribution, as a tab of its group."""
+        self._histograms.setdefault(group, {})[label] = entity
+        self._kinds.add(("histogram", f"{group}/{label}"))
+        self.changed = True
+
+    def add_text(self, instance_id: int, name: str, entity: str) -> None:
+        """Make room for a text of an instance."""
+        self._texts.setdefault(name, {})[instance_id] = entity
+        self._kinds.add(("text", name))
+        self.changed = True
+
+    def place(self, instance_id: int, name: str, points: Array) -> None:
+        """Tell where an object is, once; the camera looks at what was told.
+
+        Args:
+            instance_id: Instance that drew it.
+            name: Name of the object.
+            points: Points that it spans, shape (n, 3), in m.
+        """
+        scene = self._scenes.setdefault(instance_id, {})
+        if name not in scene and len(points) and np.isfinite(points).all():
+            scene[name] = (points.min(axis=0), points.max(axis=0))
+
+    @property
+    def digest(self) -> str:
+        """Text that is the same for equal sets of objects and numbers of instances.
+
+        Rerun keeps a user's own layout by application; runs that show the same things share it.
+        """
+        text = repr((self.instance_nb, sorted(self._kinds)))
+        return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+    @property
+    def timeline(self) -> str:
+        """Timeline that the viewer begins with: one on which everything is visible."""
+        if self._scenes or self._texts or "step" in self._timelines:
+            return "step" if self._timelines <= {"step"} else TIME
+        return "batch" if "batch" in self._timelines else next(iter(self._timelines), TIME)
+
+    def blueprint(self) -> rrb.Blueprint:
+        """Return the windows: the scenes, and beside or below them the plots and the texts.
+
+        Two or three scenes stand in a row above the rest, so that they are easily compared.
+        """
+        self.changed = False
+        scenes = [self._scene_view(instance_id) for instance_id in sorted(self._scenes)]
+        plots: list[rrb.View | Container] = [
+            *(_plot_view(name, curves) for name, curves in self._plots.items()),
+            *(_histogram_views(name, bars) for name, bars in self._histograms.items()),
+        ]
+        texts = [self._text_views(name, entities) for name, entities in self._texts.items()]
+        in_a_row = 1 < len(scenes) <= _ROW
+        parts: list[Container] = []
+        shares = []
+        if scenes:
+            columns = len(scenes) if in_a_row else math.ceil(math.sqrt(len(scenes)))
+            parts.append(rrb.Grid(*scenes, grid_columns=columns))
+            shares.append(3)
+        if plots and (len(plots) > _COLUMN or not scenes):
+            parts.append(rrb.Grid(*plots, grid_columns=math.ceil(math.sqrt(len(plots)))))
+            shares.append(3)
+            plots = []
+        if plots or texts:
+            sizes = [*[2] * len(plots), *[1] * len(texts)]
+            if in_a_row:
+                parts.append(rrb.Horizontal(*plots, *texts, column_shares=sizes))
+            else:
+                parts.append(rrb.Vertical(*plots, *texts, row_shares=sizes))
+            shares.append(2)
+        return rrb.Blueprint(
+            rrb.Vertical(*parts, row_shares=shares)
+            if in_a_row
+            else rrb.Horizontal(*parts, column_shares=shares),
+            rrb.TimePanel(
+                timeline=self.timeline, state="collapsed" if self.has_time_panel else "hidden"
+            ),
+            auto_layout=False,
+            auto_views=False,
+            collapse_panels=True,
+        )
+
+    def _text_views(self, name: str, entities: Mapping[int, str]) -> Container:
+        several = self.instance_nb > 1
+        return rrb.Tabs(
+            *(
+                rrb.TextDocumentView(
+                    origin=entity, name=f"{name} {instance_id}" if several else name
+                )
+                for instance_id, entity in sorted(entities.items())
+            )
+        )
+
+    def _scene_view(self, instance_id: int) -> rrb.Spatial3DView:
+        low, high = self._bounds(instance_id)
+        size = max(_diagonal((low, high)), 0.2)
+        camera = self._cameras.get(instance_id, {})
+        target = camera.get("target", (low + high) / 2)
+        eye = rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=camera.get("eye", target + 1.3 * size * _VIEW_FROM),
+            look_target=target,
+            eye_up=(0.0, 0.0, 1.0),
+            tracking_entity=self._followed.get(instance_id),
+        )
+        default = f"environment {instance_id}" if self.instance_nb > 1 else "environment"
+        return rrb.Spatial3DView(
+            origin=f"env_{instance_id}",
+            name=self._titles.get(instance_id, default),
+            background=rrb.Background(color=_BACKGROUND),
+            line_grid=rrb.LineGrid3D(
+                visible=True,
+                spacing=10.0 ** math.floor(math.log10(size / 2)),
+                plane=rr.components.Plane3D.XY,
+                stroke_width=1.0,
+                color=_GRID,
+            ),
+            eye_controls=eye,
+        )
+
+    def _bounds(self, instance_id: int) -> Box:
+        """Return the corners of what is to be seen; a floor much larger than the rest is not."""
+        boxes = sorted(self._scenes[instance_id].values(), key=_diagonal)
+        while len(boxes) > 1:
+            rest = _union(boxes[:-1])
+            if _diagonal(boxes[-1]) <= 5 * _diagonal(rest):
+                break
+            boxes.pop()
+        return _union(boxes) if boxes else (np.full(3, -0.5), np.full(3, 0.5))
+
+
+def _plot_view(name: str, curves: Mapping[str, int]) -> rrb.TimeSeriesView:
+    visible = sum(curves.values()) <= _LEGEND
+    legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=visible)
+    return rrb.TimeSeriesView(name=name, contents=list(curves), plot_legend=legend)
+
+
+def _histogram_views(group: str, entities: Mapping[str, str]) -> Container:
+    views = (rrb.BarChartView(origin=entity, name=label) for label, entity in entities.items())
+    return rrb.Tabs(*views, name=group)
+
+
+def _union(boxes: Sequence[Box]) -> Box:
+    return (
+        np.min([low for low, _ in boxes], axis=0),
+        np.max([high for _, high in boxes], axis=0),
+    )
+
+
+def _diagonal(box: Box) -> float:
+    return float(np.linalg.norm(box[1] - box[0]))

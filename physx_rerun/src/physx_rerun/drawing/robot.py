@@ -1,0 +1,145 @@
+"""Robots: the visual shapes of a URDF, each fixed to the frame of its link."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from physx_core.typing import Array
+from physx_rerun.drawing import colors
+from physx_rerun.drawing.rows import Rows, Times
+from physx_rerun.drawing.urdf import MESH_TYPES, Shape, quaternion, read
+
+_SILVER = (0.75, 0.78, 0.81, 1.0)
+
+DrawnShape = tuple[str, Shape]
+"""Entity of a shape, and the shape."""
+
+
+def draw_robot(
+    rows: Rows, entity: str, values: dict[str, Any], frames: Sequence[str], world: str
+) -> tuple[list[DrawnShape], Array]:
+    """Draw the visual shapes of a robot; warn of mesh files that do not exist.
+
+    Args:
+        rows: Where rows go.
+        entity: Path of the robot's entity.
+        values: What the robot was added with.
+        frames: Names of the bodies' frames.
+        world: Name of the frame that shapes stand in which belong to no body.
+
+    Returns:
+        The shapes drawn, and the bodies' poses with all joints at zero, shape (bodies, 7).
+
+    Raises:
+        VisualizerError: The URDF file cannot be read.
+    """
+    model = read(values["urdf"], values["bodies"], values.get("package_dirs") or {})
+    if model.missing:
+        warnings.warn(
+            f"{len(model.missing)} meshes of {values['urdf']} are not drawn: Rerun found no mesh "
+            f"file {model.missing[0]}. Give the folder of each package in package_dirs.",
+            stacklevel=2,
+        )
+    drawn = []
+    for shape in model.shapes:
+        path = f"{entity}/{rr.escape_entity_path_part(shape.name)}"
+        frame = world if shape.body is None else frames[shape.body]
+        pose = rr.InstancePoses3D(
+            translations=[_center(shape)],
+            quaternions=[quaternion(shape.pose[:3, :3])],
+            scales=[shape.size] if shape.kind == "mesh" else None,
+        )
+        rows.static(path, rr.CoordinateFrame(frame), pose, _geometry(shape))
+        drawn.append((path, shape))
+    return drawn, model.rest
+
+
+def tint_robot(rows: Rows, values: dict[str, Any], times: Times) -> None:
+    """Give a robot's shapes its color and opacity, or those of the URDF where it has none.
+
+    Args:
+        rows: Where rows go.
+        values: The robot's values, with its ``shapes``.
+        times: Since when.
+
+    Raises:
+        ConfigError: The color does not exist.
+    """
+    color, alpha = values.get("color"), values.get("alpha")
+    for path, shape in values["shapes"]:
+        own = shape.color
+        if color is None and alpha is None and own is None and shape.kind == "mesh":
+            continue
+        if color is not None:
+            tint = colors.rgba(color, 1.0 if alpha is None else alpha)
+        else:
+            default = (1.0, 1.0, 1.0, 1.0) if shape.kind == "mesh" else _SILVER
+            red, green, blue, opacity = own or default
+            tint = colors.rgba((red, green, blue), opacity if alpha is None else alpha)
+        archetype, option = _LOOKS[shape.kind]
+        rows.add(path, archetype, times, **{option: tint})
+
+
+_LOOKS: dict[str, tuple[type[Any], str]] = {
+    "mesh": (rr.Asset3D, "albedo_factor"),
+    "box": (rr.Boxes3D, "colors"),
+    "cylinder": (rr.Cylinders3D, "colors"),
+    "capsule": (rr.Capsules3D, "colors"),
+    "sphere": (rr.Ellipsoids3D, "colors"),
+}
+
+
+def corners_of(shapes: Sequence[Shape], poses: Array) -> Array:
+    """Return points that a robot spans: its bodies' origins, and the corners around its shapes.
+
+    Args:
+        shapes: Its shapes; of a mesh just the origin is known.
+        poses: Poses of the bodies, shape (bodies, 7).
+    """
+    found = [poses[:, :3]]
+    for shape in shapes:
+        points = _SIGNS * _reach(shape) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+        if shape.body is not None:
+            axis, w = poses[shape.body, 3:6], poses[shape.body, 6]
+            across = 2 * np.cross(axis, points)
+            points = points + w * across + np.cross(axis, across) + poses[shape.body, :3]
+        found.append(points)
+    return np.concatenate(found)
+
+
+_SIGNS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+
+
+def _reach(shape: Shape) -> Array:
+    """Return how far a shape reaches from its origin along its axes."""
+    if shape.kind == "mesh":
+        return np.zeros(3)
+    if shape.kind == "box":
+        return np.array(shape.size)
+    radius, length = shape.size
+    ends = {"sphere": radius, "cylinder": 0.5 * length, "capsule": 0.5 * length + radius}
+    return np.array([radius, radius, ends[shape.kind]])
+
+
+def _center(shape: Shape) -> Array:
+    if shape.kind != "capsule":
+        return shape.pose[:3, 3]
+    return (shape.pose @ np.array([0.0, 0.0, -shape.size[1] / 2, 1.0]))[:3]
+
+
+def _geometry(shape: Shape) -> Any:
+    if shape.mesh is not None:
+        media_type = MESH_TYPES[shape.mesh.suffix.lower()]
+        return rr.Asset3D(path=shape.mesh, media_type=media_type)
+    if shape.kind == "box":
+        return rr.Boxes3D(half_sizes=[shape.size], fill_mode="solid")
+    radius, length = shape.size
+    if shape.kind == "sphere":
+        return rr.Ellipsoids3D(half_sizes=[(radius, radius, radius)], fill_mode="solid")
+    kind = rr.Cylinders3D if shape.kind == "cylinder" else rr.Capsules3D
+    return kind(lengths=[length], radii=[radius], fill_mode="solid")

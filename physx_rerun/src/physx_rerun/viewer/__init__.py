@@ -1,0 +1,1 @@
+"""Viewer processes and the streams that feed them."""

@@ -1,0 +1,98 @@
+"""One picture after another of a scene that moves, made by a viewer without a window."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from physx_core.errors import VisualizerError
+from physx_core.typing import Array
+from physx_rerun.viewer.headless import Camera, start
+
+_MARGIN = (16, 80)  # pixels of the window around a view, and some more: its frame, its title
+_NOTES = 10  # pictures after which the viewer's notes of its start are gone
+_PATIENCE = 60.0  # s that a picture may take
+
+
+class OffscreenViewer:
+    """A viewer without a window.
+
+    Attributes:
+        address: Where it listens, ``127.0.0.1:PORT``.
+    """
+
+    def __init__(self, size: tuple[int, int], memory_limit: str) -> None:
+        """Start it.
+
+        Args:
+            size: Width and height of its pictures, in pixels.
+            memory_limit: Memory that it may use before it forgets the oldest rows.
+
+        Raises:
+            VisualizerError: There is no graphics driver, or it does not start.
+        """
+        self._size = size
+        self._folder = tempfile.TemporaryDirectory(prefix="physx-rerun-")
+        window = (size[0] + _MARGIN[0], size[1] + _MARGIN[1])
+        limits = ("--memory-limit", memory_limit, "--server-memory-limit", "100MB")
+        self._viewer = start(window, Path(self._folder.name), *limits)
+        self._camera: Camera | None = None
+        self.address = self._viewer.address
+        try:
+            self._viewer.wait_until_ready()
+        except VisualizerError:
+            self.close()
+            raise
+
+    def picture(self, step: int, mark: str, number: int) -> Array:
+        """Return a picture of the scene, shape (height, width, 3), uint8.
+
+        Args:
+            step: Position on the timeline ``step`` to draw.
+            mark: Timeline on which the last row that must have arrived lies.
+            number: Its position there.
+
+        Raises:
+            VisualizerError: There is no scene, or the viewer ended or takes too long.
+        """
+        deadline = time.monotonic() + _PATIENCE
+        try:
+            is_first = self._camera is None
+            camera = self._camera or Camera(self._viewer, deadline)
+            camera.deadline = deadline
+            camera.wait_for_position(mark, number)
+            if is_first:
+                camera.wait_for_recording()
+            camera.go_to("step", step)
+            scene = camera.scene()
+            if scene is None:
+                raise VisualizerError("There is nothing to take a picture of: nothing was drawn.")
+            for _ in range(_NOTES if is_first else 0):
+                camera.glance(scene)
+            drawn = camera.shoot(scene) if is_first else camera.glance(scene)
+        except OSError as error:
+            self._viewer.check(wait=2.0)
+            raise VisualizerError(f"The Rerun viewer drew no picture: {error}.") from error
+        self._camera = camera
+        return _cut(Image.open(io.BytesIO(drawn)), self._size)
+
+    def close(self) -> None:
+        """End the viewer."""
+        self._viewer.end()
+        self._folder.cleanup()
+
+
+def _cut(picture: Image.Image, size: tuple[int, int]) -> Array:
+    """Return the middle of a picture; one that is smaller is enlarged first."""
+    factor = max(1.0, *(want / have for want, have in zip(size, picture.size, strict=True)))
+    if factor > 1.0:
+        whole = [round(factor * have) for have in picture.size]
+        picture = picture.resize((max(whole[0], size[0]), max(whole[1], size[1])))
+    left, top = ((have - want) // 2 for have, want in zip(picture.size, size, strict=True))
+    cut = picture.convert("RGB").crop((left, top, left + size[0], top + size[1]))
+    return np.asarray(cut).copy()

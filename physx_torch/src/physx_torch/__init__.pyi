@@ -1,0 +1,13 @@
+"""The physx plugin ``torch``: PyTorch networks, optimization and transformation."""
+
+from .forward_dynamics import ForwardDynamics as ForwardDynamics
+from .networks.encoder_decoder import EncoderDecoder as EncoderDecoder
+from .networks.fc import FC as FC
+from .networks.module_network import ModuleNetwork as ModuleNetwork
+from .networks.network import TorchNetwork as TorchNetwork
+from .networks.transformation import TorchTransformation as TorchTransformation
+from .networks.unet import UNet as UNet
+from .networks.unet_transformation import UNetTransformation as UNetTransformation
+from .training.data import StoredDataset as StoredDataset
+from .training.optimization import TorchOptimization as TorchOptimization
+from .training.tensorboard import TensorBoard as TensorBoard

@@ -1,0 +1,324 @@
+"""TorchNetwork: what every network of PyTorch has in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from physx_core import Field, Network, Transformation
+from physx_core.components import Group, options_of
+from physx_core.errors import (
+    ConfigError,
+    FieldsMismatchError,
+    MissingFieldError,
+    UnknownOptionError,
+    UsageError,
+    listed,
+)
+from physx_core.typing import Array, Batch, Tensors
+from physx_torch.devices import find_device
+from physx_torch.storage.parameters import check_match, read_tensors, write_tensors
+from physx_torch.training import parallel
+
+DATA_TYPES = {"float32": torch.float32, "float64": torch.float64}
+"""Names of the floating types that a network can compute in."""
+
+
+class TorchNetwork(torch.nn.Module, Network):
+    """Base of PyTorch networks: a module whose inputs and outputs are fields.
+
+    A subclass makes its layers in the constructor and implements ``forward``, which gets the
+    tensors of `net_fields` in that order, of shape (samples, *field shape), and returns those of
+    `pred_fields`: one tensor, several in that order, or a dictionary by name.
+
+    The names of the fields are class attributes of the subclass or arguments of the constructor.
+    Where `opt_fields` are given and `pred_fields` are not, a prediction has the name of the field
+    that it is compared with.
+
+    Attributes:
+        device: Where the parameters are.
+        data_type: Floating type of parameters and tensors.
+    """
+
+    parameters_file: ClassVar[str] = "parameters.safetensors"
+    default_optimization: ClassVar[str] = "torch/default"
+    default_transformation: ClassVar[str] = "torch/default"
+    export_forms: ClassVar[Sequence[str]] = ("onnx", "torchscript", "pt2")
+
+    def __init__(
+        self,
+        *,
+        net_fields: str | Iterable[str] | None = None,
+        opt_fields: str | Iterable[str] | None = None,
+        pred_fields: str | Iterable[str] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Keep the names of the fields.
+
+        Args:
+            net_fields: Name or names of the fields that the network reads.
+            opt_fields: Name or names of the fields that the loss compares the prediction with.
+            pred_fields: Name or names of the fields that the network predicts.
+            kwargs: Must be empty; a subclass takes its own options by name.
+
+        Raises:
+            UnknownOptionError: An option that no class of the network takes.
+            ConfigError: Names are missing, are given twice, or do not fit together in number.
+        """
+        if kwargs:
+            raise UnknownOptionError(type(self).__name__, kwargs, options_of(type(self)))
+        super().__init__()
+        own_names = opt_fields is not None or self.opt_fields != Network.opt_fields
+        self.net_fields = _names("net_fields", net_fields, self.net_fields)
+        self.opt_fields = _names("opt_fields", opt_fields, self.opt_fields)
+        if pred_fields is None and self.pred_fields == Network.pred_fields and own_names:
+            pred_fields = self.opt_fields
+        self.pred_fields = _names("pred_fields", pred_fields, self.pred_fields)
+        if len(self.pred_fields) != len(self.opt_fields):
+            raise ConfigError(
+                f"{type(self).__name__} predicts {listed(self.pred_fields)} but is compared with "
+                f"{listed(self.opt_fields)}: each pred_field needs one opt_field."
+            )
+        self.device = torch.device("cpu")
+        self.data_type = torch.float32
+        self._training_forward: Callable[..., Any] | None = None
+
+    @classmethod
+    def set_seed(cls, seed: int) -> None:
+        """Seed torch's random numbers, those of every device."""
+        torch.manual_seed(seed)
+
+    @classmethod
+    def join_group(cls, device: str) -> Group:
+        """Join the processes that torchrun started to train this network together.
+
+        Raises:
+            ConfigError: The device does not exist, or the processes do not find each other.
+        """
+        return parallel.join(device)
+
+    def predict(self, data: Tensors) -> Tensors:
+        """Return ``{field: tensor}`` for `pred_fields` from the `net_fields` in `data`.
+
+        Raises:
+            MissingFieldError: `data` lacks one of `net_fields`.
+            FieldsMismatchError: ``forward`` returned something else than `pred_fields`.
+        """
+        try:
+            inputs = [data[name] for name in self.net_fields]
+        except KeyError as error:
+            raise MissingFieldError(
+                f'{type(self).__name__} reads the field "{error.args[0]}", which is not given. '
+                f"Given: {listed(data)}.",
+                field=str(error.args[0]),
+            ) from None
+        if self.training:
+            return self._by_field(self(*inputs))
+        with torch.no_grad():
+            return self._by_field(self(*inputs))
+
+    def forward(self, *inputs: torch.Tensor) -> Any:
+        """Return the tensors of `pred_fields`; what a subclass implements.
+
+        Args:
+            inputs: The tensors of `net_fields` in that order, of shape (samples, *field shape).
+
+        Raises:
+            UsageError: The subclass does not implement it.
+        """
+        raise UsageError(f"{type(self).__name__} does not implement forward().")
+
+    def __call__(self, *inputs: Any) -> Any:
+        """Return what ``forward`` makes of the tensors of `net_fields`."""
+        if self.training and self._training_forward is not None:
+            return self._training_forward(*inputs)
+        return super().__call__(*inputs)
+
+    def set_training_forward(self, forward: Callable[..., Any] | None) -> None:
+        """Choose what takes the place of ``forward`` while the network is trained; None: nothing.
+
+        The optimization does so, to compile it or to compute in mixed precision.
+        """
+        self._training_forward = forward
+
+    def _by_field(self, output: Any) -> Tensors:
+        names = self.pred_fields
+        if isinstance(output, torch.Tensor) and len(names) == 1:
+            return {names[0]: output}
+        if isinstance(output, Mapping) and all(name in output for name in names):
+            return {name: output[name] for name in names}
+        if isinstance(output, (tuple, list)) and len(output) == len(names):
+            return dict(zip(names, output, strict=True))
+        given = listed(output) if isinstance(output, Mapping) else type(output).__name__
+        if isinstance(output, (tuple, list)):
+            given = f"{len(output)} values"
+        raise FieldsMismatchError(
+            f"{type(self).__name__}.forward() does not return its pred_fields",
+            dict.fromkeys(names, f"expected; returned was: {given}"),
+        )
+
+    def set_train(self) -> None:
+        """Get ready to be trained."""
+        self.train()
+
+    def set_eval(self) -> None:
+        """Get ready to predict: no gradients are recorded."""
+        if self.training:  # to look at every layer takes as long as a small network's prediction
+            self.eval()
+
+    def set_device(self, device: str) -> None:
+        """Move to ``"cpu"``, ``"cuda"``, ``"cuda:<index>"``, ``"mps"`` or ``"auto"``.
+
+        ``"auto"`` is the first CUDA device if there is one, otherwise the processor.
+
+        Raises:
+            ConfigError: The device does not exist on this machine, or cannot hold the data type.
+        """
+        found = find_device(device)
+        _check_type(self.data_type, found)
+        self.device = found
+        self.to(found)
+
+    def set_data_type(self, data_type: str) -> None:
+        """Compute in ``"float32"`` or ``"float64"``.
+
+        Raises:
+            ConfigError: Another type, or one that the device cannot hold.
+        """
+        if data_type not in DATA_TYPES:
+            raise ConfigError(f'data_type is "{data_type}" but must be {listed(DATA_TYPES)}.')
+        _check_type(DATA_TYPES[data_type], self.device)
+        self.data_type = DATA_TYPES[data_type]
+        self._apply(lambda tensor: _in_precision(tensor, self.data_type))
+
+    def get_parameters(self) -> dict[str, torch.Tensor]:
+        """Return the parameters that are trained by name; they are the network's own."""
+        return dict(self.named_parameters())
+
+    def get_gradients(self) -> dict[str, torch.Tensor]:
+        """Return the gradients of the last step by parameter; they are the network's own."""
+        named = self.named_parameters()
+        return {name: p.grad for name, p in named if p.grad is not None}
+
+    def set_gradients(self, gradients: Mapping[str, torch.Tensor]) -> None:
+        """Take over gradients that `get_gradients` returned; parameters without one get none.
+
+        Raises:
+            ValueError: A parameter is missing or has another shape.
+        """
+        own = self.get_parameters()
+        for name, gradient in gradients.items():
+            if name not in own or own[name].shape != gradient.shape:
+                raise ValueError(f"it has no parameter {name} of shape {tuple(gradient.shape)}")
+        for name, parameter in own.items():
+            found = gradients.get(name)
+            parameter.grad = None if found is None else found.to(parameter.device, parameter.dtype)
+
+    def nb_parameters(self) -> int:
+        """Return how many real numbers the parameters hold; a complex one is two of them."""
+        return sum(p.numel() * (2 if p.is_complex() else 1) for p in self.parameters())
+
+    def save_parameters(self, path: Path) -> None:
+        """Write parameters and buffers to a safetensors file.
+
+        Raises:
+            CheckpointError: The file cannot be written, or the state holds more than tensors.
+        """
+        write_tensors(path, self._state())
+
+    def load_parameters(self, path: Path) -> None:
+        """Read parameters and buffers that `save_parameters` wrote, in any floating type.
+
+        Raises:
+            CheckpointError: The file is missing, damaged or of another architecture; the network
+                is unchanged then.
+        """
+        tensors, _ = read_tensors(path)
+        check_match(path, type(self).__name__, tensors, self._state())
+        self.load_state_dict(tensors)
+
+    def _state(self) -> dict[str, Any]:
+        """Return parameters, buffers and extra states, without what a module notes about itself."""
+        return {
+            name: value
+            for name, value in self.state_dict().items()
+            if isinstance(value, torch.Tensor) or name.endswith("_extra_state")
+        }
+
+    def export(
+        self, path: Path, form: str, transformation: Transformation, fields: Mapping[str, Field]
+    ) -> None:
+        """Write network and transformation as ``"onnx"``, ``"torchscript"`` or ``"pt2"``.
+
+        The first axis of inputs and outputs is that of the samples, of any length. Floating inputs
+        have the network's data type. ONNX names inputs and outputs by the fields; the other two
+        take and return a dictionary of tensors by field. A field that is read and predicted is
+        given as ``predicted_<name>``.
+
+        Raises:
+            ConfigError: There is no such form, or the network cannot be written in it.
+            MissingLibraryError: ONNX needs the extra ``physx-torch[export]``.
+        """
+        if form not in self.export_forms:
+            super().export(path, form, transformation, fields)
+        from physx_torch import export
+
+        export.write(path, form, self, transformation, fields)
+
+    def numpy_to_tensor(self, batch: Batch) -> Tensors:
+        """Return arrays as tensors on the network's device.
+
+        Floating arrays get the network's data type; integers, booleans and complex numbers keep
+        theirs. On the processor a writable array of the right type shares its memory.
+
+        Args:
+            batch: Arrays by field, each of shape (samples, *field shape).
+        """
+        return {name: self._tensor(array) for name, array in batch.items()}
+
+    def _tensor(self, array: Array) -> torch.Tensor:
+        tensor = torch.from_numpy(_plain(array))
+        if tensor.is_floating_point():
+            return tensor.to(self.device, self.data_type)
+        return tensor.to(self.device)
+
+    def tensor_to_numpy(self, tensors: Tensors) -> Batch:
+        """Return tensors as arrays; those on the processor share their memory."""
+        return {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
+
+
+def _plain(array: Array) -> Array:
+    # torch takes neither read-only memory, nor foreign byte orders, nor negative strides.
+    flags = array.flags
+    regular = flags.writeable and array.dtype.isnative
+    if regular and (flags.c_contiguous or min(array.strides) >= 0):
+        return array
+    return np.array(array, dtype=array.dtype.newbyteorder("="), order="C")
+
+
+def _names(
+    option: str, given: str | Iterable[str] | None, default: str | Iterable[str]
+) -> tuple[str, ...]:
+    chosen = default if given is None else given
+    names = (chosen,) if isinstance(chosen, str) else tuple(chosen)
+    if not names or len(set(names)) != len(names) or not all(isinstance(n, str) for n in names):
+        raise ConfigError(
+            f"{option} is {chosen!r} but must be a field's name or several that differ."
+        )
+    return names
+
+
+def _in_precision(tensor: torch.Tensor, data_type: torch.dtype) -> torch.Tensor:
+    """Return floating and complex tensors in a precision, others as they are."""
+    if tensor.is_complex():
+        return tensor.to(data_type.to_complex())
+    return tensor.to(data_type) if tensor.is_floating_point() else tensor
+
+
+def _check_type(data_type: torch.dtype, device: torch.device) -> None:
+    if device.type == "mps" and data_type == torch.float64:
+        raise ConfigError('The device "mps" has no float64: use float32 or the device "cpu".')

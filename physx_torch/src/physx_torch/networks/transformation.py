@@ -1,0 +1,103 @@
+"""TorchTransformation: normalizes what the network reads, and brings predictions back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+
+from physx_core import Network, Normalization, Transformation
+from physx_core.errors import ConfigError
+from physx_core.typing import Tensors
+from physx_torch.networks.network import TorchNetwork
+
+
+class _Scale(NamedTuple):
+    """Mean and standard deviation of a field as tensors of the field's shape."""
+
+    mean: torch.Tensor
+    std: torch.Tensor
+
+
+class TorchTransformation(Transformation):
+    """Gives the network and the loss each component with mean 0 and standard deviation 1.
+
+    Fields of `net_fields` and `opt_fields` are normalized with their own coefficients; the i-th of
+    `pred_fields` is brought back to physical units with those of the i-th of `opt_fields`. Fields
+    without coefficients stay as they are.
+
+    All of it is computed in the network's data type: values far from zero that vary little (an
+    offset of 1e6 spreads) lose their last digits in float32 before the mean is subtracted; use
+    float64 for those.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._inputs: dict[str, _Scale] = {}
+        self._targets: dict[str, _Scale] = {}
+        self._predictions: dict[str, _Scale] = {}
+
+    def set_normalization(
+        self, normalization: Mapping[str, Normalization], network: Network
+    ) -> None:
+        """Keep the coefficients as tensors of the network's device and data type.
+
+        Call it again when the network's device or data type has changed.
+
+        Args:
+            normalization: Mean and standard deviation by field; fields that the network does not
+                use are ignored.
+            network: The network whose fields are transformed.
+
+        Raises:
+            ConfigError: The network is not one of PyTorch.
+        """
+        if not isinstance(network, TorchNetwork):
+            raise ConfigError(f"{type(network).__name__} is no TorchNetwork.")
+        super().set_normalization(normalization, network)
+        scales = {name: _scale(item, network) for name, item in normalization.items()}
+        self._inputs = {n: scales[n] for n in network.net_fields if n in scales}
+        self._targets = {n: scales[n] for n in network.opt_fields if n in scales}
+        pairs = zip(network.pred_fields, network.opt_fields, strict=True)
+        self._predictions = {pred: scales[opt] for pred, opt in pairs if opt in scales}
+
+    def transform_before_prediction(self, data: Tensors) -> Tensors:
+        """Return the data with `net_fields` normalized."""
+        return _normalized(data, self._inputs)
+
+    def transform_before_loss(
+        self, prediction: Tensors, targets: Tensors
+    ) -> tuple[Tensors, Tensors]:
+        """Return the prediction as it is, and the targets normalized as the network's own are."""
+        return prediction, _normalized(targets, self._targets)
+
+    def transform_before_apply(self, prediction: Tensors) -> Tensors:
+        """Return the prediction in physical units."""
+        if not self._predictions:
+            return prediction
+        changed = {
+            name: torch.addcmul(scale.mean, prediction[name], scale.std)
+            for name, scale in self._predictions.items()
+            if name in prediction
+        }
+        return {**prediction, **changed}
+
+
+def _scale(item: Normalization, network: TorchNetwork) -> _Scale:
+    mean, std = (
+        torch.tensor(values, dtype=network.data_type, device=network.device)
+        for values in (item.mean, item.std)
+    )
+    return _Scale(mean, std)
+
+
+def _normalized(data: Tensors, scales: Mapping[str, _Scale]) -> Tensors:
+    if not scales:
+        return data
+    changed = {
+        name: (data[name] - scale.mean) / scale.std
+        for name, scale in scales.items()
+        if name in data
+    }
+    return {**data, **changed}

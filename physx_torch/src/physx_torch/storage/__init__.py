@@ -1,0 +1,1 @@
+"""Parameter and state files in safetensors."""

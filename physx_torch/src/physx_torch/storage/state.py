@@ -1,0 +1,82 @@
+"""State files: nested plain data with tensors in them, in safetensors, which runs no code."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from physx_core.errors import CheckpointError
+from physx_torch.storage.parameters import read_tensors, write_tensors
+
+_KEY = "state"
+
+
+def write_state(path: Path, state: Mapping[str, Any]) -> None:
+    """Write dictionaries, lists, numbers, texts and tensors, nested in any way.
+
+    Raises:
+        CheckpointError: There is something else in it, or the file cannot be written.
+    """
+    tensors: dict[str, torch.Tensor] = {}
+    plain = _split(state, "", tensors)
+    write_tensors(path, tensors, {_KEY: json.dumps(plain)})
+
+
+def read_state(path: Path) -> dict[str, Any]:
+    """Return what `write_state` wrote; tuples have become lists.
+
+    Raises:
+        CheckpointError: The file is missing, damaged or holds something else.
+    """
+    tensors, texts = read_tensors(path)
+    try:
+        state: dict[str, Any] = _join(json.loads(texts[_KEY]), tensors)
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{path} holds no state of an optimization.") from error
+    return state
+
+
+def random_state(device: torch.device) -> dict[str, torch.Tensor]:
+    """Return the state of the random numbers that torch draws on a device and the processor."""
+    state = {"cpu": torch.get_rng_state()}
+    if device.type == "cuda":
+        state["cuda"] = torch.cuda.get_rng_state(device)
+    return state
+
+
+def set_random_state(state: Mapping[str, torch.Tensor], device: torch.device) -> None:
+    """Let torch go on drawing random numbers where `random_state` was called."""
+    torch.set_rng_state(state["cpu"])
+    if device.type == "cuda" and "cuda" in state:
+        torch.cuda.set_rng_state(state["cuda"], device)
+
+
+def _split(value: Any, where: str, tensors: dict[str, torch.Tensor]) -> dict[str, Any]:
+    if isinstance(value, torch.Tensor):
+        tensors[where] = value
+        return {"tensor": where}
+    if isinstance(value, Mapping):
+        items = [[key, _split(item, f"{where}/{key}", tensors)] for key, item in value.items()]
+        return {"items": items}
+    if isinstance(value, (list, tuple)):
+        return {"list": [_split(item, f"{where}/{i}", tensors) for i, item in enumerate(value)]}
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return {"value": value}
+    raise CheckpointError(
+        f'"{where}" of the optimization\'s state is a {type(value).__name__}, which cannot be '
+        "written without running code when it is read."
+    )
+
+
+def _join(plain: dict[str, Any], tensors: Mapping[str, torch.Tensor]) -> Any:
+    if "tensor" in plain:
+        return tensors[plain["tensor"]]
+    if "items" in plain:
+        return {key: _join(item, tensors) for key, item in plain["items"]}
+    if "list" in plain:
+        return [_join(item, tensors) for item in plain["list"]]
+    return plain["value"]

@@ -1,0 +1,1 @@
+"""Optimization, data-parallel training, and statistics."""
