@@ -129,7 +129,7 @@ class Services:
 
 def configured(environment, options):
     if isinstance(environment, str) and environment.isidentifier():
-        environment = f"{Path(__file__).with_name('transport_envs.py')}:{environment}"
+        environment = f"{(Path(__file__).parent / 'programs' / 'worker_envs.py')}:{environment}"
     return EnvironmentConfig(environment, **options)
 
 
@@ -141,7 +141,7 @@ def services():
 
 @pytest.fixture
 def local(services):
-    """Return the source of an environment in this process; a plain name is in transport_envs.py."""
+    """Return the source of an environment in this process; a plain name is in worker_envs.py."""
 
     def make(environment, **options):
         return LocalSource(configured(environment, options), services, SEED)

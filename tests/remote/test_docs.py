@@ -26,7 +26,7 @@ from physx_remote.serving.protocol import find_protocol
 PAGE = Path(__file__).parents[2] / "docs" / "remote.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```python\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
-PROJECT = Path(__file__).with_name("godot")
+PROJECT = Path(__file__).parent / "programs" / "godot"
 SEEN = """
 assert seen["positions"].shape == (2,) and seen["positions"].any()
 assert env.action_space.contains(env.action_space.sample()) and isinstance(terminated, bool)

@@ -19,7 +19,7 @@ import pytest
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.errors import ClientError
 
-ENVS = Path(__file__).with_name("transport_envs.py")
+ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
 SOON = 30.0  # far below the time for which a client may be silent, on the busiest machine too
 
 

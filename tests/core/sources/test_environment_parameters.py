@@ -20,7 +20,7 @@ from physx_core.components import Observer
 from physx_core.errors import DatasetError
 from physx_core.pipelines.services import RunServices
 
-ENVS = Path(__file__).with_name("source_envs.py")
+ENVS = Path(__file__).parents[1] / "programs" / "source_envs.py"
 
 
 def keeping(over_tcp=False, **options):

@@ -18,7 +18,7 @@ from physx_core.errors import RemoteClosedError, RemoteTimeoutError
 from physx_remote import connect, connect_vector
 from physx_remote.godot_gym.messages import Messages
 
-PROJECT = Path(__file__).with_name("godot")
+PROJECT = Path(__file__).parents[1] / "programs" / "godot"
 BINARY = "godot3-server"
 FRAME = 1 / 60  # s
 

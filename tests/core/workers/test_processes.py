@@ -18,7 +18,7 @@ from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.workers.client.client import run_client
 from physx_core.workers.processes.launchers import ClientProcess, stop
 
-ENVS = Path(__file__).with_name("transport_envs.py")
+ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
 
 
 def test_what_a_client_process_sees(clients, services, monkeypatch):

@@ -17,7 +17,7 @@ from numpy.testing import assert_array_equal
 from physx_core import Dataset
 from physx_core.errors import DatasetError, DatasetNotFoundError
 
-KILLS = Path(__file__).with_name("dataset_kills.py")
+KILLS = Path(__file__).parents[1] / "programs" / "dataset_kills.py"
 WORKS = ["create", "append", "roll-over", "seal", "json", "update"]
 
 

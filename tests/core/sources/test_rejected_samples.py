@@ -11,7 +11,7 @@ from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.cli import main
 from physx_core.errors import UsageError, WrongSamplesError
 
-PICKY = f"{Path(__file__).with_name('source_envs.py')}:Picky"
+PICKY = f"{(Path(__file__).parents[1] / 'programs' / 'source_envs.py')}:Picky"
 
 
 def picky(**options):

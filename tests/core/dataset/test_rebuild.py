@@ -17,7 +17,7 @@ from physx_core.errors import (
     DatasetNotFoundError,
 )
 
-OLD = Path(__file__).parents[1] / "data" / "dataset_v1"
+OLD = Path(__file__).parents[2] / "data" / "dataset_v1"
 
 
 # Repairing --------------------------------------------------------------------------------------

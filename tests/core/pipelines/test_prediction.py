@@ -25,7 +25,7 @@ from physx_core import (
 from physx_core.cli import main
 from physx_core.errors import ConfigError, DatasetError, DatasetNotFoundError, WrongSamplesError
 
-ENVS = Path(__file__).with_name("source_envs.py")
+ENVS = Path(__file__).parents[1] / "programs" / "source_envs.py"
 NETWORK = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "y"})
 
 

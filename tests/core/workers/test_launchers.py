@@ -100,14 +100,14 @@ def test_a_launcher_of_ones_own_starts_the_clients(clients, notes, reference):
         assert source.batch(4)["env_id"].tolist() == [1, 2, 1, 2]
     assert [file.read_text() for file in notes.glob("*.launch")] == ["[1, 2]"]
     said = (notes / "2.out").read_text()
-    assert "transport_envs.py:Plain, instance 2 of 2" in said
+    assert "worker_envs.py:Plain, instance 2 of 2" in said
     assert said.endswith("the run has ended\n")
 
 
 def test_a_launcher_of_ones_own_starts_a_client_again(clients, notes):
     settings = {"launcher": CommandLauncher, "launcher_kwargs": {"notes": str(notes)}}
     kwargs = {"fault": "fail", "at": 3}
-    wanderer = f"{HERE.with_name('restart_envs.py')}:Wanderer"
+    wanderer = f"{HERE.parents[1] / 'programs' / 'restart_envs.py'}:Wanderer"
     with clients(wanderer, num_clients=2, restarts=1, env_kwargs=kwargs, **settings) as source:
         assert source.batch(20)["step"].tolist() == [step // 2 for step in range(20)]
     launches = [file.read_text() for file in sorted(notes.glob("*.launch"))]

@@ -9,7 +9,7 @@ import pytest
 
 from physx_core.errors import EnvironmentFailedError
 
-ENVS = Path(__file__).with_name("source_envs.py")
+ENVS = Path(__file__).parents[1] / "programs" / "source_envs.py"
 
 
 def same(a, b):

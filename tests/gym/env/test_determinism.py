@@ -14,7 +14,7 @@ from physx_core.simulation import Encoder, Imu, Motor
 from physx_gym import Layer, RobotEnv
 from physx_gym.env.buffers import copied
 
-PROGRAM = Path(__file__).with_name("noisy_ant.py")
+PROGRAM = Path(__file__).parents[1] / "programs" / "noisy_ant.py"
 program = runpy.run_path(str(PROGRAM))
 make, run = program["make"], program["run"]
 

@@ -19,8 +19,8 @@ import pytest
 from physx_core.errors import ClientError, ConfigError
 from physx_core.net import Kind, pack
 
-ENVS = Path(__file__).with_name("transport_envs.py")
-WANDERER = f"{Path(__file__).with_name('restart_envs.py')}:Wanderer"
+ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
+WANDERER = f"{(Path(__file__).parents[1] / 'programs' / 'restart_envs.py')}:Wanderer"
 TOKEN = "a token for these tests"
 CLIENT = [sys.executable, "-m", "physx_core", "client"]
 
@@ -90,7 +90,7 @@ def test_clients_join_a_waiting_run_and_say_what_they_do(by_hand, join, port, ca
     assert [process.returncode for process in ours] == [0, 0]
     assert batch["env_id"].tolist() == [1, 2] * 3
     assert said[0][0] == f"physx client: looks for the server at 127.0.0.1:{port}"
-    assert said[0][1].endswith("transport_envs.py:Plain, instance 2 of 2")
+    assert said[0][1].endswith("worker_envs.py:Plain, instance 2 of 2")
     assert said[0][-1] == "physx client: the run has ended"
     assert said[1][1].endswith("instance 1 of 2")
     first = warnings(caplog)[0]

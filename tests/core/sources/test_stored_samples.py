@@ -23,7 +23,7 @@ from physx_core.errors import (
     WrongSamplesError,
 )
 
-ENVS = Path(__file__).with_name("source_envs.py")
+ENVS = Path(__file__).parents[1] / "programs" / "source_envs.py"
 DOUBLING = f"{ENVS}:Doubling"
 NETWORK = {"network_kwargs": {"net_fields": "x", "opt_fields": "y"}}
 

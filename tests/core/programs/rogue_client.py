@@ -1,6 +1,6 @@
 """A rogue that sends frames to a server, random and mutated, and prints what it did as JSON.
 
-``python transport_rogue.py HOST:PORT INSTANCE SEED FRAMES``; instance 0: it does not prove that it
+``python rogue_client.py HOST:PORT INSTANCE SEED FRAMES``; instance 0: it does not prove that it
 knows the token in ``PHYSX_TOKEN``, whatever it sends; otherwise it does, and sends the frames in
 the place of that instance. Every connection ends after some frames, or when the server ends it.
 """

@@ -19,7 +19,7 @@ from physx_core.errors import ClientError, EnvironmentFailedError, SampleError
 from physx_core.net import Kind, pack
 from physx_core.workers.server.journal import Journal
 
-ENVS = Path(__file__).with_name("restart_envs.py")
+ENVS = Path(__file__).parents[1] / "programs" / "restart_envs.py"
 WANDERER = f"{ENVS}:Wanderer"
 
 

@@ -13,7 +13,7 @@ import pytest
 from physx_core import Environment
 from physx_core.errors import ComponentNotFoundError, UsageError
 
-ENVS = Path(__file__).with_name("transport_envs.py")
+ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
 
 
 def same(a, b):

@@ -67,7 +67,7 @@ def test_first_accelerations_do_not_depend_on_what_was_before(backend):
 
 
 def test_registered_environments_are_the_same_in_another_process():
-    program = Path(__file__).with_name("registered_runs.py")
+    program = Path(__file__).parents[1] / "programs" / "registered_runs.py"
     registered = runpy.run_path(str(program))
     words = [sys.executable, str(program), "3"]
     there = subprocess.check_output(words, text=True).split()

@@ -1,6 +1,6 @@
 """The server under random and mutated frames, from strangers and from clients, during a run.
 
-`transport_rogue.py` sends them from a process of its own. Meanwhile real clients make rows, and
+`rogue_client.py` sends them from a process of its own. Meanwhile real clients make rows, and
 the memory of this process is watched.
 """
 
@@ -21,8 +21,8 @@ from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.net import Kind, pack
 from physx_core.workers.server.client_group import ClientGroup
 
-ROGUE = Path(__file__).with_name("transport_rogue.py")
-ENVS = Path(__file__).with_name("transport_envs.py")
+ROGUE = Path(__file__).parents[1] / "programs" / "rogue_client.py"
+ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
 TOKEN = "a token for this test"
 MEGABYTE = 1 << 20
 LONG = pytest.mark.faults
