@@ -11,14 +11,14 @@ from .blocks import PDController as PDController
 from .blocks import QuantityObserver as QuantityObserver
 from .bridge.gym_environment import GymEnvironment as GymEnvironment
 from .bridge.policy import Policy as Policy
-from .build.pipeline import build_pipeline as build_pipeline
-from .build.pipeline import load_pipeline as load_pipeline
 from .env.layers.composed import ComposedEnv as ComposedEnv
 from .env.layers.controlled import ControlledEnv as ControlledEnv
 from .env.layers.layer import Layer as Layer
 from .env.layers.observed import ObservedEnv as ObservedEnv
 from .env.pipeline_env import PipelineEnv as PipelineEnv
 from .env.robot_env import RobotEnv as RobotEnv
+from .pipeline.recipe import build_pipeline as build_pipeline
+from .pipeline.recipe import load_pipeline as load_pipeline
 from .show.plotting import plot as plot
 from .show.replaying import replay as replay
 from .simulator.simulator import Simulator as Simulator

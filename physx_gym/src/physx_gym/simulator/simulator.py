@@ -19,7 +19,7 @@ from physx_core.errors import (
 )
 from physx_core.simulation import Ground, HeightField, Robot, Stairs, World, Wrench
 from physx_core.typing import Vector
-from physx_gym.build import options as plain
+from physx_gym.pipeline import options as plain
 from physx_gym.simulator.equipped_world import Engine, EquippedWorld, positive_or_none
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from physx_core.errors import ComponentNotFoundError, LogError, nearest
 from physx_core.files import replace
 from physx_core.simulation import World
-from physx_gym.build.plain_description import plain, world_of
+from physx_gym.pipeline.plain_description import plain, world_of
 from physx_gym.tasks.trajectory import Trajectory
 
 TIME = "time"

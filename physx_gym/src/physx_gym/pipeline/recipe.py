@@ -15,9 +15,9 @@ from typing import Any
 from physx_core.config import read_toml
 from physx_core.errors import ConfigError, ConfigFileError
 from physx_gym.blocks.block import ControllerBlock, ObserverBlock
-from physx_gym.build.components import built, check_call, check_table, find, find_environment
 from physx_gym.env.layers.controlled import ControlledEnv
 from physx_gym.env.layers.observed import ObservedEnv
+from physx_gym.pipeline.components import built, check_call, check_table, find, find_environment
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from physx_core.errors import ConfigError, UnknownOptionError
-from physx_core.simulation import Motor
-from physx_core.simulation import Sensor
-from physx_core.simulation import World
+from physx_core.simulation import Motor, Sensor, World
 
 _NAMES = frozenset({"name", "joint", "urdf", "package_dirs", "joints", "feet", "path", "heights"})
 """What a thing is rather than how it behaves: no options."""

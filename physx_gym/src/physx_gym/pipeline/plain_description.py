@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.simulation import description as worlds
 from physx_core import PhysxError
 from physx_core.errors import LogError
 from physx_core.simulation import World
+from physx_core.simulation import description as worlds
 
 _KINDS = {
     name: kind
