@@ -7,20 +7,18 @@ import dataclasses
 import inspect
 import itertools
 import textwrap
-import tomllib
 import typing
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, TypeVar
 
 import tyro
-from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from physx_core.cli.arguments import argument_registry
 from physx_core.config import from_plain, read_toml
 from physx_core.errors import ConfigFileError, UnknownOptionError, UsageError, listed
 from physx_core.pipelines.pipeline import Pipeline
 
 P = TypeVar("P", bound=Pipeline)
-Registry = ConstructorRegistry
 
 
 def pipeline_from(
@@ -163,45 +161,3 @@ def _docstrings(cls: type[Any]) -> dict[str, str]:
             text = following.value if isinstance(following, ast.Expr) else None
             docs[statement.target.id] = str(text.value) if isinstance(text, ast.Constant) else ""
     return docs
-
-
-def argument_registry() -> Registry:
-    """Return what reads ``NAME=VALUE ...`` and references; a context within which it does."""
-    registry = ConstructorRegistry()
-
-    @registry.primitive_rule
-    def arguments(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-        if info.type != dict[str, Any]:
-            return None
-        return PrimitiveConstructorSpec(
-            nargs="*",
-            metavar="NAME=VALUE ...",
-            instance_from_str=lambda words: dict(_argument(word) for word in words),
-            is_instance=lambda value: isinstance(value, dict),
-            str_from_instance=lambda value: [f"{name}={item}" for name, item in value.items()],
-        )
-
-    @registry.primitive_rule
-    def reference(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-        if info.type not in (str | type[Any], str | type[Any] | None):
-            return None
-        return PrimitiveConstructorSpec(
-            nargs=1,
-            metavar="REFERENCE",
-            instance_from_str=lambda words: words[0],
-            is_instance=lambda value: True,
-            str_from_instance=lambda value: [str(value)],
-        )
-
-    return registry
-
-
-def _argument(word: str) -> tuple[str, Any]:
-    """Return name and value of ``NAME=VALUE``; the value is TOML, or else a text."""
-    name, equals, text = word.partition("=")
-    if not equals:
-        raise ValueError(f"{word!r} is not NAME=VALUE")
-    try:
-        return name, tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return name, text

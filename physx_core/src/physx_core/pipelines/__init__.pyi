@@ -2,7 +2,7 @@
 
 from .data_generation import DataGeneration as DataGeneration
 from .learner import Learner as Learner
-from .learner import restored as restored
+from .learner import load_learner as load_learner
 from .pipeline import Pipeline as Pipeline
 from .prediction import Prediction as Prediction
 from .replay import Replay as Replay

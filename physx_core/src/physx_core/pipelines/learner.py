@@ -291,6 +291,22 @@ def restored(config: NetworkConfig, path: Path) -> Learner:
     return learner
 
 
+def load_learner(folder: str | Path, config: NetworkConfig | None = None) -> Learner:
+    """Return the trained network of a session, ready to predict.
+
+    Args:
+        folder: The session's folder, or that of its checkpoints.
+        config: Which checkpoint, and what else to change; None: the last one.
+
+    Raises:
+        CheckpointError: There is no checkpoint, or it is damaged or of another network.
+        FieldsMismatchError: The network reads other fields.
+    """
+    config = config or NetworkConfig()
+    place = Path(config.network_dir or folder)
+    return restored(config, checkpoint.find(place, config.network_name, config.which_network))
+
+
 def _make(kind: str, reference: Any, arguments: dict[str, Any], base: type[Any]) -> Any:
     return _made(kind, reference, resolve(kind, reference), arguments, base)
 

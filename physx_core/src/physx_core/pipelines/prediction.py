@@ -5,15 +5,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
-from pathlib import Path
 from typing import ClassVar
 
-from physx_core import checkpoint
 from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, at_least, options
 from physx_core.dataset import Dataset
 from physx_core.fields import Field
 from physx_core.pipelines.interrupt import deferred_interrupt
-from physx_core.pipelines.learner import Learner, restored
+from physx_core.pipelines.learner import Learner
 from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
 from physx_core.pipelines.run_description import describe_environment_config, describe_learner
 from physx_core.pipelines.storage import (
@@ -149,10 +147,7 @@ class Prediction(Pipeline):
         network, environment = self.network_config, self.environment_config
         seed = chosen_seed(environment.seed)
         self.session = Session.existing(self.session_dir, self.session_name)
-        place = Path(network.network_dir) if network.network_dir else self.session.network_dir
-        self.learner = restored(
-            network, checkpoint.find(place, network.network_name, network.which_network)
-        )
+        self.learner = load_learner(self.session.path, network)
         config = self.dataset_config or DatasetConfig()
         self._stored, replayed = None, None
         if environment.load_samples:

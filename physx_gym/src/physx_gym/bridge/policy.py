@@ -10,9 +10,9 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from physx_core import NetworkConfig, checkpoint
+from physx_core import NetworkConfig
 from physx_core.errors import ConfigError, UsageError, listed
-from physx_core.pipelines import restored
+from physx_core.pipelines import load_learner
 from physx_core.typing import Array
 from physx_gym.bridge.space_fields import SpaceFields
 
@@ -47,12 +47,7 @@ class Policy:
             CheckpointError: There is no checkpoint, or it is damaged.
             ConfigError: The network reads what is no part of the observation.
         """
-        config = network or NetworkConfig()
-        place = Path(config.network_dir or session)
-        place = place / "network" if (place / "network").is_dir() else place
-        self._learner = restored(
-            config, checkpoint.find(place, config.network_name, config.which_network)
-        )
+        self._learner = load_learner(session, network)
         if isinstance(env, gymnasium.vector.VectorEnv):
             self._many = True
             observed, acted = env.single_observation_space, env.single_action_space

@@ -11,13 +11,27 @@ import numpy as np
 
 from physx_core import PhysxError
 from physx_core.errors import LogError
-from physx_core.simulation import World
-from physx_core.simulation import description as worlds
+from physx_core.simulation import (
+    Box,
+    Capsule,
+    Cylinder,
+    Ground,
+    HeightField,
+    JointSettings,
+    Mesh,
+    Robot,
+    Sphere,
+    Stairs,
+    World,
+    Wrench,
+)
 
 _KINDS = {
-    name: kind
-    for name, kind in vars(worlds).items()
-    if isinstance(kind, type) and dataclasses.is_dataclass(kind)
+    kind.__name__: kind
+    for kind in (
+        *(World, Robot, JointSettings, Wrench, Ground, HeightField, Stairs),
+        *(Box, Capsule, Cylinder, Mesh, Sphere),
+    )
 }
 """Descriptions that a world consists of, by name."""
 _KIND = "kind"

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from physx_core.cli.pipeline_options import argument_registry
+from physx_core.cli import argument_registry
 from physx_core.errors import ConfigError, UsageError
 from physx_core.net import TOKEN_VARIABLE
 from physx_remote.endpoints import serve

@@ -1,0 +1,50 @@
+"""Command-line arguments of the form ``NAME=VALUE``, and references to components."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import Any
+
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+
+def argument_registry() -> ConstructorRegistry:
+    """Return what reads ``NAME=VALUE ...`` and references; a context within which it does."""
+    registry = ConstructorRegistry()
+
+    @registry.primitive_rule
+    def arguments(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+        if info.type != dict[str, Any]:
+            return None
+        return PrimitiveConstructorSpec(
+            nargs="*",
+            metavar="NAME=VALUE ...",
+            instance_from_str=lambda words: dict(_argument(word) for word in words),
+            is_instance=lambda value: isinstance(value, dict),
+            str_from_instance=lambda value: [f"{name}={item}" for name, item in value.items()],
+        )
+
+    @registry.primitive_rule
+    def reference(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+        if info.type not in (str | type[Any], str | type[Any] | None):
+            return None
+        return PrimitiveConstructorSpec(
+            nargs=1,
+            metavar="REFERENCE",
+            instance_from_str=lambda words: words[0],
+            is_instance=lambda value: True,
+            str_from_instance=lambda value: [str(value)],
+        )
+
+    return registry
+
+
+def _argument(word: str) -> tuple[str, Any]:
+    """Return name and value of ``NAME=VALUE``; the value is TOML, or else a text."""
+    name, equals, text = word.partition("=")
+    if not equals:
+        raise ValueError(f"{word!r} is not NAME=VALUE")
+    try:
+        return name, tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name, text
