@@ -86,13 +86,15 @@ def _overview() -> str:
 
 def _summary(entry: EntryPoint) -> str:
     """Return the first line of a command's module, which is read but not imported."""
+    package, *module = entry.value.split(".")
     try:
-        spec = importlib.util.find_spec(entry.value)
-        source = Path(spec.origin).read_text() if spec and spec.origin else ""
-        text = (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
-    except Exception as error:  # a broken package breaks its own command only
-        return f"(broken: {error})"
-    return text.partition(": ")[2].rstrip(".")
+        spec = importlib.util.find_spec(package)
+        folders = (spec and spec.submodule_search_locations) or []
+        source = Path(folders[0], *module).with_suffix(".py").read_text()
+        text = ast.get_docstring(ast.parse(source)) or ""
+    except (ImportError, OSError, IndexError, SyntaxError, ValueError) as error:
+        return f"(broken: {error})"  # a broken package breaks its own command only
+    return text.partition("\n")[0].partition(": ")[2].rstrip(".")
 
 
 def _message(error: PhysxError, debug: bool) -> str:

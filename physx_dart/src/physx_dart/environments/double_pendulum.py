@@ -13,7 +13,7 @@ from physx_core.errors import ConfigError
 from physx_core.simulation import Robot, Simulation, World
 from physx_dart.environments.trajectories import SmoothTrajectory
 
-URDF = Path(__file__).parent / "robots" / "double_pendulum.urdf"
+URDF = Path(__file__).parents[1] / "robots" / "double_pendulum.urdf"
 """Two links of 1 kg and 0.5 m that hang down at zero."""
 
 

@@ -12,7 +12,7 @@ from physx_core.errors import MissingMeshesError, ModelError, nearest
 
 EXAMPLE_DATA = "example-robot-data"
 """Distribution with many robots, and the package that their mesh names begin with."""
-OWN_ROBOTS = Path(__file__).parent / "robots"
+OWN_ROBOTS = Path(__file__).parents[1] / "robots"
 """Folder of the robots that come with physx."""
 
 
