@@ -1,7 +1,7 @@
 """physx connects C++ physics engines with deep learning."""
 
 from . import plugins as plugins
-from .closing import Closing as Closing
+from .closeable import Closeable as Closeable
 from .components import ClientHandle as ClientHandle
 from .components import Environment as Environment
 from .components import Factory as Factory
@@ -17,7 +17,7 @@ from .config import NetworkConfig as NetworkConfig
 from .dataset import Dataset as Dataset
 from .errors import PhysxError as PhysxError
 from .fields import Field as Field
-from .openmp import rest_soon as rest_soon
+from .openmp import limit_openmp_spin as limit_openmp_spin
 from .pipelines import DataGeneration as DataGeneration
 from .pipelines import Prediction as Prediction
 from .pipelines import Replay as Replay

@@ -1,8 +1,8 @@
-"""OpenMP: how long its threads stay awake once they have nothing to do.
+"""Limits how long idle OpenMP threads spin.
 
-A library that computes in several threads, such as PyTorch, leaves them spinning for a few
-milliseconds after each piece of work, in case that more follows. They take the processor cores from
-the environments that go on meanwhile in processes of their own.
+After each parallel region, the threads of a library such as PyTorch spin for a few milliseconds in
+case more work follows. Meanwhile they take processor cores from the environments that run in
+processes of their own.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from __future__ import annotations
 import os
 
 _SPINS = "10000"
-"""About 0.2 ms: long enough for the next layer of a network, too short to hold up a simulation."""
+"""About 0.2 ms: long enough to reach a network's next layer, too short to delay a simulation."""
 
 
-def rest_soon() -> None:
-    """Have the threads of GNU's OpenMP sleep soon after their work, unless the user chose a time.
+def limit_openmp_spin() -> None:
+    """Let GNU OpenMP's threads sleep soon after their work, unless the user set a wait policy.
 
-    It holds for libraries that are loaded from now on, in this process and those that it starts.
+    This applies to libraries loaded from now on, in this process and in those that it starts.
     """
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)

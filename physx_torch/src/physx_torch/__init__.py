@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import lazy_loader
 
-from physx_core import rest_soon
+from physx_core import limit_openmp_spin
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-rest_soon()
+limit_openmp_spin()

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import DTypeLike
 
-from physx_core.closing import Closing
+from physx_core.closeable import Closeable
 from physx_core.dataset.read import strategy as policies
 from physx_core.dataset.read.cache import ColumnCache
 from physx_core.dataset.read.episodes import Episode, find_episodes
@@ -34,7 +34,7 @@ from physx_core.typing import Batch
 MAX_FILE_SIZE = 0.25
 
 
-class Dataset(Changes, Closing):
+class Dataset(Changes, Closeable):
     """A folder of partition files with its manifest; make one with `create` or `open`.
 
     A context manager. One process at a time may write; any number may read, also meanwhile. What

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from physx_core.closing import Closing
+from physx_core.closeable import Closeable
 from physx_core.simulation.description import World, Wrench
 from physx_core.simulation.dynamics import Dynamics
 from physx_core.simulation.features import FEATURES
@@ -56,7 +56,7 @@ class Backend(ABC):
         return ()
 
 
-class Simulation(Dynamics, Closing):
+class Simulation(Dynamics, Closeable):
     """One running world. A context manager; after `close` every call raises `SimulationError`.
 
     A method whose feature is not in `features` raises `FeatureNotSupportedError`.

@@ -17,7 +17,7 @@ from typing import IO
 
 import numpy as np
 
-from physx_core import Closing
+from physx_core import Closeable
 from physx_core.errors import SimulationError
 from physx_core.typing import Vector
 from physx_dart.batch.batches import Batches
@@ -37,7 +37,7 @@ _PATIENCE = 5.0
 """Time in s for which a process that closed its connection may take to end."""
 
 
-class SharedBatches(Closing):
+class SharedBatches(Closeable):
     """Batches of which this process computes some rows, and others the rest at the same time.
 
     The other processes start when they are first needed. They end when this is closed or no longer

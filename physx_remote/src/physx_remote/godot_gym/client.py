@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from physx_core import Closing, Field
+from physx_core import Closeable, Field
 from physx_core.errors import ConfigError, RemoteError, RemoteProtocolError, RequestError
 from physx_remote.godot_gym.messages import DESCRIPTION, Messages, extension
 from physx_remote.godot_gym.protocol import OUTCOME, observation_fields
@@ -22,7 +22,7 @@ Parts = dict[str, dict[str, Any] | None]
 """The parts ``agent`` and ``world`` of an answer; None for one that is not there."""
 
 
-class GodotGymClient(Closing):
+class GodotGymClient(Closeable):
     """Sends requests to a server of godot-gym and waits for the answers. A context manager.
 
     Attributes:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from physx_core import Closing, PhysxError
+from physx_core import Closeable, PhysxError
 from physx_core.errors import ConfigError, RemoteProtocolError
 from physx_core.net import Kind, pack_value
 from physx_core.typing import Array
@@ -41,7 +41,7 @@ class Rows(NamedTuple):
     infos: Sequence[dict[str, Any]]
 
 
-class PhysxClient(Closing):
+class PhysxClient(Closeable):
     """Drives the worlds of a service, any of them with one request. A context manager.
 
     Attributes:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_core import Closing
+from physx_core import Closeable
 from physx_core.errors import RemoteProtocolError
 from physx_core.net import Frame, Kind, pack_value
 from physx_core.typing import Array
@@ -53,7 +53,7 @@ class Seen:
     infos: list[dict[str, Any]]
 
 
-class PhysxObserver(Closing):
+class PhysxObserver(Closeable):
     """Gets what the acting client's requests give. A context manager.
 
     Who does not keep up loses what came in between and goes on with the present state of all

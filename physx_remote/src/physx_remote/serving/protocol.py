@@ -8,7 +8,7 @@ from importlib import import_module
 from inspect import Parameter, isabstract, signature
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from physx_core import Closing
+from physx_core import Closeable
 from physx_core.errors import ConfigError, RemoteError, UnknownOptionError, listed, nearest
 from physx_core.plugins import resolve
 
@@ -29,7 +29,7 @@ PROTOCOLS: Mapping[str, str] = {
 _LAST_PORT = 0xFFFF
 
 
-class Service(Closing):
+class Service(Closeable):
     """Environments at work for others; a context manager. Nothing happens but in calls of `poll`.
 
     Attributes:

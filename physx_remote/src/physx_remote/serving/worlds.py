@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import gymnasium
 
-from physx_core import Closing, PhysxError
+from physx_core import Closeable, PhysxError
 from physx_core.components import Environment
 from physx_core.errors import ComponentNotFoundError, ConfigError, UsageError
 from physx_core.plugins import resolve
@@ -31,7 +31,7 @@ Transition: TypeAlias = tuple[Any, float, bool, bool, dict[str, Any]]
 """Observation, reward, terminated, truncated, info."""
 
 
-class Worlds(Closing):
+class Worlds(Closeable):
     """One or several gymnasium environments with the same spaces. A context manager.
 
     What an environment raises passes through: whoever serves the worlds reports it and lives on.

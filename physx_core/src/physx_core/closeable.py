@@ -1,4 +1,4 @@
-"""What is closed at the end of a with statement."""
+"""Base class of context managers that close themselves."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from types import TracebackType
 from typing import Self
 
 
-class Closing(ABC):
-    """A context manager that closes itself."""
+class Closeable(ABC):
+    """A context manager that calls `close` at the end of its with statement."""
 
     @abstractmethod
     def close(self) -> None:
-        """Free what this holds; calling it again does nothing."""
+        """Release all resources; further calls do nothing."""
 
     def __enter__(self) -> Self:
         """Return the object itself."""
