@@ -1,5 +1,6 @@
-"""Each wheel is built and installed alone into an empty environment, as a user would do it."""
+"""Each wheel is built and installed into an empty environment, as a user would do it."""
 
+import json
 import shutil
 import subprocess
 import sys
@@ -9,12 +10,26 @@ import pytest
 
 pytestmark = pytest.mark.slow
 
+PACKAGES = ("physx_core", "physx_dart", "physx_torch", "physx_rerun", "physx_gym", "physx_remote")
+PHYSX = ("-m", "physx_core")
+GENERATE = "--batch-nb 2 --batch-size 10"
+SERVE = """
+import threading
+from physx_remote import connect, serve
+
+service = serve("CartPole-v1")
+threading.Thread(target=service.run, daemon=True).start()
+with connect("{}:{}".format(*service.address), token=service.token) as env:
+    env.reset(seed=0)
+    print(env.step(1)[1], "reward")
+"""
+
 
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory, request):
     root = request.config.rootpath
     folder = tmp_path_factory.mktemp("wheels")
-    for name in ("physx_core", "physx_dart", "physx_torch", "physx_rerun"):
+    for name in PACKAGES:
         source = shutil.copytree(root / name, folder / "src" / name)
         command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "-o", folder, source]
         subprocess.run(list(map(str, command)), check=True, capture_output=True)
@@ -36,27 +51,33 @@ def empty(tmp_path, run, wheels, root):
     return install
 
 
-def test_the_core_alone_generates_and_torch_adds_its_network(empty, run):
+def test_the_core_alone_generates_and_trains_and_torch_adds_its_network(empty, run):
     python = empty("physx_core")
-    generate = ("-m", "physx_core", "generate", "toy/spring", "--batch-nb", 2, "--batch-size", 10)
+    listed = json.loads(run("-m", "pip", "list", "--format", "json", python=python).stdout)
+    foreign = {"gymnasium", "torch", "dartpy", "pin", "rerun-sdk"}
+    assert not foreign & {package["name"] for package in listed}
+    generate = (*PHYSX, "generate", "toy/spring", "--batch-nb", 2, "--batch-size", 10)
     assert "20 samples" in run(*generate, python=python).stdout
-    train = (
-        "-m", "physx_core", "train", "sessions/data_generation", "--epoch-nb", 1,
-        "--batch-size", 5, "--network.network", "torch/fc", "--network.network-kwargs",
+
+    def train(network, *options, ok=True):
+        words = (*PHYSX, "train", "sessions/data_generation", "--epoch-nb", 1, "--batch-size", 5)
+        return run(*words, "--network.network", network, *options, python=python, ok=ok)
+
+    arguments = ("--network.network-kwargs", "net_fields=['state','force']")
+    assert "training loss" in train("toy/linear", *arguments).stdout
+    fc = (
+        "torch/fc", "--network.network-kwargs",
         "layers=[2,4,2]", "net_fields='state'", "opt_fields='next_state'",
         "--network.loss", "MSELoss", "--network.optimizer", "Adam",
     )  # fmt: skip
-    missing = run(*train, python=python, ok=False)
+    missing = train(*fc, ok=False)
     assert missing.returncode == 1 and "pip install physx-torch" in missing.stderr
-    missing = run(
-        "-m", "physx_core", "generate", "dart/arm", *generate[4:], python=python, ok=False
-    )
+    missing = run(*PHYSX, "generate", "dart/arm", *generate[4:], python=python, ok=False)
     assert missing.returncode == 1 and "pip install physx-dart" in missing.stderr
+    missing = run(*PHYSX, "serve", python=python, ok=False)
+    assert missing.returncode == 1 and "pip install physx-remote" in missing.stderr
     empty("physx_torch")
-    assert "training loss" in run(*train, python=python).stdout
-
-
-GENERATE = "--batch-nb 2 --batch-size 10"
+    assert "training loss" in train(*fc).stdout
 
 
 @pytest.mark.parametrize(
@@ -64,8 +85,15 @@ GENERATE = "--batch-nb 2 --batch-size 10"
     [
         ("physx_dart", f"generate dart/double-pendulum {GENERATE}"),
         ("physx_rerun", f"generate toy/spring {GENERATE} --environment.visualizer rerun"),
+        ("physx_gym", f"generate gym/CartPole-v1 {GENERATE}"),
     ],
 )
-def test_each_plugin_works_with_its_dependencies_alone(name, command, empty, run):
+def test_each_plugin_works_with_the_core_alone(name, command, empty, run):
     python = empty("physx_core", name)
-    assert "20 samples" in run("-m", "physx_core", *command.split(), python=python).stdout
+    assert "20 samples" in run(*PHYSX, *command.split(), python=python).stdout
+
+
+def test_remote_works_with_the_core_alone(empty, run, tmp_path):
+    python = empty("physx_core", "physx_remote")
+    (tmp_path / "program.py").write_text(SERVE)
+    assert "1.0 reward" in run("program.py", python=python).stdout

@@ -36,7 +36,7 @@ def write_film(pictures: Iterable[NDArray[np.uint8]], path: Path, frame_rate: fl
     try:
         from PIL import Image
     except ImportError as error:
-        raise MissingLibraryError("A film", "pillow", "film") from error
+        raise MissingLibraryError("A film", "pillow", "film", "physx-gym") from error
     first, *rest = [Image.fromarray(picture) for picture in pictures]
     path.parent.mkdir(parents=True, exist_ok=True)
     duration = round(1000 / frame_rate)

@@ -135,7 +135,7 @@ def _figure(count: int, show: bool) -> Figure:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise MissingLibraryError("Plotting", "matplotlib", "plot") from error
+        raise MissingLibraryError("Plotting", "matplotlib", "plot", "physx-gym") from error
     wide = min(count, _COLUMNS)
     high = -(-count // wide)
     size = (wide * _WIDTH, high * _HEIGHT)

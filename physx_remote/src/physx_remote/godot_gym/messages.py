@@ -355,7 +355,9 @@ def _message_class(parts: Mapping[str, Mapping[str, tuple[bool, str]]]) -> Any:
     try:
         from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
     except ImportError:
-        raise MissingLibraryError("The protocol godot-gym", "protobuf", "godot") from None
+        raise MissingLibraryError(
+            "The protocol godot-gym", "protobuf", "godot", "physx-remote"
+        ) from None
     file = descriptor_pb2.FileDescriptorProto(
         name="physx_remote.proto", package="physx", syntax="proto3"
     )
