@@ -115,7 +115,7 @@ def test_an_environment_plots_its_episode(tmp_path):
 
 def test_without_matplotlib_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(MissingLibraryError, match=r'pip install "physx-core\[plot\]"'):
+    with pytest.raises(MissingLibraryError, match=r'pip install "physx-gym\[plot\]"'):
         plot(log_of("a"))
 
 
