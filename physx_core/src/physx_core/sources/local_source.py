@@ -11,7 +11,7 @@ from physx_core.errors import UsageError
 from physx_core.rows import ROW_FIELDS, Columns, joined, row_of, shaped_by
 from physx_core.sources.source import Source, check_stored
 from physx_core.typing import Batch
-from physx_core.workers.instance import Instance
+from physx_core.workers.instance import Instance, instance_arguments
 
 
 class LocalSource(Source):
@@ -38,17 +38,7 @@ class LocalSource(Source):
         self._services = services
         self._config = config
         self._instances = [
-            Instance(
-                config.environment,
-                config.env_kwargs,
-                instance_id=number,
-                instance_nb=self.instance_nb,
-                seed=seed,
-                simulations_per_step=config.simulations_per_step,
-                max_wrong_samples=config.max_wrong_samples_per_step,
-                record_wrong=config.record_wrong_samples,
-                accept_all=accept_all,
-            )
+            Instance(**instance_arguments(config, number, seed, accept_all))
             for number in range(1, self.instance_nb + 1)
         ]
         self._columns: Columns | None = None

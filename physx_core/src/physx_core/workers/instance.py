@@ -9,11 +9,29 @@ from typing import Any
 
 from physx_core.components.environment import Environment, Services
 from physx_core.components.scene import Factory
+from physx_core.config import EnvironmentConfig
 from physx_core.errors import EnvironmentFailedError, PhysxError, UsageError, WrongSamplesError
 from physx_core.fields import Field
 from physx_core.plugins import resolve
 from physx_core.rows import Refused
 from physx_core.typing import Sample
+
+
+def instance_arguments(
+    config: EnvironmentConfig, instance_id: int, seed: Sequence[int], accept_all: bool
+) -> dict[str, Any]:
+    """Return the arguments of `Instance` for one instance of a configuration."""
+    return {
+        "environment": config.environment,
+        "env_kwargs": config.env_kwargs,
+        "instance_id": instance_id,
+        "instance_nb": config.num_clients,
+        "seed": list(seed),
+        "simulations_per_step": config.simulations_per_step,
+        "max_wrong_samples": config.max_wrong_samples_per_step,
+        "record_wrong": config.record_wrong_samples,
+        "accept_all": accept_all,
+    }
 
 
 class Instance:

@@ -20,6 +20,7 @@ from physx_core.net.tokens import run_token
 from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import located
+from physx_core.workers.instance import instance_arguments
 from physx_core.workers.processes.launchers import stop
 from physx_core.workers.server.client_errors import ended, silent
 from physx_core.workers.server.peer import Peer
@@ -314,15 +315,8 @@ class ClientGroup:
         config = self.config
         return encode(
             {
+                **instance_arguments(config, instance_id, self._seed, self._accepts_all),
                 "environment": located("environment", config.environment),
-                "env_kwargs": config.env_kwargs,
-                "seed": self._seed,
-                "instance_id": instance_id,
-                "instance_nb": config.num_clients,
-                "simulations_per_step": config.simulations_per_step,
-                "max_wrong_samples": config.max_wrong_samples_per_step,
-                "record_wrong": config.record_wrong_samples,
-                "accept_all": self._accepts_all,
                 "draw": config.visualizer is not None,
                 "path": [str(Path(entry).resolve()) for entry in sys.path],
                 "directory": str(Path.cwd()),
