@@ -15,7 +15,7 @@ from physx_core import (
 )
 from physx_core.errors import ConfigError, UsageError
 from physx_gym.bridge.policy import Policy, action_arrays
-from physx_gym.bridge.space_fields import SpaceFields
+from physx_gym.spaces import SpaceFields
 
 
 def lean(observation):

@@ -12,7 +12,7 @@ import pytest
 
 from physx_core.simulation import Encoder, Imu, Motor
 from physx_gym import Layer, RobotEnv
-from physx_gym.env.buffers import copied
+from physx_gym.spaces import copy_tree
 
 PROGRAM = Path(__file__).parents[1] / "programs" / "noisy_ant.py"
 program = runpy.run_path(str(PROGRAM))
@@ -140,7 +140,7 @@ def test_copies_with_motors_that_have_a_state(backend):
 
 def test_copied_trees():
     tree = {"a": np.zeros(2), "b": (np.ones(()), [np.int64(3), "text"]), "c": 4}
-    other = copied(tree)
+    other = copy_tree(tree)
     assert leaves(other["a"]) == leaves(tree["a"]) and other["b"][1] == tree["b"][1]
     assert not np.shares_memory(other["a"], tree["a"]) and other["c"] == 4
 

@@ -232,7 +232,7 @@ def test_disabled_autoreset_with_a_mask(nothing_stays_behind):
 def test_mistakes_and_failures_are_named(nothing_stays_behind):
     with pytest.raises(ConfigError, match=r"CartPole-v7.*CartPole-v1"):
         ParallelVectorEnv("CartPole-v7", 2)
-    with pytest.raises(ConfigError, match="no fixed shape"):
+    with pytest.raises(ConfigError, match="do not have a fixed shape"):
         ParallelVectorEnv(HERE + "Unstorable", 2)
     with pytest.raises(ConfigError, match="at least 1"):
         ParallelVectorEnv("CartPole-v1", 0)

@@ -14,7 +14,7 @@ from physx_core.errors import ConfigError
 from physx_core.plugins import resolve
 from physx_gym.bridge.making import make_env
 from physx_gym.bridge.policy import action_arrays
-from physx_gym.bridge.space_fields import SpaceFields
+from physx_gym.spaces import SpaceFields
 
 
 class GymEnvironment(Environment):

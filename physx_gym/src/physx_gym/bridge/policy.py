@@ -14,7 +14,7 @@ from physx_core import NetworkConfig
 from physx_core.errors import ConfigError, UsageError, listed
 from physx_core.pipelines import load_learner
 from physx_core.typing import Array
-from physx_gym.bridge.space_fields import SpaceFields
+from physx_gym.spaces import SpaceFields
 
 
 class Policy:

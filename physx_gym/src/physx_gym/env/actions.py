@@ -8,8 +8,8 @@ import numpy as np
 from gymnasium import spaces
 
 from physx_core.errors import ActionError
-from physx_gym.env.buffers import Path, fill, written
 from physx_gym.env.shared_arrays import SharedArrays
+from physx_gym.spaces import Path, fill, format_path
 
 
 class Actions(SharedArrays):
@@ -115,5 +115,5 @@ def _cut(action: Any, bounds: tuple[Any, Any] | None, out: Any) -> None:
 
 
 def _wrong(path: Path, what: str) -> ActionError:
-    entry = written(path)
+    entry = format_path(path)
     return ActionError(f"The action{entry and ' at '}{entry} {what}. See env.action_space.", entry)

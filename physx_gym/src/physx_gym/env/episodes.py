@@ -15,10 +15,11 @@ from physx_core.errors import ConfigError, EpisodeError, SimulationError
 from physx_gym.env import seeding
 from physx_gym.env import subclass_checks as inheritance
 from physx_gym.env.actions import Actions
-from physx_gym.env.buffers import ObservationChecks, copied, copier, fill, neutral
+from physx_gym.env.observation_checks import ObservationChecks
 from physx_gym.env.pipeline_env import Info, PipelineEnv, Step
 from physx_gym.simulator.periods import Periods
 from physx_gym.simulator.simulator import Simulator, simulator_of
+from physx_gym.spaces import copier, copy_tree, fill, neutral
 from physx_gym.telemetry.recording import Recording
 
 if TYPE_CHECKING:
@@ -371,7 +372,7 @@ class Episodes(PipelineEnv):
         quantities = self.__quantities
         return super()._snapshot_own() | {
             "simulator": self.simulator.snapshot(),
-            "random": copied(self.np_random.bit_generator.state),
+            "random": copy_tree(self.np_random.bit_generator.state),
             "seed": self.np_random_seed,
             "num_steps": int(self.num_steps),
             "ready": (self.__ready, self.__why),

@@ -10,8 +10,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from physx_gym.env.buffers import copied, fill
 from physx_gym.env.shared_arrays import SharedArrays
+from physx_gym.spaces import copy_tree, fill
 
 if TYPE_CHECKING:
     from physx_core.simulation import Part
@@ -294,15 +294,15 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
 
     def _snapshot_own(self) -> dict[str, Any]:
         return {
-            "action": copied(self.action),
-            "observation": copied(self.observation),
-            "memory": copied(self._memory()),
+            "action": copy_tree(self.action),
+            "observation": copy_tree(self.observation),
+            "memory": copy_tree(self._memory()),
         }
 
     def _restore_own(self, own: dict[str, Any]) -> None:
         self.action = fill(self.action, own["action"])
         self.observation = fill(self.observation, own["observation"])
-        self._recall(copied(own["memory"]))
+        self._recall(copy_tree(own["memory"]))
 
 
 def _is_own(kind: type, name: str) -> bool:

@@ -10,10 +10,10 @@ import numpy as np
 from physx_core.components import Factory
 from physx_core.errors import ConfigError, EpisodeError, UsageError
 from physx_core.typing import Vector
-from physx_gym.env.buffers import neutral
 from physx_gym.env.episodes import Episodes
 from physx_gym.env.pipeline_env import Info
 from physx_gym.simulator.boxes import action_space_of, observation_space_of, observed
+from physx_gym.spaces import neutral
 
 
 class RobotEnv(Episodes):

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from physx_core.typing import Vector
-from physx_gym.env.buffers import leaves, neutral
 from physx_gym.simulator.simulator import Simulator
+from physx_gym.spaces import leaves, neutral, value_at
 
 _MARGIN = 0.01
 """How far beyond their limits positions are still within the space, as a share of the range."""
@@ -67,19 +66,13 @@ def observed(simulator: Simulator) -> tuple[Any, Vector, dict[str, Any]]:
     """
     space = observation_space_of(simulator, 1.0)
     numbers = simulator.views_of(np.arange(len(simulator.values), dtype=np.float64))
-    places = [np.ravel(_at(numbers, path)) for path, _ in leaves(space)]
+    places = [np.ravel(value_at(numbers, path)) for path, _ in leaves(space)]
     index = np.concatenate(places).astype(np.intp)
     flat, begin = simulator.values[index], 0
     observation = neutral(space)
     for path, box in leaves(space):
         end = begin + int(np.prod(box.shape or ()))
         *parents, key = path
-        _at(observation, parents)[key] = flat[begin:end].reshape(box.shape or ())
+        value_at(observation, parents)[key] = flat[begin:end].reshape(box.shape or ())
         begin = end
     return index, flat, observation
-
-
-def _at(tree: Any, path: Sequence[Any]) -> Any:
-    for key in path:
-        tree = tree[key]
-    return tree

@@ -10,7 +10,7 @@ import numpy as np
 from physx_core import Field
 from physx_core.net import decode
 from physx_core.typing import Array
-from physx_gym.bridge.space_fields import SpaceFields
+from physx_gym.spaces import SpaceFields
 
 ROW = "row"
 """Name of the field that holds the records."""

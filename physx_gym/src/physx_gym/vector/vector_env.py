@@ -21,7 +21,7 @@ from physx_core.errors import ActionError, ConfigError, UnknownOptionError, Usag
 from physx_core.sources import ClientSource
 from physx_core.typing import Array, Batch, Sample
 from physx_gym.bridge.making import make_env
-from physx_gym.bridge.space_fields import SpaceFields
+from physx_gym.spaces import SpaceFields
 from physx_gym.vector.infos import InfoLayout
 from physx_gym.vector.rows import ROW, Info, RowLayout, text_value
 from physx_gym.vector.worker import COMMAND, FORBIDDEN, VectorWorker, packed

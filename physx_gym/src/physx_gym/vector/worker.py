@@ -14,7 +14,7 @@ from physx_core.errors import UsageError
 from physx_core.net import encode
 from physx_core.typing import Array, Sample
 from physx_gym.bridge.making import make_env
-from physx_gym.bridge.space_fields import SpaceFields
+from physx_gym.spaces import SpaceFields
 from physx_gym.vector.infos import InfoLayout
 from physx_gym.vector.rows import LENGTH, ROW, Info, RowLayout, put_text, text_value
 

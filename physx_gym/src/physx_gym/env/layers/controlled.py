@@ -7,9 +7,9 @@ from typing import Any
 from physx_core.errors import ConfigError
 from physx_core.typing import Vector
 from physx_gym.blocks.block import ControllerBlock
-from physx_gym.env.buffers import neutral
 from physx_gym.env.layers.block_layer import BlockLayer
 from physx_gym.env.layers.layer import PipelineEnv
+from physx_gym.spaces import neutral
 
 
 class ControlledEnv(BlockLayer):

@@ -13,7 +13,7 @@ import numpy as np
 from physx_core.errors import ComponentNotFoundError, ConfigError, FeatureNotSupportedError
 from physx_core.simulation import Part, Simulation
 from physx_core.typing import Records, Vector
-from physx_gym.env.buffers import copied
+from physx_gym.spaces import copy_tree
 
 if TYPE_CHECKING:
     from physx_gym.env.layers.layer import PipelineEnv
@@ -324,13 +324,13 @@ class Quantities(Mapping[str, Any]):
 
     def snapshot(self) -> Any:
         """Return what is remembered."""
-        return [(quantity, copied(kept)) for quantity, kept in self._memories.items()]
+        return [(quantity, copy_tree(kept)) for quantity, kept in self._memories.items()]
 
     def restore(self, state: Any) -> None:
         """Take up what `snapshot` returned."""
         self.reset()
         self._begins = False
-        self._memories = {quantity: copied(kept) for quantity, kept in state}
+        self._memories = {quantity: copy_tree(kept) for quantity, kept in state}
 
 
 def check_quantity(where: str, value: Any) -> Quantity:
