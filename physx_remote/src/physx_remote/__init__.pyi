@@ -3,7 +3,6 @@
 from .endpoints import connect as connect
 from .endpoints import connect_vector as connect_vector
 from .endpoints import serve as serve
-from .godot_gym.agent import RLAgent as RLAgent
 from .godot_gym.client import GodotGymClient as GodotGymClient
 from .godot_gym.client import GodotGymEnv as GodotGymEnv
 from .godot_gym.communication import Communication as Communication
@@ -11,7 +10,8 @@ from .godot_gym.environment import RLEnvironment as RLEnvironment
 from .godot_gym.frames_timer import PhysicsFramesTimer as PhysicsFramesTimer
 from .godot_gym.messages import Messages as Messages
 from .godot_gym.messages import fill as fill
-from .godot_gym.world import RLEnvWorld as RLEnvWorld
+from .godot_gym.parts import RLAgent as RLAgent
+from .godot_gym.parts import RLEnvWorld as RLEnvWorld
 from .godot_rl.client import GodotRLEnv as GodotRLEnv
 from .godot_rl.client import GodotRLVectorEnv as GodotRLVectorEnv
 from .godot_rl.launch import write_launcher as write_launcher

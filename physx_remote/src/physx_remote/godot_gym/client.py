@@ -13,7 +13,7 @@ from gymnasium import spaces
 from physx_core import Closeable, Field
 from physx_core.errors import ConfigError, RemoteError, RemoteProtocolError, RequestError
 from physx_remote.godot_gym.messages import DESCRIPTION, Messages, extension
-from physx_remote.godot_gym.protocol import OUTCOME, observation_fields
+from physx_remote.godot_gym.wire import OUTCOME, observation_fields
 from physx_remote.serving.client_link import Link
 from physx_remote.serving.framing import MAX_ANSWER
 from physx_remote.serving.spaces import Space, build_space, join, leaves, to_json

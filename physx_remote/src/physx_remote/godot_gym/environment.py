@@ -12,12 +12,11 @@ import numpy as np
 
 from physx_core.errors import RequestError, UsageError
 from physx_core.simulation import Simulation
-from physx_remote.godot_gym.agent import RLAgent
 from physx_remote.godot_gym.communication import Communication
 from physx_remote.godot_gym.frames_timer import PhysicsFramesTimer
 from physx_remote.godot_gym.messages import DESCRIPTION, Messages, encoded_extension
+from physx_remote.godot_gym.parts import RLAgent, RLEnvWorld
 from physx_remote.godot_gym.requests import as_count, as_object, as_seed, as_speed
-from physx_remote.godot_gym.world import RLEnvWorld
 from physx_remote.serving.spaces import describe_space
 
 FRAME_TIME = 1 / 60

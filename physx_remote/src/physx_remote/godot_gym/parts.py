@@ -1,0 +1,49 @@
+"""RLAgent and RLEnvWorld: the two parts of an environment that another process drives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from physx_core.errors import UsageError
+
+
+class _Part:
+    """What agents and worlds have in common; a subclass implements `get_data`."""
+
+    def get_data(self, request: Any, storage: Any) -> None:
+        """Write the requested data into the message.
+
+        Args:
+            request: Any JSON value, by convention a list of names.
+            storage: Message for this part's data; `physx_remote.fill` writes arrays into it.
+        """
+        raise UsageError(f"{type(self).__name__} does not implement get_data(request, storage).")
+
+    def reset(self, arguments: Any = None) -> None:
+        """Begin an episode; called from `RLEnvironment._reset` if the user's code calls it."""
+
+    def configure(self, configuration: Any) -> None:
+        """Apply a configuration, any JSON value."""
+
+    def _physics_process(self, delta: float) -> None:
+        """Run once in each physics frame, before physics is stepped.
+
+        Args:
+            delta: Length of the frame, in s.
+        """
+
+
+class RLAgent(_Part):
+    """What acts and observes; a subclass implements `set_action` and `get_data`."""
+
+    def set_action(self, action: Any) -> None:
+        """Set the action of the next physics steps; called once for each action.
+
+        Args:
+            action: Any JSON value, as the client sent it.
+        """
+        raise UsageError(f"{type(self).__name__} does not implement set_action(action).")
+
+
+class RLEnvWorld(_Part):
+    """The world around the agent; a subclass implements `get_data`."""
