@@ -70,9 +70,7 @@ class GymnasiumScene(RLEnvironment):
         value = self.reset_request if isinstance(self.reset_request, dict) else {}
         seed, options = value.get(self.SEED_KEY), value.get("options")
         if options is not None and not isinstance(options, dict):
-            raise RequestError(
-                f"The options of a reset must be a JSON object, not {options!r:.60}."
-            )
+            raise RequestError(f"Reset options must be a JSON object, not {options!r:.60}.")
         agent.observation, info = self.worlds.reset(0, seed, options)
         outcome.set(0.0, False, False, info)
 
