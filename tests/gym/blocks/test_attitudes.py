@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physx_core.simulation.sensors.attitudes import (
-    from_rotation_vectors,
-    product,
-    turned,
-    turned_back,
+from physx_core.rotations import (
+    from_rotation_vector_rows,
+    multiply_rows,
+    rotate_back_rows,
+    rotate_rows,
+    to_roll_pitch_yaw,
 )
 from physx_gym.blocks import mahony
 
@@ -48,7 +49,7 @@ def test_follows_a_turn_exactly_without_gains():
     state = [*begin, *rate, 0, 0, 0, *rate]
     for _ in range(400):
         state = mahony.advanced(state, [*rate, 0, 0, 0], mahony.Gains.of(0.0, 0.0, DT, 9.81))
-    end = product(begin, from_rotation_vectors(400 * DT * rate))
+    end = multiply_rows(begin, from_rotation_vector_rows(400 * DT * rate))
     assert angle(end, np.array(state[:4])) < 1e-7
 
 
@@ -57,17 +58,17 @@ def test_fast_turns_are_exact_too():
     state = mahony.advanced(
         [0, 0, 0, 1.0, *rate, 0, 0, 0, *rate], [*rate, 0, 0, 0], mahony.Gains.of(0, 0, DT, 9.81)
     )
-    assert angle(from_rotation_vectors(DT * rate), np.array(state[:4])) < 1e-7
+    assert angle(from_rotation_vector_rows(DT * rate), np.array(state[:4])) < 1e-7
 
 
 def test_finds_up_and_bias_from_acceleration():
     truth = quaternions(1, seed=3)[0]
-    seen = 9.81 * turned_back(truth, UP)
+    seen = 9.81 * rotate_back_rows(truth, UP)
     bias = np.array([0.02, -0.01, 0.03])
     state = [0.0, 0.0, 0.0, 1.0, *bias, 0, 0, 0, *bias]
     for _ in range(int(120 / DT)):
         state = mahony.advanced(state, [*bias, *seen], mahony.Gains.of(1.0, 0.1, DT, 9.81))
-    found = turned_back(np.array(state[:4]), UP)
+    found = rotate_back_rows(np.array(state[:4]), UP)
     np.testing.assert_allclose(found, seen / 9.81, atol=1e-3)
     across = bias - np.dot(bias, found) * found  # a bias about the vertical cannot be seen
     estimate = np.array(state[7:10])
@@ -86,8 +87,10 @@ def test_accelerations_count_as_far_as_they_have_the_size_of_gravity(size, share
 
 def test_upright_has_no_twist():
     for truth in quaternions(20):
-        found = np.array(mahony.upright(*(9.81 * turned_back(truth, UP))))
-        np.testing.assert_allclose(turned_back(found, UP), turned_back(truth, UP), atol=1e-12)
+        found = np.array(mahony.upright(*(9.81 * rotate_back_rows(truth, UP))))
+        np.testing.assert_allclose(
+            rotate_back_rows(found, UP), rotate_back_rows(truth, UP), atol=1e-12
+        )
         assert found[2] == 0.0
     assert mahony.upright(0.0, 0.0, -9.81) == (1.0, 0.0, 0.0, 0.0)
     assert mahony.upright(0.0, 0.0, 0.0) == (0.0, 0.0, 0.0, 1.0)
@@ -97,16 +100,20 @@ def test_without_twist_keeps_up_where_it_was():
     for truth in quaternions(20):
         found = np.array(mahony.without_twist(*truth))
         np.testing.assert_allclose(np.linalg.norm(found), 1.0)
-        np.testing.assert_allclose(turned_back(found, UP), turned_back(truth, UP), atol=1e-12)
+        np.testing.assert_allclose(
+            rotate_back_rows(found, UP), rotate_back_rows(truth, UP), atol=1e-12
+        )
         np.testing.assert_allclose(found[2], 0.0, atol=1e-15)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_roll_pitch_yaw(seed):
     roll, pitch, yaw = np.random.default_rng(seed).uniform(-1.4, 1.4, 3)
-    turns = from_rotation_vectors(np.diag([roll, pitch, yaw]))
-    whole = product(turns[2], product(turns[1], turns[0]))
-    np.testing.assert_allclose(mahony.roll_pitch_yaw(*whole), [roll, pitch, yaw], atol=1e-12)
+    turns = from_rotation_vector_rows(np.diag([roll, pitch, yaw]))
+    whole = multiply_rows(turns[2], multiply_rows(turns[1], turns[0]))
+    np.testing.assert_allclose(to_roll_pitch_yaw(whole), [roll, pitch, yaw], atol=1e-12)
     np.testing.assert_allclose(
-        turned(whole, UP), turned(turns[2], turned(turns[1], turned(turns[0], UP))), atol=1e-12
+        rotate_rows(whole, UP),
+        rotate_rows(turns[2], rotate_rows(turns[1], rotate_rows(turns[0], UP))),
+        atol=1e-12,
     )

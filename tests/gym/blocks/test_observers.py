@@ -7,7 +7,7 @@ import pytest
 
 from physx_core import Encoder, Imu
 from physx_core.errors import ConfigError, SimulationError
-from physx_core.simulation.sensors.attitudes import turned_back
+from physx_core.rotations import rotate_back_rows, to_roll_pitch_yaw
 from physx_gym import (
     BodyObserver,
     ControlledEnv,
@@ -18,7 +18,6 @@ from physx_gym import (
     RobotEnv,
     Simulator,
 )
-from physx_gym.blocks import mahony
 from physx_gym.tasks.quantities import BaseHeight, Touching
 
 DT = 0.005
@@ -76,7 +75,7 @@ def errors(env, size, rest=0):
     """Return the largest error of roll, pitch and yaw over 200 steps, and the largest tilt."""
     worst = tilt = 0.0
     for observed in swaying(env, 200, size, rest):
-        truth = np.array(mahony.roll_pitch_yaw(*env.robot_state.q[3:7]))
+        truth = np.array(to_roll_pitch_yaw(env.robot_state.q[3:7]))
         tilt = max(tilt, np.abs(truth[:2]).max())
         for name in ("mahony", "bodies"):
             found = observed["features"][name]["roll_pitch_yaw"][:, 0]
@@ -105,7 +104,7 @@ def test_links_between_encoders():
         seen = observed["features"]["bodies"]
         truth = simulation.body_poses(bodies)[:, 3:]
         assert turn_between(seen["orientation"].T, truth).max() < 5e-3
-        rates = turned_back(truth, simulation.body_velocities(bodies)[:, 3:])
+        rates = rotate_back_rows(truth, simulation.body_velocities(bodies)[:, 3:])
         np.testing.assert_allclose(seen["angular_velocity"].T, rates, atol=0.05)
 
 
@@ -139,7 +138,7 @@ def test_begin_without_orientation_and_without_twist():
         seen = observed["features"]["mahony"]["orientation"][:, 0]
         assert seen[2] == 0.0
         up = np.array([0.0, 0.0, 1.0])
-        found, truth = turned_back(seen, up), turned_back(env.robot_state.q[3:7], up)
+        found, truth = rotate_back_rows(seen, up), rotate_back_rows(env.robot_state.q[3:7], up)
         assert np.linalg.norm(found - truth) < 0.2
     exact = walker(filtered={"exact_init": True})
     observed, _ = exact.reset(seed=0)

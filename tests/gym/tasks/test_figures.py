@@ -14,8 +14,8 @@ import pytest
 from gymnasium import spaces
 
 from physx_core.errors import SimulationError, VisualizerError
+from physx_core.rotations import from_rotation_vector_rows, multiply_rows, to_matrix_rows
 from physx_core.simulation import Encoder, Imu, Motor, Wrench
-from physx_core.simulation.sensors.attitudes import from_rotation_vectors, product
 from physx_gym import ControlledEnv, PDController, RobotEnv, Simulator, read_log
 from physx_gym.tasks.quantities import BodyPoses, geometry
 from physx_gym.tasks.terminations import lost_ground, roll_pitch, unsafe_joints
@@ -249,11 +249,11 @@ def test_differences_of_poses_agree_with_pinocchio():
         np.testing.assert_allclose(row[3:], pin.log3(turn), rtol=1e-7, atol=1e-9)
         np.testing.assert_allclose(row[:3], b[:3] - a[:3], rtol=1e-7)
     vectors = rng.normal(size=(200, 3))
-    turns = from_rotation_vectors(vectors)
+    turns = from_rotation_vector_rows(vectors)
     exact = np.array([pin.exp3(vector) for vector in vectors])
-    np.testing.assert_allclose(geometry.matrices(turns), exact, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(to_matrix_rows(turns), exact, rtol=1e-7, atol=1e-9)
     both = np.array([a @ b for a, b in zip(exact, exact[::-1], strict=True)])
-    found = geometry.matrices(product(turns, turns[::-1]))
+    found = to_matrix_rows(multiply_rows(turns, turns[::-1]))
     np.testing.assert_allclose(found, both, rtol=1e-7, atol=1e-9)
 
 

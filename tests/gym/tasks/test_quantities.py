@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from physx_core import rotations
 from physx_core.errors import ComponentNotFoundError, ConfigError, FeatureNotSupportedError
 from physx_dart.shared.robot_files import find_robot
 from physx_gym import RobotEnv, Simulator
@@ -306,17 +307,15 @@ def test_rotations_agree_with_pinocchio():
     rng = np.random.default_rng(0)
     q = rng.normal(size=(200, 4))
     q /= np.linalg.norm(q, axis=1, keepdims=True)
-    rotations = [pin.Quaternion(row).matrix() for row in q]
-    logs = np.array([pin.log3(rotation) for rotation in rotations])
-    np.testing.assert_allclose(geometry.matrices(q), rotations, atol=1e-12)
-    np.testing.assert_allclose(geometry.rotation_vectors(q), logs, rtol=1e-7, atol=1e-9)
+    matrices = [pin.Quaternion(row).matrix() for row in q]
+    logs = np.array([pin.log3(matrix) for matrix in matrices])
+    np.testing.assert_allclose(rotations.to_matrix_rows(q), matrices, atol=1e-12)
+    np.testing.assert_allclose(rotations.to_rotation_vector_rows(q), logs, rtol=1e-7, atol=1e-9)
     small = np.array([[1e-9, 0.0, 0.0, 1.0]])
-    np.testing.assert_allclose(geometry.rotation_vectors(small), [[2e-9, 0, 0]], rtol=1e-6)
-    angles = np.array([pin.rpy.matrixToRpy(rotation) for rotation in rotations])
-    np.testing.assert_allclose(geometry.roll_pitch_yaw(q), angles, rtol=1e-7, atol=1e-9)
-    mean = geometry.mean_quaternion(
-        np.array([[0, 0, np.sin(a), np.cos(a)] for a in (0.1, 0.2, 0.3)])
-    )
+    np.testing.assert_allclose(rotations.to_rotation_vector_rows(small), [[2e-9, 0, 0]], rtol=1e-6)
+    angles = np.array([pin.rpy.matrixToRpy(matrix) for matrix in matrices])
+    np.testing.assert_allclose(rotations.to_roll_pitch_yaw_rows(q), angles, rtol=1e-7, atol=1e-9)
+    mean = rotations.mean(np.array([[0, 0, np.sin(a), np.cos(a)] for a in (0.1, 0.2, 0.3)]))
     np.testing.assert_allclose(mean, [0, 0, np.sin(0.2), np.cos(0.2)], atol=1e-12)
     step = geometry.odometry_difference(np.array([1.0, 1.0, np.pi / 2]), np.zeros(3))
     np.testing.assert_allclose(step, [np.sqrt(2), 0.0, np.pi / 2], atol=1e-12)

@@ -1,6 +1,5 @@
 """Worlds, engines, motors, and sensors."""
 
-from . import rotations as rotations
 from .backend import Backend as Backend
 from .backend import Hook as Hook
 from .backend import Simulation as Simulation

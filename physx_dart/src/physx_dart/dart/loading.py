@@ -14,10 +14,10 @@ import numpy as np
 from dartpy import dynamics, utils
 
 from physx_core.errors import ModelError
+from physx_core.rotations import to_matrix
 from physx_core.simulation import Ground, HeightField, Stairs
 from physx_core.typing import Vector
 from physx_dart.shared.parts import Mover, Static
-from physx_dart.shared.rotations import matrix_from_quaternion
 from physx_dart.shared.shapes import Shape
 
 WORLD = "world"
@@ -45,7 +45,7 @@ def load_skeleton(mover: Mover) -> dynamics.Skeleton:
         text = text.replace(f'<link name="{WORLD}">', f'<link name="{ROOT}">')
     skeleton = _parsed(text, mover.fixed_base, str(model.path))
     if mover.fixed_base:
-        place = _transform(mover.position, matrix_from_quaternion(np.array(mover.orientation)))
+        place = _transform(mover.position, to_matrix(mover.orientation))
         skeleton.getRootJoint().setTransformFromParentBodyNode(place)
     skeleton.setName(mover.name)
     return skeleton
@@ -77,7 +77,7 @@ def static_skeleton(static: Static) -> dynamics.Skeleton:
     """
     skeleton = dynamics.Skeleton(static.name)
     joint, body = skeleton.createWeldJointAndBodyNodePair()
-    rotation = matrix_from_quaternion(np.array(static.orientation))
+    rotation = to_matrix(static.orientation)
     joint.setTransformFromParentBodyNode(_transform(static.position, rotation))
     what = static.what
     if isinstance(what, Shape):

@@ -8,18 +8,17 @@ from typing import Any
 import numpy as np
 from dartpy import dynamics
 
-from physx_core.simulation.rotations import turned_back
+from physx_core.rotations import (
+    from_matrix_rows,
+    from_rotation_vector,
+    rotate_back,
+    to_matrix,
+    to_rotation_vector,
+)
 from physx_core.typing import Vector
 from physx_dart.dart.loading import link_name, load_skeleton
-from physx_dart.shared.engine import RobotEngine
+from physx_dart.shared.engine import RobotEngine, base_accelerations
 from physx_dart.shared.parts import Mover
-from physx_dart.shared.rotations import (
-    base_accelerations,
-    matrix_from_quaternion,
-    poses_from_matrices,
-    quaternion_of,
-    vector_from_quaternion,
-)
 from physx_dart.shared.urdf import Joint
 
 _ACTUATORS = {
@@ -73,7 +72,7 @@ class DartRobot(RobotEngine):
     def _attitude(self) -> tuple[float, ...]:
         """Return the base's quaternion x, y, z, w."""
         if self._quaternion is None:
-            self._quaternion = quaternion_of(*self._q[:3].tolist())
+            self._quaternion = from_rotation_vector(*self._q[:3].tolist())
         return self._quaternion
 
     def positions(self) -> Vector:
@@ -100,14 +99,14 @@ class DartRobot(RobotEngine):
         x, y, z, *linear = a[:6].tolist()
         attitude = self._attitude()
         change = base_accelerations(attitude, linear, self.velocities())
-        a[:6] = (*change, *turned_back(attitude, x, y, z))
+        a[:6] = (*change, *rotate_back(attitude, x, y, z))
         return a
 
     def _in_base(self, v: Vector) -> Vector:
         """Turn a base's angular and linear motion in the world into linear, angular in its own."""
         x, y, z, a, b, c = v[:6].tolist()
         attitude = self._attitude()
-        v[:6] = (*turned_back(attitude, a, b, c), *turned_back(attitude, x, y, z))
+        v[:6] = (*rotate_back(attitude, a, b, c), *rotate_back(attitude, x, y, z))
         return v
 
     def write(self, positions: Vector, velocities: Vector) -> None:
@@ -158,8 +157,9 @@ class DartRobot(RobotEngine):
     def poses(self, positions: Vector) -> Vector:
         """Return the poses of all links in positions, shape (links, 7)."""
         self._place(self._shadow, positions, np.zeros(self.nv))
-        transforms = [body.getWorldTransform().matrix() for body in self._links]
-        return poses_from_matrices(np.array(transforms))
+        transforms = np.array([body.getWorldTransform().matrix() for body in self._links])
+        quaternions = from_matrix_rows(transforms[:, :3, :3])
+        return np.concatenate([transforms[:, :3, 3], quaternions], axis=1)
 
     def forward(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
         """Return the accelerations that torques cause, resistance included."""
@@ -194,8 +194,8 @@ class DartRobot(RobotEngine):
         rotation = None
         if not self.fixed_base:
             quaternion = positions[3:7] / np.linalg.norm(positions[3:7])
-            rotation = matrix_from_quaternion(quaternion)
-            vector = vector_from_quaternion(quaternion)
+            rotation = to_matrix(quaternion)
+            vector = to_rotation_vector(quaternion)
             positions = np.concatenate([vector, positions[:3], positions[7:]])
             twist = velocities
             velocities = np.concatenate([rotation @ twist[3:6], rotation @ twist[:3], twist[6:]])

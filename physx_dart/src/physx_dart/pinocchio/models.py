@@ -8,9 +8,9 @@ import numpy as np
 import pinocchio
 
 from physx_core.errors import ModelError
+from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
 from physx_dart.shared.parts import Mover
-from physx_dart.shared.rotations import matrix_from_quaternion
 
 _TRANSLATION, _ROTATION = "physx translation", "physx rotation"
 _LINK = "physx link "
@@ -72,7 +72,7 @@ def _parsed(mover: Mover, *root: Any) -> Any:
 
 def _weld(model: Any, mover: Mover) -> None:
     """Move the root of a robot with a fixed base to its place."""
-    rotation = matrix_from_quaternion(np.array(mover.orientation))
+    rotation = to_matrix(mover.orientation)
     base = pinocchio.SE3(rotation, np.array(mover.position))
     for joint in range(1, model.njoints):
         if model.parents[joint] == 0:

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
+from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
 from physx_dart.shared.meshes import read_vertices
 from physx_dart.shared.parts import Mover
-from physx_dart.shared.rotations import matrix_from_quaternion
 from physx_dart.shared.shapes import Shape
 
 
@@ -31,7 +31,7 @@ class Reach:
         found = [-math.inf]
         for (link, shape), corners in zip(self._shapes, self._corners, strict=True):
             pose = poses[link]
-            along = direction @ matrix_from_quaternion(pose[3:])
+            along = direction @ to_matrix(pose[3:])
             middle = float(direction @ pose[:3] + along @ shape.position)
             local = along @ shape.rotation
             if corners is not None:

@@ -15,17 +15,16 @@ import numpy as np
 import pinocchio
 from numpy import add, multiply
 
+from physx_core.rotations import rotate, rotate_back, to_matrix
 from physx_core.simulation import CONTACT, World
-from physx_core.simulation.rotations import turned, turned_back
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.contacts import ContactFinder, Places, Touching
 from physx_dart.pinocchio.limits import JointConstraints, solve
 from physx_dart.pinocchio.models import frames_of, load_stepping_model
 from physx_dart.pinocchio.solver import ImpulseSolver
 from physx_dart.shared.algorithms import MoverAlgorithms
-from physx_dart.shared.engine import RobotEngine
+from physx_dart.shared.engine import RobotEngine, base_accelerations
 from physx_dart.shared.parts import Mover, Static
-from physx_dart.shared.rotations import base_accelerations, matrix_from_quaternion
 
 _UNSEEN = 10
 """Steps after which it is seen whether a limit might have acted."""
@@ -322,7 +321,7 @@ class PinocchioRobot(RobotEngine):
             return self._velocities.copy()
         if self._turned is not self._velocities:
             self._turned, self._twist = self._velocities, self._velocities.copy()
-            self._twist[:3] = turned_back(self._positions[3:7].tolist(), *self._twist[:3].tolist())
+            self._twist[:3] = rotate_back(self._positions[3:7].tolist(), *self._twist[:3].tolist())
         return self._twist.copy()
 
     def accelerations(self) -> Vector:
@@ -331,7 +330,7 @@ class PinocchioRobot(RobotEngine):
         if not self.base:
             return a
         earlier, now = self._earlier[3:7].tolist(), self._positions[3:7].tolist()
-        x, y, z = turned_back(now, *turned(earlier, *self._before[3:6].tolist()))
+        x, y, z = rotate_back(now, *rotate(earlier, *self._before[3:6].tolist()))
         p, q, r = self._velocities[3:6].tolist()
         change = base_accelerations(now, a[:3].tolist(), self.velocities())
         pace = 1 / self._period
@@ -342,7 +341,7 @@ class PinocchioRobot(RobotEngine):
         """Set the state."""
         self._positions, self._velocities = positions.copy(), velocities.copy()
         if self.base:
-            rotation = matrix_from_quaternion(positions[3:7])
+            rotation = to_matrix(positions[3:7])
             self._velocities[:3] = rotation @ velocities[:3]
         self._earlier, self._before = self._positions, self._velocities
         self._touching, self._safe_steps = None, 0

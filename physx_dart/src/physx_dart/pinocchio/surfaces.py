@@ -10,10 +10,10 @@ from typing import ClassVar
 import numpy as np
 
 from physx_core.errors import FeatureNotSupportedError
+from physx_core.rotations import to_matrix
 from physx_core.simulation import Ground, HeightField, Stairs
 from physx_core.typing import Vector
 from physx_dart.shared.parts import Static
-from physx_dart.shared.rotations import matrix_from_quaternion
 from physx_dart.shared.shapes import Shape
 
 
@@ -117,7 +117,7 @@ def surfaces_of(static: Static, engine: str, features: Sequence[str]) -> list[Su
         return found
     if what.kind == "mesh":
         raise FeatureNotSupportedError(engine, "mesh_contacts", features, "Use a box instead.")
-    rotation = matrix_from_quaternion(np.array(static.orientation))
+    rotation = to_matrix(static.orientation)
     return [Solid(what, np.array(static.position), rotation)]
 
 

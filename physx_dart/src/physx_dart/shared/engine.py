@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import numpy as np
 
+from physx_core.rotations import Triple, cross, rotate_back
 from physx_core.typing import Vector
 from physx_dart.pinocchio.resistance import Resistance
 from physx_dart.shared.parts import Mover
@@ -102,3 +104,19 @@ class RobotEngine(ABC):
     @abstractmethod
     def inverse(self, positions: Vector, velocities: Vector, accelerations: Vector) -> Vector:
         """Return the torques that cause accelerations, resistance included."""
+
+
+def base_accelerations(
+    orientation: Sequence[float], linear: Sequence[float], twist: Vector
+) -> Triple:
+    """Return the derivative of the linear part of a base's twist, along its own axes, in m/s².
+
+    Args:
+        orientation: Quaternion x, y, z, w of the base.
+        linear: Acceleration of its origin along the world's axes, in m/s².
+        twist: Its linear, then its angular velocity along its own axes; more may follow.
+    """
+    u, v, w, p, q, r = twist[:6].tolist()
+    a, b, c = rotate_back(orientation, *linear)
+    x, y, z = cross(p, q, r, u, v, w)
+    return a - x, b - y, c - z

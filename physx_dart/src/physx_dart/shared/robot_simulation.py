@@ -12,14 +12,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from physx_core.errors import SimulationError, listed
+from physx_core.rotations import cross, to_matrix
 from physx_core.simulation import CONTACT, FEATURES, Hook, State, Wrench, finite_vector
-from physx_core.simulation.rotations import cross
 from physx_core.typing import Records, Vector
 from physx_dart.shared.checks import integer
 from physx_dart.shared.engine import RobotEngine
 from physx_dart.shared.influences import Hooks, Wrenches
 from physx_dart.shared.parts import Parts
-from physx_dart.shared.rotations import matrix_from_quaternion
 from physx_dart.shared.world_state import WorldState
 
 _FASTEST = 1e8
@@ -334,7 +333,7 @@ class RobotSimulation(WorldState):
                     _add(found, body, acting, cross(x - a, y - b, z - c, *acting))
         for wrench, force, torque in self._wrenches.before(self._frame):
             body = self._places[wrench.body]
-            turn = matrix_from_quaternion(poses[body, 3:])
+            turn = to_matrix(poses[body, 3:])
             if wrench.frame == "body":
                 force, torque = turn @ force, turn @ torque
             arm = turn @ wrench.point

@@ -10,11 +10,11 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from physx_core.errors import ModelError, listed, nearest
+from physx_core.rotations import from_roll_pitch_yaw, to_matrix
 from physx_core.simulation import Box, Capsule, Cylinder, Mesh, Robot, Sphere, WorldObject
 from physx_core.typing import Vector
 from physx_dart.shared.meshes import bounding_box, bounding_capsule, read_vertices
 from physx_dart.shared.robot_files import mesh_path
-from physx_dart.shared.rotations import matrix_from_quaternion
 
 _OPTIONS: dict[str, tuple[str, ...]] = {
     "box": ("size",),
@@ -151,7 +151,9 @@ def _read(robot: Robot, path: Path, link: str, element: Element) -> Shape:
         for name in ("xyz", "rpy")
     )
     material = robot.friction, robot.restitution
-    return Shape(tag, size, np.array(xyz), rotation_of(rpy), link, *material, mesh)
+    return Shape(
+        tag, size, np.array(xyz), to_matrix(from_roll_pitch_yaw(*rpy)), link, *material, mesh
+    )
 
 
 def _floats(link: str, name: str, text: str, count: int | None) -> list[float]:
@@ -186,15 +188,3 @@ def _replaced(shape: Shape, collisions: str) -> Shape:
         rotation=shape.rotation @ axes,
         mesh=None,
     )
-
-
-def rotation_of(rpy: list[float]) -> Vector:
-    """Return the matrix, shape (3, 3), of roll, pitch and yaw as URDF files give them, in rad."""
-    if not any(rpy):
-        return np.eye(3)
-    roll, pitch, yaw = (0.5 * angle for angle in rpy)
-    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
-    cy, sy = math.cos(yaw), math.sin(yaw)
-    x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
-    z, w = cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy
-    return matrix_from_quaternion((x, y, z, w))

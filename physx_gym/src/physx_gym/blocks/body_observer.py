@@ -9,12 +9,12 @@ import numpy as np
 from gymnasium import spaces
 
 from physx_core.errors import ConfigError
+from physx_core.rotations import invert, multiply, rotate_back, to_roll_pitch_yaw
 from physx_core.simulation import Imu
 from physx_gym.blocks.block import ObserverBlock
-from physx_gym.blocks.mahony import roll_pitch_yaw
 from physx_gym.blocks.mahony_filter import MahonyFilter
 from physx_gym.blocks.motor_joints import JointEncoders
-from physx_gym.blocks.turning import Turning, inverse, product, turned
+from physx_gym.blocks.turning import Turning
 
 if TYPE_CHECKING:
     from physx_gym.env.layers.layer import PipelineEnv
@@ -71,7 +71,7 @@ class BodyObserver(ObserverBlock):
         simulator = self.env.simulator
         imus = [each for each in simulator.sensors if type(each) is Imu]
         self.bodies = self._wanted or tuple(dict.fromkeys(imu.body for imu in imus))
-        self._offsets = [inverse(imu.rotation) for imu in imus]
+        self._offsets = [invert(imu.rotation) for imu in imus]
         self._ways: list[tuple[int, Turning, list[int]]] = []
         joints: dict[str, int] = {}
         for body in self.bodies:
@@ -118,8 +118,8 @@ class BodyObserver(ObserverBlock):
         for place, way, columns in self._ways:
             offset = self._offsets[place]
             body, rate = way.carry(
-                product(attitudes[place], offset),
-                turned(inverse(offset), turns[place]),
+                multiply(attitudes[place], offset),
+                rotate_back(offset, *turns[place]),
                 [angles[column] for column in columns],
                 [rates[column] for column in columns],
             )
@@ -127,4 +127,4 @@ class BodyObserver(ObserverBlock):
         self.observation["orientation"].T[:] = [body for body, _ in found]
         self.observation["angular_velocity"].T[:] = [rate for _, rate in found]
         if self.compute_rpy:
-            self.observation["roll_pitch_yaw"].T[:] = [roll_pitch_yaw(*body) for body, _ in found]
+            self.observation["roll_pitch_yaw"].T[:] = [to_roll_pitch_yaw(body) for body, _ in found]

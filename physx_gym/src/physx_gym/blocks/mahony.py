@@ -14,11 +14,13 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from physx_core.simulation.sensors.attitudes import (
-    cross,
-    from_rotation_vectors,
-    product,
-    turned_back,
+from physx_core.rotations import (
+    IDENTITY,
+    Quaternion,
+    cross_rows,
+    from_rotation_vector_rows,
+    multiply_rows,
+    rotate_back_rows,
 )
 from physx_core.typing import Vector
 
@@ -116,33 +118,33 @@ def advanced_rows(states: Vector, measured: Vector, gains: Gains) -> Vector:
     squares = np.einsum("ij,ij->i", accelerations, accelerations)
     weights = np.maximum(gravity - 2 * np.abs(squares - gravity), 0.0)
     weights /= np.where(weights > 0, gravity * np.sqrt(squares), 1.0)
-    up = turned_back(attitudes, np.broadcast_to(_UP, rates.shape))
-    errors = cross(accelerations, up) * weights[:, None]
+    up = rotate_back_rows(attitudes, np.broadcast_to(_UP, rates.shape))
+    errors = cross_rows(accelerations, up) * weights[:, None]
     halves = half * (0.5 * (last + rates) - biases) + gains.turn * errors
-    attitudes = product(attitudes, from_rotation_vectors(2 * halves))
+    attitudes = multiply_rows(attitudes, from_rotation_vector_rows(2 * halves))
     attitudes /= np.sqrt(np.einsum("ij,ij->i", attitudes, attitudes))[:, None]
     biases = biases - gains.bias * errors
     return np.concatenate([attitudes, rates - biases, biases, rates], axis=1)
 
 
-def unit(x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
+def unit(x: float, y: float, z: float, w: float) -> Quaternion:
     """Return a quaternion with the length 1."""
     scale = 1.0 / math.sqrt(x * x + y * y + z * z + w * w)
     return x * scale, y * scale, z * scale, w * scale
 
 
-def upright(ax: float, ay: float, az: float) -> tuple[float, float, float, float]:
+def upright(ax: float, ay: float, az: float) -> Quaternion:
     """Return the attitude without twist at which an acceleration at rest points up."""
     length = math.sqrt(ax * ax + ay * ay + az * az)
     if length <= _WEIGHTLESS:
-        return 0.0, 0.0, 0.0, 1.0
+        return IDENTITY
     ax, ay, az = ax / length, ay / length, az / length
     if az < -1 + 1e-9:
         return 1.0, 0.0, 0.0, 0.0
     return unit(ay, -ax, 0.0, 1 + az)
 
 
-def without_twist(x: float, y: float, z: float, w: float) -> tuple[float, float, float, float]:
+def without_twist(x: float, y: float, z: float, w: float) -> Quaternion:
     """Return a quaternion without its turn about the vertical, which is made first.
 
     Of ``q = twist * tilt`` it is the tilt, so where up is in the sensor's frame stays as it was.
@@ -152,11 +154,3 @@ def without_twist(x: float, y: float, z: float, w: float) -> tuple[float, float,
         return x, y, z, w
     c, s = w / length, -z / length
     return c * x - s * y, c * y + s * x, 0.0, length
-
-
-def roll_pitch_yaw(x: float, y: float, z: float, w: float) -> tuple[float, float, float]:
-    """Return the angles of a quaternion, in rad: turned by roll, then pitch, then yaw."""
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return roll, pitch, yaw

@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from physx_core import checks
 from physx_core.errors import ConfigError
+from physx_core.rotations import to_roll_pitch_yaw
 from physx_core.simulation import Imu
 from physx_core.typing import Vector
 from physx_gym.blocks.block import ObserverBlock
@@ -19,7 +20,6 @@ from physx_gym.blocks.mahony import (
     Gains,
     advanced,
     advanced_rows,
-    roll_pitch_yaw,
     upright,
     without_twist,
 )
@@ -179,4 +179,4 @@ class MahonyFilter(ObserverBlock):
             if self.ignore_twist:
                 attitude = column[:4] = without_twist(*attitude)
             if self.compute_rpy:
-                column[13:] = roll_pitch_yaw(*attitude)
+                column[13:] = to_roll_pitch_yaw(attitude)

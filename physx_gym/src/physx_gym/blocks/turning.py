@@ -7,46 +7,23 @@ Quaternions are x, y, z, w, in plain numbers, as there are few of them.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from physx_core.errors import FeatureNotSupportedError
+from physx_core.rotations import (
+    IDENTITY,
+    Quaternion,
+    Triple,
+    from_axis_angle,
+    invert,
+    multiply,
+    rotate,
+    rotate_back,
+)
 from physx_core.simulation import Simulation
 from physx_core.typing import Vector
-
-Quaternion = tuple[float, float, float, float]
-Axis = tuple[float, float, float]
-
-
-def product(a: Sequence[float], b: Sequence[float]) -> Quaternion:
-    """Return the quaternion that turns by `b`, then by `a`."""
-    ax, ay, az, aw = a
-    bx, by, bz, bw = b
-    return (
-        ax * bw + aw * bx + ay * bz - az * by,
-        ay * bw + aw * by + az * bx - ax * bz,
-        az * bw + aw * bz + ax * by - ay * bx,
-        aw * bw - ax * bx - ay * by - az * bz,
-    )
-
-
-def inverse(q: Sequence[float]) -> Quaternion:
-    """Return the quaternion that turns back."""
-    return -q[0], -q[1], -q[2], q[3]
-
-
-def turned(q: Sequence[float], vector: Sequence[float]) -> Axis:
-    """Return a vector turned by a quaternion."""
-    x, y, z, _ = product(product(q, (*vector, 0.0)), inverse(q))
-    return x, y, z
-
-
-def about(axis: Axis, angle: float) -> Quaternion:
-    """Return the turn about an axis of length 1 by an angle, in rad."""
-    s = math.sin(0.5 * angle)
-    return s * axis[0], s * axis[1], s * axis[2], math.cos(0.5 * angle)
 
 
 class Turning:
@@ -69,9 +46,9 @@ class Turning:
             SimulationError: There is no link of such a name.
         """
         self.joints: tuple[str, ...] = ()
-        self._up: list[tuple[int, Axis]] = []
-        self._down: list[tuple[int, Axis]] = []
-        self._before = self._after = (0.0, 0.0, 0.0, 1.0)
+        self._up: list[tuple[int, Triple]] = []
+        self._down: list[tuple[int, Triple]] = []
+        self._before = self._after = IDENTITY
         if known == wanted:
             return
         if "jacobian" not in simulation.features:
@@ -93,7 +70,7 @@ class Turning:
         rate: Sequence[float],
         angles: Sequence[float],
         rates: Sequence[float],
-    ) -> tuple[Quaternion, Axis]:
+    ) -> tuple[Quaternion, Triple]:
         """Return attitude and angular velocity of the wanted link.
 
         Args:
@@ -109,23 +86,23 @@ class Turning:
             return attitude, (rate[0], rate[1], rate[2])
         first, back = _walked(self._up, angles, rates)
         second, forth = _walked(self._down, angles, rates)
-        first, second = product(first, self._before), product(second, self._after)
-        common = turned(first, rate)
+        first, second = multiply(first, self._before), multiply(second, self._after)
+        common = rotate(first, *rate)
         moved = [c - b + f for c, b, f in zip(common, back, forth, strict=True)]
-        whole = product(attitude, product(inverse(first), second))
-        return whole, turned(inverse(second), moved)
+        whole = multiply(attitude, multiply(invert(first), second))
+        return whole, rotate_back(second, *moved)
 
 
 def _walked(
-    chain: list[tuple[int, Axis]], angles: Sequence[float], rates: Sequence[float]
-) -> tuple[Quaternion, Axis]:
+    chain: list[tuple[int, Triple]], angles: Sequence[float], rates: Sequence[float]
+) -> tuple[Quaternion, Triple]:
     """Return the turn of a chain of joints, and the angular velocity at its end."""
-    turn: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    turn: Quaternion = IDENTITY
     wx = wy = wz = 0.0
     for place, axis in chain:
-        x, y, z = turned(turn, axis)
+        x, y, z = rotate(turn, *axis)
         wx, wy, wz = wx + x * rates[place], wy + y * rates[place], wz + z * rates[place]
-        turn = product(turn, about(axis, angles[place]))
+        turn = multiply(turn, from_axis_angle(axis, angles[place]))
     return turn, (wx, wy, wz)
 
 
@@ -138,7 +115,7 @@ def _reference(simulation: Simulation) -> Vector:
     return found
 
 
-def _axes(simulation: Simulation, body: str, reference: Vector) -> dict[str, Axis]:
+def _axes(simulation: Simulation, body: str, reference: Vector) -> dict[str, Triple]:
     """Return the axes of the joints that turn a link, those close to the base first."""
     jacobian = simulation.jacobian(body, reference)[3:]
     found = {}

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from physx_core.rotations import rotate_back_rows
 from physx_core.simulation import Ground, Robot, World
-from physx_core.simulation.sensors.attitudes import turned_back
 from physx_core.typing import Vector
 from physx_gym.env.layers.layer import Info
 from physx_gym.env.robot_env import RobotEnv
@@ -92,7 +92,7 @@ class QuadrupedEnv(RobotEnv):
         """Observe attitude, velocities, joints and the last action."""
         state, seen = measurement["states"]["agent"], self.observation
         q, v = state["q"], state["v"]
-        seen[:3] = turned_back(q[np.newaxis, 3:7], _UP)[0]
+        seen[:3] = rotate_back_rows(q[np.newaxis, 3:7], _UP)[0]
         seen[3:9] = v[:6]
         np.subtract(q[7:], self._stand, out=seen[9:21])
         seen[21:33], seen[33:] = v[6:], self._previous

@@ -12,10 +12,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from physx_core.errors import ConfigError, FeatureNotSupportedError
+from physx_core.rotations import IDENTITY, cross, multiply, rotate, rotate_back
 from physx_core.simulation.backend import Simulation
 from physx_core.simulation.description import World
 from physx_core.simulation.devices import as_slice, places_of
-from physx_core.simulation.rotations import cross, product, turned, turned_back
 from physx_core.simulation.sensors.sensor import (
     ContactSensor,
     EffortSensor,
@@ -25,9 +25,6 @@ from physx_core.simulation.sensors.sensor import (
     Sensor,
 )
 from physx_core.typing import Vector
-
-_AHEAD = (0.0, 0.0, 0.0, 1.0)
-"""Quaternion of no rotation."""
 
 
 class Truth(Protocol):
@@ -63,7 +60,7 @@ class ImuTruth:
         self._bodies = [sensor.body for sensor in sensors]
         places_of("body", self._bodies, simulation.layout.names)
         self._arms = [_unless(sensor.position, (0.0, 0.0, 0.0)) for sensor in sensors]
-        self._rotations = [_unless(sensor.rotation, _AHEAD) for sensor in sensors]
+        self._rotations = [_unless(sensor.rotation, IDENTITY) for sensor in sensors]
         self._gravity = tuple(float(part) for part in world.gravity)
         layout = simulation.layout
         floating = [part for part in layout.parts.values() if part.floating]
@@ -89,7 +86,7 @@ class ImuTruth:
             g, h, o, p, q, r = state[1][first : first + 6].tolist()
             a, b, c, d, e, f = state[2][first : first + 6].tolist()
             # The velocity is along axes that turn themselves.
-            i, j, k = turned_back(attitude, *self._gravity)
+            i, j, k = rotate_back(attitude, *self._gravity)
             s, t, u = cross(p, q, r, g, h, o)
             a, b, c = a + s - i, b + t - j, c + u - k
             arm, rotation = self._arms[row], self._rotations[row]
@@ -98,9 +95,9 @@ class ImuTruth:
                 s, t, u = cross(p, q, r, *cross(p, q, r, *arm))
                 a, b, c = a + i + s, b + j + t, c + k + u
             if rotation is not None:
-                attitude = product(attitude, rotation)
-                p, q, r = turned_back(rotation, p, q, r)
-                a, b, c = turned_back(rotation, a, b, c)
+                attitude = multiply(attitude, rotation)
+                p, q, r = rotate_back(rotation, p, q, r)
+                a, b, c = rotate_back(rotation, a, b, c)
             out[row] = (*attitude, p, q, r, a, b, c)
 
     def _measured(
@@ -110,18 +107,18 @@ class ImuTruth:
         attitude: Sequence[float] = motion[3:7]
         p, q, r, x, y, z, a, b, c = motion[10:]
         if arm is not None:
-            i, j, k = turned(attitude, *arm)
+            i, j, k = rotate(attitude, *arm)
             s, t, u = cross(p, q, r, i, j, k)
             s, t, u = cross(p, q, r, s, t, u)
             i, j, k = cross(a, b, c, i, j, k)
             x, y, z = x + i + s, y + j + t, z + k + u
         if rotation is not None:
-            attitude = product(attitude, rotation)
+            attitude = multiply(attitude, rotation)
         i, j, k = self._gravity
         return (
             *attitude,
-            *turned_back(attitude, p, q, r),
-            *turned_back(attitude, x - i, y - j, z - k),
+            *rotate_back(attitude, p, q, r),
+            *rotate_back(attitude, x - i, y - j, z - k),
         )
 
 

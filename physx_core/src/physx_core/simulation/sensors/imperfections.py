@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from physx_core.simulation.sensors.attitudes import between, from_rotation_vectors, product
+from physx_core.rotations import from_rotation_vector_rows, interpolate_rows, multiply_rows
 from physx_core.simulation.sensors.sensor import Sensor
 from physx_core.typing import Vector
 
@@ -117,7 +117,7 @@ class Delays:
         seen: Vector = later + share * (earlier - later)
         at = self._places.attitudes
         if at.size:
-            seen[at] = between(later[at], earlier[at], share[at[:, :1]])
+            seen[at] = interpolate_rows(later[at], earlier[at], share[at[:, :1]])
         switches = self._places.switches
         seen[switches] = seen[switches] >= 0.5
         return seen
@@ -178,6 +178,6 @@ class Errors:
         found = seen.copy()
         found[places.added] += error[places.adding]
         if places.attitudes.size:
-            turns = from_rotation_vectors(error[places.turning])
-            found[places.attitudes] = product(seen[places.attitudes], turns)
+            turns = from_rotation_vector_rows(error[places.turning])
+            found[places.attitudes] = multiply_rows(seen[places.attitudes], turns)
         return found

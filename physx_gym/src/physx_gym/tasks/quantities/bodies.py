@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
+from physx_core import rotations
 from physx_core.errors import ConfigError
-from physx_core.simulation.sensors.attitudes import turned_back
 from physx_core.typing import Vector
 from physx_gym.tasks.quantities import geometry
 from physx_gym.tasks.quantities.combined import Rate
@@ -66,8 +66,8 @@ class BodyOrientations(Quantity):
         if self.form == "quaternion":
             return np.asarray(quaternions)
         if self.form == "matrix":
-            return geometry.matrices(quaternions)
-        return geometry.roll_pitch_yaw(quaternions)
+            return rotations.to_matrix_rows(quaternions)
+        return rotations.to_roll_pitch_yaw_rows(quaternions)
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,10 @@ class BodyVelocities(Quantity):
         if self.frame == "world":
             return velocities
         turn = moment.get(BodyPoses(self.bodies))[:, 3:]
-        parts = [turned_back(turn, velocities[:, :3]), turned_back(turn, velocities[:, 3:])]
+        parts = [
+            rotations.rotate_back_rows(turn, velocities[:, :3]),
+            rotations.rotate_back_rows(turn, velocities[:, 3:]),
+        ]
         return np.concatenate(parts, axis=1)
 
 
@@ -120,7 +123,7 @@ class MeanPose(Quantity):
     def compute(self, moment: Moment) -> Vector:
         """Return mean position and mean orientation."""
         poses = moment.get(BodyPoses(self.bodies))
-        return np.concatenate([poses[:, :3].mean(0), geometry.mean_quaternion(poses[:, 3:])])
+        return np.concatenate([poses[:, :3].mean(0), rotations.mean(poses[:, 3:])])
 
 
 @dataclass(frozen=True)
@@ -158,7 +161,7 @@ class MeanOdometry(Quantity):
     def compute(self, moment: Moment) -> Vector:
         """Return the planar pose."""
         pose = moment.get(MeanPose(self.bodies))
-        return np.array([pose[0], pose[1], geometry.yaw_of(pose[3:])])
+        return np.array([pose[0], pose[1], rotations.to_roll_pitch_yaw(pose[3:].tolist())[2]])
 
 
 def root_of(moment: Moment) -> str:
@@ -201,7 +204,7 @@ class Odometry(Quantity):
     def compute(self, moment: Moment) -> Vector:
         """Return the planar pose."""
         pose = moment.get(BodyPoses((root_of(moment),)))[0]
-        return np.array([pose[0], pose[1], geometry.yaw_of(pose[3:])])
+        return np.array([pose[0], pose[1], rotations.to_roll_pitch_yaw(pose[3:].tolist())[2]])
 
 
 @dataclass(frozen=True)

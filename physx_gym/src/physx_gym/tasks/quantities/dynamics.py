@@ -9,10 +9,10 @@ from typing import Literal
 import numpy as np
 
 from physx_core.errors import ConfigError, FeatureNotSupportedError
+from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
 from physx_gym.tasks.quantities.bodies import BodyPositions
 from physx_gym.tasks.quantities.combined import Rate
-from physx_gym.tasks.quantities.geometry import matrices
 from physx_gym.tasks.quantities.joints import JointTorques, JointVelocities
 from physx_gym.tasks.quantities.quantity import Moment, Quantity
 
@@ -43,7 +43,7 @@ class MassAndMomentum(Quantity):
         momentum = rows @ moment.v
         linear = momentum[:3]
         angular = momentum[3:] - np.cross(center, linear)
-        turn = matrices(moment.q[3:7])
+        turn = to_matrix(moment.q[3:7])
         return np.concatenate([[mass], moment.q[:3] + turn @ center, turn @ linear, turn @ angular])
 
 
