@@ -19,7 +19,7 @@ from physx_core.errors import (
 )
 from physx_core.simulation import Ground, HeightField, Robot, Stairs, World, Wrench
 from physx_core.typing import Vector
-from physx_gym.pipeline import options as plain
+from physx_gym.simulator import options as nested_options
 from physx_gym.simulator.equipped_world import Engine, EquippedWorld, positive_or_none
 
 
@@ -70,10 +70,10 @@ class Simulator(EquippedWorld):
             ``"stepper"``; ``"motors"`` by joint; ``"sensors"`` by name.
         """
         return {
-            "world": plain.world_options(self.world),
+            "world": nested_options.world_options(self.world),
             "stepper": {name: getattr(self, name) for name in _STEPPER},
-            "motors": plain.motor_options(self.motors),
-            "sensors": plain.sensor_options(self.sensors),
+            "motors": nested_options.motor_options(self.motors),
+            "sensors": nested_options.sensor_options(self.sensors),
         }
 
     def set_options(self, options: Mapping[str, Any]) -> None:
@@ -88,14 +88,14 @@ class Simulator(EquippedWorld):
             ConfigError: A value cannot be.
         """
         self._check_stopped("set_options")
-        plain.check_known("", options, ("world", "stepper", "motors", "sensors"))
-        world = plain.changed_world(self.world, options.get("world", {}))
+        nested_options.check_known("", options, ("world", "stepper", "motors", "sensors"))
+        world = nested_options.change_world(self.world, options.get("world", {}))
         motors = {motor.joint: motor for motor in self.motors}
-        motors = plain.changed_each("motors", motors, options.get("motors", {}))
+        motors = nested_options.change_each("motors", motors, options.get("motors", {}))
         sensors = {sensor.name: sensor for sensor in self.sensors}
-        sensors = plain.changed_each("sensors", sensors, options.get("sensors", {}))
+        sensors = nested_options.change_each("sensors", sensors, options.get("sensors", {}))
         stepper = options.get("stepper", {})
-        plain.check_known("stepper", stepper, _STEPPER)
+        nested_options.check_known("stepper", stepper, _STEPPER)
         for name, value in stepper.items():
             setattr(self, name, positive_or_none(name, value))
         if world is not self.world:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from physx_core.errors import ComponentNotFoundError, LogError, nearest
 from physx_core.files import replace
 from physx_core.simulation import World
-from physx_gym.pipeline.plain_description import plain, world_of
 from physx_gym.tasks.trajectory import Trajectory
+from physx_gym.telemetry.plain_description import to_plain, world_of
 
 TIME = "time"
 """Column of the time since the episode's begin, in s."""
@@ -139,7 +139,7 @@ class Log:
         with h5py.File(image, "w") as file:
             file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
             constants = {key: each for key, each in self.constants.items() if key != "units"}
-            text = json.dumps(plain(constants)).encode()
+            text = json.dumps(to_plain(constants)).encode()
             file.create_dataset("constants", data=np.frombuffer(text, np.uint8))
             for dtype in ("float64", "int64"):
                 names = [key for key, each in self.variables.items() if each.dtype == dtype]

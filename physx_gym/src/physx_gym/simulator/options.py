@@ -10,35 +10,35 @@ from physx_core.errors import ConfigError, UnknownOptionError
 from physx_core.simulation import Motor, Sensor, World
 
 _NAMES = frozenset({"name", "joint", "urdf", "package_dirs", "joints", "feet", "path", "heights"})
-"""What a thing is rather than how it behaves: no options."""
+"""Fields that identify a thing rather than configure it: these are not options."""
 _PARTS = ("robots", "objects")
 
 
 def world_options(world: World) -> dict[str, Any]:
-    """Return the options of a world: its own, those of the ground, the robots and the objects."""
-    found = _plain(world, {"ground", *_PARTS})
-    found["ground"] = {} if world.ground is None else _plain(world.ground)
+    """Return the options of a world, its ground, its robots and its objects."""
+    found = _fields_of(world, {"ground", *_PARTS})
+    found["ground"] = {} if world.ground is None else _fields_of(world.ground)
     for part in _PARTS:
-        found[part] = {thing.name: _plain(thing) for thing in getattr(world, part)}
+        found[part] = {thing.name: _fields_of(thing) for thing in getattr(world, part)}
     return found
 
 
 def motor_options(motors: Sequence[Motor]) -> dict[str, Any]:
     """Return the options of motors by joint."""
-    return {motor.joint: _plain(motor) for motor in motors}
+    return {motor.joint: _fields_of(motor) for motor in motors}
 
 
 def sensor_options(sensors: Sequence[Sensor]) -> dict[str, Any]:
     """Return the options of sensors by name."""
-    return {sensor.name: _plain(sensor) for sensor in sensors}
+    return {sensor.name: _fields_of(sensor) for sensor in sensors}
 
 
-def changed_world(world: World, options: Mapping[str, Any]) -> World:
+def change_world(world: World, options: Mapping[str, Any]) -> World:
     """Return a world with some options changed.
 
     Raises:
-        UnknownOptionError: There is no option of that name.
-        ConfigError: A value cannot be.
+        UnknownOptionError: If there is no option of that name.
+        ConfigError: If a value is out of range.
     """
     options = dict(_mapping("world", options))
     ground = options.pop("ground", None)
@@ -46,53 +46,53 @@ def changed_world(world: World, options: Mapping[str, Any]) -> World:
     if ground:
         if world.ground is None:
             raise ConfigError('The world has no ground, so ["world"]["ground"] has no options.')
-        new_ground = _changed("world.ground", world.ground, ground)
+        new_ground = _change("world.ground", world.ground, ground)
         changes = {} if new_ground is world.ground else {"ground": new_ground}
     for part in _PARTS:
         given = options.pop(part, None)
         if given:
             things = {thing.name: thing for thing in getattr(world, part)}
-            new = changed_each(f"world.{part}", things, given)
+            new = change_each(f"world.{part}", things, given)
             if any(new[name] is not thing for name, thing in things.items()):
                 changes[part] = tuple(new.values())
-    changed: World = _changed("world", world, options, (*_PARTS, "ground"))
+    changed: World = _change("world", world, options, (*_PARTS, "ground"))
     return dataclasses.replace(changed, **changes) if changes else changed
 
 
-def changed_each(where: str, things: Mapping[str, Any], options: Any) -> dict[str, Any]:
+def change_each(where: str, things: Mapping[str, Any], options: Any) -> dict[str, Any]:
     """Return things by name with some options changed.
 
     Raises:
-        UnknownOptionError: There is no thing, or no option, of that name.
-        ConfigError: A value cannot be.
+        UnknownOptionError: If there is no thing, or no option, of that name.
+        ConfigError: If a value is out of range.
     """
     options = _mapping(where, options)
     check_known(where, options, things)
     return {
-        name: _changed(f"{where}.{name}", thing, options[name]) if name in options else thing
+        name: _change(f"{where}.{name}", thing, options[name]) if name in options else thing
         for name, thing in things.items()
     }
 
 
 def check_known(where: str, options: Any, known: Any) -> None:
-    """Check names of options.
+    """Check the names of options.
 
     Raises:
-        UnknownOptionError: One is not known.
+        UnknownOptionError: If one is not known.
     """
     unknown = [str(name) for name in _mapping(where, options) if name not in known]
     if unknown:
         raise UnknownOptionError(f"Options of the simulator: {where}", unknown, known)
 
 
-def _plain(thing: Any, without: set[str] | None = None) -> dict[str, Any]:
+def _fields_of(thing: Any, without: set[str] | None = None) -> dict[str, Any]:
     left_out = _NAMES | (without or set())
     names = [field.name for field in dataclasses.fields(thing) if field.name not in left_out]
     return {name: getattr(thing, name) for name in names}
 
 
-def _changed(where: str, thing: Any, options: Any, without: Sequence[str] = ()) -> Any:
-    known = _plain(thing, set(without))
+def _change(where: str, thing: Any, options: Any, without: Sequence[str] = ()) -> Any:
+    known = _fields_of(thing, set(without))
     check_known(where, options, (*known, *without))
     new = {name: value for name, value in options.items() if not _same(value, known.get(name))}
     return dataclasses.replace(thing, **new) if new else thing

@@ -1,4 +1,4 @@
-"""Parts of pipelines as plain data: a table with the name of a class and its options."""
+"""Parts of pipelines from tables: ``{"cls": <class or function>, "kwargs": <its options>}``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from physx_core.errors import ComponentNotFoundError, ConfigError, UnknownOption
 from physx_core.plugins import imported
 
 _MODULES = {
-    "environment": ("physx_gym", "physx_gym.environments"),
+    "environment": ("physx_gym",),
     "block": ("physx_gym.blocks",),
     "wrapper": ("physx_gym",),
     "component": (
@@ -24,7 +24,7 @@ _MODULES = {
         "physx_core",
     ),
 }
-"""Where each kind of part is looked for by its name alone."""
+"""Where each kind of part is looked up by its name alone."""
 
 
 def find(kind: str, reference: Any) -> Callable[..., Any]:
@@ -33,36 +33,31 @@ def find(kind: str, reference: Any) -> Callable[..., Any]:
     Args:
         kind: ``environment``, ``block``, ``wrapper``, or ``component`` for everything else.
         reference: A class or function, ``"package.module:Class"``, ``"script.py:Class"``, or the
-            name of one that physx brings.
+            name of one that physx provides.
 
     Raises:
-        ComponentNotFoundError: There is none of that name.
-        ConfigError: It can be none.
+        ComponentNotFoundError: If there is none of that name.
+        ConfigError: If the reference is neither a name nor callable.
     """
     if not isinstance(reference, str):
         found = reference
     elif ":" in reference:
         found = imported(kind, reference)
     else:
-        found = _own(kind, reference)
+        found = _find_by_name(kind, reference)
     if not callable(found):
         raise ConfigError(
-            f"{reference!r} makes no {kind}: give a class, its name, or where it is, as in "
-            '"package.module:Class".'
+            f"{reference!r} does not make a valid {kind}: give a class, its name, or its location, "
+            'as in "package.module:Class".'
         )
-    made: Callable[..., Any] = found
-    return made
+    maker: Callable[..., Any] = found
+    return maker
 
 
-def _own(kind: str, name: str) -> Any:
+def _find_by_name(kind: str, name: str) -> Any:
     known: list[str] = []
     for place in _MODULES[kind]:
-        try:
-            module = importlib.import_module(place)
-        except ModuleNotFoundError as error:
-            if error.name != place:
-                raise
-            continue
+        module = importlib.import_module(place)
         names = list(getattr(module, "__all__", ()))
         if name in names:
             return getattr(module, name)
@@ -76,51 +71,55 @@ def find_environment(reference: Any) -> tuple[Callable[..., Any], dict[str, Any]
     """Return what makes an environment, and the options that it is registered with.
 
     Args:
-        reference: As in `find`, or an id that Gymnasium knows.
+        reference: As in `find`, or an id that is registered with Gymnasium.
     """
     if not isinstance(reference, str) or reference not in gymnasium.registry:
         return find("environment", reference), {}
     spec = gymnasium.registry[reference]
-    entry = spec.entry_point
-    if entry is None:
+    if spec.entry_point is None:
         raise ConfigError(f'The environment "{reference}" is registered without an entry point.')
-    return find("environment", entry), dict(spec.kwargs)
+    return find("environment", spec.entry_point), dict(spec.kwargs)
 
 
-def make(where: str, kind: str, table: Any, *args: Any, **extra: Any) -> Any:
-    """Return the part that a table ``{"cls": ..., "kwargs": {...}}`` describes.
+def build(where: str, kind: str, table: Mapping[str, Any], *args: Any, **given: Any) -> Any:
+    """Return the part that a table describes.
 
     Args:
-        where: What to call the table in errors.
+        where: What errors call the table.
         kind: See `find`.
         table: The table.
         args: First arguments of the part.
-        extra: Options in place of those in the table.
+        given: Options that replace those in the table.
+
+    Raises:
+        UnknownOptionError: If the table or the part does not have an option of that name.
+        ConfigError: If the table is incomplete, or an argument of the part is missing.
+        ComponentNotFoundError: If a part is not found.
     """
     check_table(where, table, ("cls", "kwargs"))
-    made = find(kind, table["cls"])
-    options = {**built(f"{where}.kwargs", table.get("kwargs", {})), **extra}
-    check_call(where, made, args, options)
-    return made(*args, **options)
+    maker = find(kind, table["cls"])
+    options = {**build_nested(f"{where}.kwargs", table.get("kwargs", {})), **given}
+    check_call(where, maker, args, options)
+    return maker(*args, **options)
 
 
-def built(where: str, value: Any) -> Any:
-    """Return plain data with every table that has a ``cls`` replaced by the part it describes."""
+def build_nested(where: str, value: Any) -> Any:
+    """Return nested data in which each table with a ``cls`` is replaced by its part."""
     if isinstance(value, Mapping):
         if "cls" in value:
-            return make(where, "component", value)
-        return {key: built(f"{where}.{key}", each) for key, each in value.items()}
+            return build(where, "component", value)
+        return {key: build_nested(f"{where}.{key}", each) for key, each in value.items()}
     if isinstance(value, (list, tuple)):
-        return type(value)(built(f"{where}[{i}]", each) for i, each in enumerate(value))
+        return type(value)(build_nested(f"{where}[{i}]", each) for i, each in enumerate(value))
     return value
 
 
 def check_table(where: str, table: Any, known: Iterable[str], required: str = "cls") -> None:
-    """Check that a table has no other keys than known ones, and one that it must have.
+    """Check the keys of a table.
 
     Raises:
-        UnknownOptionError: It has another one.
-        ConfigError: It is no table, or that one is missing.
+        UnknownOptionError: If it has a key that is not known.
+        ConfigError: If it or its options are not a table, or the required key is missing.
     """
     if not isinstance(table, Mapping):
         raise ConfigError(f"{where} is {table!r} but must be a table.")
@@ -129,22 +128,24 @@ def check_table(where: str, table: Any, known: Iterable[str], required: str = "c
         raise UnknownOptionError(where, unknown, known)
     if required and required not in table:
         raise ConfigError(f'{where} has no "{required}".')
+    if not isinstance(table.get("kwargs", {}), Mapping):
+        raise ConfigError(f"{where}.kwargs is {table['kwargs']!r} but must be a table.")
 
 
 def check_call(
-    where: str, made: Callable[..., Any], args: tuple[Any, ...], options: Mapping[str, Any]
+    where: str, maker: Callable[..., Any], args: tuple[Any, ...], options: Mapping[str, Any]
 ) -> None:
-    """Check that a class or function takes arguments.
+    """Check that a class or function takes some arguments.
 
     Raises:
-        UnknownOptionError: It has no option of a name.
-        ConfigError: One is missing.
+        UnknownOptionError: If it does not have an option of that name.
+        ConfigError: If an argument is missing.
     """
     try:
-        signature = inspect.signature(made)
-    except (TypeError, ValueError):  # made in C: it says itself what it does not take
+        signature = inspect.signature(maker)
+    except (TypeError, ValueError):  # implemented in C: it reports its own mistakes
         return
-    name = getattr(made, "__name__", repr(made))
+    name = getattr(maker, "__name__", repr(maker))
     parameters = signature.parameters.values()
     if not any(each.kind is each.VAR_KEYWORD for each in parameters):
         known = [
