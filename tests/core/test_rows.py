@@ -9,13 +9,13 @@ from physx_core.errors import (
     NotFiniteError,
     UnknownFieldError,
 )
-from physx_core.rows import Columns, shaped_by
+from physx_core.rows import RowBuffer, infer_shapes
 
 FIELDS = [Field("x", (2,)), Field("n", (), "int32")]
 
 
 def test_rows_are_copies_with_instance_and_step():
-    columns = Columns(FIELDS, 4)
+    columns = RowBuffer(FIELDS, 4)
     x = np.array([1.0, 2.0])
     columns.put(0, {"x": x, "n": 3}, 2, 5, 7)
     x[:] = 0
@@ -41,13 +41,13 @@ def test_rows_are_copies_with_instance_and_step():
 )
 def test_what_does_not_fit_is_named(sample, error, field):
     with pytest.raises(error, match=f'Instance 3, step 5: field "{field}"') as caught:
-        Columns(FIELDS, 1).put(0, sample, 3, 0, 5)
+        RowBuffer(FIELDS, 1).put(0, sample, 3, 0, 5)
     assert (caught.value.field, caught.value.instance_id, caught.value.step) == (field, 3, 5)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_the_first_row_that_is_not_finite_is_named(bad):
-    columns = Columns(FIELDS, 3)
+    columns = RowBuffer(FIELDS, 3)
     for row in range(3):
         columns.put(row, {"x": np.array([0, bad if row else 1.0]), "n": 0}, row + 1, 0, 10 + row)
     assert len(columns.rows(1)["x"]) == 1
@@ -56,5 +56,5 @@ def test_the_first_row_that_is_not_finite_is_named(bad):
 
 
 def test_open_shapes_are_taken_from_the_first_sample():
-    fields = shaped_by([Field("x"), Field("y", (1,))], {"x": [[1, 2]], "y": 0})
+    fields = infer_shapes([Field("x"), Field("y", (1,))], {"x": [[1, 2]], "y": 0})
     assert [field.shape for field in fields] == [(1, 2), (1,)]

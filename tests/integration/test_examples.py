@@ -126,7 +126,7 @@ def test_a_step_that_diverges_is_refused(beam, tmp_path, monkeypatch):
 
     monkeypatch.setattr(beam.ElasticBeam, "solve", fail)
     config = EnvironmentConfig(beam.Beam, as_tcp_ip_client=False, max_wrong_samples_per_step=3)
-    with pytest.raises(WrongSamplesError, match="refused 4 samples"):
+    with pytest.raises(WrongSamplesError, match="rejected 4 samples"):
         DataGeneration(config, session_dir=str(tmp_path), batch_nb=1, batch_size=1).execute()
 
 

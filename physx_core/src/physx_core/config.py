@@ -91,7 +91,7 @@ def at_least(minimum: float, default: Any = dataclasses.MISSING) -> Any:
 MODES = ("training", "validation", "prediction")
 """The modes of a dataset that samples are made for."""
 WRONG = "wrong"
-"""Mode of the samples that `check_sample` refused."""
+"""Mode of the samples that `check_sample` rejected."""
 
 
 @configuration
@@ -113,9 +113,9 @@ class EnvironmentConfig:
     simulations_per_step: int = at_least(1, 1)
     """Calls of `step` for one sample; `compute_training_data` is False in all but the last."""
     max_wrong_samples_per_step: int = at_least(0, 10)
-    """How many samples in a row `check_sample` may refuse before the run ends with an error."""
+    """How many samples in a row `check_sample` may reject before the run ends with an error."""
     record_wrong_samples: bool = False
-    """Store the samples that `check_sample` refuses too, in the mode "wrong", with the same fields;
+    """Store the samples that `check_sample` rejects too, in the mode "wrong", with the same fields;
     those that are invalid, for example with NaN, are left out. A prediction does so if it records.
     """
     load_samples: bool = False
@@ -159,7 +159,7 @@ class DatasetConfig:
     """Folder of an existing session or dataset to read; it is never modified."""
     mode: str = field(default="training", metadata={"choices": (*MODES, WRONG)})
     """Mode that is written or read: "training", "validation" or "prediction"; "wrong", which holds
-    what `check_sample` refused, is only read."""
+    what `check_sample` rejected, is only read."""
     max_file_size: float = at_least(1e-6, 0.25)
     """Size in GB at which a partition is full and the next one begins."""
     shuffle: bool = True

@@ -148,7 +148,7 @@ class NotFiniteError(SampleError):
 
 
 class WrongSamplesError(SampleError):
-    """`check_sample` refused more samples in a row than the configuration allows."""
+    """`check_sample` rejected more samples in a row than the configuration allows."""
 
 
 # Environments and clients -------------------------------------------------------------------

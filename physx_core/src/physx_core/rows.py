@@ -1,4 +1,4 @@
-"""Columns: a block of rows under construction, one preallocated array for each field."""
+"""RowBuffer: a block of rows under construction, one preallocated array for each field."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ ROW_FIELDS = (
 """What physx adds to each row: the instance that made it, the instance's trajectory and step."""
 
 
-def shaped_by(fields: Iterable[Field], sample: Mapping[str, Any]) -> list[Field]:
+def infer_shapes(fields: Iterable[Field], sample: Mapping[str, Any]) -> list[Field]:
     """Return the fields with their shapes, those yet unknown taken from the first sample."""
     shaped = []
     for field in fields:
         if field.shape is None and field.name in sample:
-            with contextlib.suppress(ValueError):  # a ragged value: `Columns.put` names it
+            with contextlib.suppress(ValueError):  # a ragged value: `RowBuffer.put` names it
                 field = replace(field, shape=np.asarray(sample[field.name]).shape)
         shaped.append(field)
     return shaped
 
 
-def row_of(batch: Batch, row: int) -> Sample:
+def copy_row(batch: Batch, row: int) -> Sample:
     """Return a copy of one row of a batch as a sample, each value an array."""
     return {name: np.array(values[row]) for name, values in batch.items()}
 
 
-class Columns:
+class RowBuffer:
     """Rows of samples, each checked as it is put in; finiteness is checked a block at a time.
 
     Attributes:
@@ -154,8 +154,8 @@ class Columns:
         )
 
 
-class Refused:
-    """Samples that `check_sample` refused, in the order of their steps.
+class RejectedSamples:
+    """Samples that `check_sample` rejected, in the order of their steps.
 
     Nothing invalid is ever stored: one that lacks a field, has one of another name, shape or type,
     or holds NaN or an infinite number, is left out.
@@ -180,7 +180,7 @@ class Refused:
         """Return fields with shapes that are open taken from the first sample that has them all."""
         for sample, _, _ in self._waiting:
             if all(field.name in sample for field in fields):
-                return shaped_by(fields, sample)
+                return infer_shapes(fields, sample)
         return list(fields)
 
     def take(self, fields: Sequence[Field], instance_id: int) -> Batch:
@@ -193,7 +193,7 @@ class Refused:
         waiting, self._waiting = self._waiting, []
         if any(field.shape is None for field in fields):
             waiting = []
-        columns, count = Columns(fields, len(waiting)), 0
+        columns, count = RowBuffer(fields, len(waiting)), 0
         for sample, episode, step in waiting:
             with contextlib.suppress(SampleError):
                 columns.put(count, sample, instance_id, episode, step)
@@ -205,7 +205,7 @@ class Refused:
         self._waiting.clear()
 
 
-def joined(blocks: Sequence[Batch]) -> Batch:
+def concatenate(blocks: Sequence[Batch]) -> Batch:
     """Return blocks of rows of the same fields as one; empty where there are no rows."""
     blocks = [block for block in blocks if len(next(iter(block.values()), ()))]
     if not blocks:

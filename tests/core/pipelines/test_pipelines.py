@@ -135,7 +135,7 @@ def test_the_recorded_configuration_reproduces_the_run():
         assert np.array_equal(a["training"]["force"][:], b["training"]["force"][:])
 
 
-def test_refused_samples_are_not_stored_and_substeps_do_not_compute():
+def test_rejected_samples_are_not_stored_and_substeps_do_not_compute():
     config = EnvironmentConfig(Counting, as_tcp_ip_client=False, simulations_per_step=3)
     generate(environment_config=config, batch_nb=1, batch_size=6)
     with Dataset.open("sessions/run") as dataset:
@@ -185,7 +185,7 @@ def test_what_was_committed_stays_when_a_sample_is_bad():
 
 
 def test_refusing_all_samples_ends_with_an_error():
-    with pytest.raises(WrongSamplesError, match="refused 11 samples in a row"):
+    with pytest.raises(WrongSamplesError, match="rejected 11 samples in a row"):
         generate(environment_config=counting(refuse=True))
 
 

@@ -111,7 +111,7 @@ def test_several_run_in_clients_and_one_in_this_process(nothing_stays_behind):
             assert type(prediction.source) is expected
 
 
-def test_refused_samples_are_recorded_with_the_others(nothing_stays_behind):
+def test_rejected_samples_are_recorded_with_the_others(nothing_stays_behind):
     runs = []
     for over_tcp in (False, True):
         config = environment(
@@ -277,7 +277,7 @@ def test_the_command_replays_what_a_session_holds_and_draws_it():
 
 
 @pytest.mark.parametrize("over_tcp", [False, True])
-def test_refused_samples_are_replayed_once_each(over_tcp, nothing_stays_behind):
+def test_rejected_samples_are_replayed_once_each(over_tcp, nothing_stays_behind):
     config = environment("Refusing", record_wrong_samples=True, num_clients=2)
     DataGeneration(config, session_name="refused", batch_nb=1, batch_size=14).execute()
     with Dataset.open("sessions/refused") as dataset:
@@ -293,13 +293,13 @@ def test_refused_samples_are_replayed_once_each(over_tcp, nothing_stays_behind):
     data = DatasetConfig(existing_dir="sessions/refused", mode="wrong")
     Mine(data, again, session_name="replay").execute()
     assert seen == list(zip(wrong["env_id"], wrong["step"], strict=True)) and len(seen) == 12
-    with pytest.raises(ConfigError, match='"wrong" is that of samples which check_sample refused'):
+    with pytest.raises(ConfigError, match='"wrong" is that of samples which check_sample rejected'):
         DataGeneration(config, DatasetConfig(mode="wrong"), batch_nb=1, batch_size=1).execute()
     with pytest.raises(ConfigError, match="To look at them: physx replay"):
         Training(NETWORK, DatasetConfig(mode="wrong"), config, epoch_nb=1, batch_size=1).execute()
 
 
-def test_the_command_replays_the_refused_samples(capsys):
+def test_the_command_replays_the_rejected_samples(capsys):
     config = environment("Refusing", record_wrong_samples=True)
     DataGeneration(config, session_name="refused", batch_nb=1, batch_size=4).execute()
     words = ["sessions/refused", "--environment.no-as-tcp-ip-client"]

@@ -157,7 +157,7 @@ if __name__ == "__main__":
     assert done.stdout.strip() == "[[1.0, 0.0], [2.0, 0.0], [1.0, 1.0]]", done.stderr
 
 
-def test_a_class_that_no_other_process_finds_is_refused(clients):
+def test_a_class_that_no_other_process_finds_is_rejected(clients):
     class Inside(HereDefined):
         pass
 

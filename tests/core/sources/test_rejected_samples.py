@@ -1,4 +1,4 @@
-"""What check_sample refuses: recorded in the mode "wrong", in the same order however it is made."""
+"""What check_sample rejects: recorded in the mode "wrong", in the same order however it is made."""
 
 from __future__ import annotations
 
@@ -43,31 +43,31 @@ def same(a, b):
 
 
 @pytest.mark.parametrize(("instances", "ahead"), [(1, None), (3, None), (3, 0)])
-def test_refused_rows_are_those_of_a_local_source(local, clients, instances, ahead):
+def test_rejected_rows_are_those_of_a_local_source(local, clients, instances, ahead):
     settings = {"num_clients": instances, "record_wrong_samples": True}
     found = 0
     with local(PICKY, **settings) as ours, clients(PICKY, run_ahead=ahead, **settings) as theirs:
         for size in (1, 2, 50, 1, 7, 300):
             same(theirs.batch(size), ours.batch(size))
-            wrong = ours.take_refused()
-            same(theirs.take_refused(), wrong)
-            assert ours.take_refused() == theirs.take_refused() == {}
+            wrong = ours.pop_rejected()
+            same(theirs.pop_rejected(), wrong)
+            assert ours.pop_rejected() == theirs.pop_rejected() == {}
             found += len(wrong.get("step", ()))
     assert found > 50
 
 
-def test_refused_rows_come_by_instance_then_step_before_their_accepted_ones(local):
+def test_rejected_rows_come_by_instance_then_step_before_their_accepted_ones(local):
     with local(PICKY, num_clients=3, record_wrong_samples=True) as source:
         before = dict.fromkeys((1, 2, 3), -1)
         for _ in range(5):
             rows = source.batch(9)
-            wrong = source.take_refused()
+            wrong = source.pop_rejected()
             places = list(zip(wrong["env_id"], wrong["step"], strict=True))
             assert places == sorted(places)
             for number in (1, 2, 3):
                 steps = rows["step"][rows["env_id"] == number]
-                refused = wrong["step"][wrong["env_id"] == number]
-                made = sorted([*steps, *refused])
+                rejected = wrong["step"][wrong["env_id"] == number]
+                made = sorted([*steps, *rejected])
                 assert made == list(range(before[number] + 1, steps[-1] + 1))
                 before[number] = steps[-1]
             assert (wrong["state"][:, 0] > 0.6).all()
@@ -80,18 +80,18 @@ def test_those_of_a_batch_are_forgotten_with_the_next(local, clients):
         for source in (ours, theirs):
             source.batch(100)
             source.batch(4)
-        same(theirs.take_refused(), ours.take_refused())
+        same(theirs.pop_rejected(), ours.pop_rejected())
 
 
 def test_nothing_is_kept_unless_it_is_asked_for(local, clients):
     with local(PICKY) as ours, clients(PICKY) as theirs:
         for source in (ours, theirs):
             source.batch(50)
-            assert source.take_refused() == {}
+            assert source.pop_rejected() == {}
 
 
 @pytest.mark.parametrize("spoil", ["nan", "shape", "name", "ragged", "text"])
-def test_refused_samples_that_are_invalid_are_left_out(local, clients, spoil):
+def test_rejected_samples_that_are_invalid_are_left_out(local, clients, spoil):
     settings = {
         "num_clients": 2,
         "record_wrong_samples": True,
@@ -99,8 +99,8 @@ def test_refused_samples_that_are_invalid_are_left_out(local, clients, spoil):
     }
     with local(PICKY, **settings) as ours, clients(PICKY, **settings) as theirs:
         same(ours.batch(60), theirs.batch(60))
-        wrong = ours.take_refused()
-        same(theirs.take_refused(), wrong)
+        wrong = ours.pop_rejected()
+        same(theirs.pop_rejected(), wrong)
     steps = wrong["step"][wrong["env_id"] == 1]
     assert len(steps) and (steps % 2 == 0).all()
     assert np.isfinite(wrong["state"]).all()
@@ -144,7 +144,7 @@ def test_too_many_name_the_instance_and_are_recorded(instances, stuck, nothing_s
             max_wrong_samples_per_step=6,
             late=0.02,
         )
-        with pytest.raises(WrongSamplesError, match="refused 7 samples in a row") as caught:
+        with pytest.raises(WrongSamplesError, match="rejected 7 samples in a row") as caught:
             run(config, f"run_{over_tcp}")
         assert caught.value.instance_id == instances
     for mode in ("training", "wrong"):

@@ -37,18 +37,18 @@ def observed(make, services, *, apply, stored, **settings):
     services.save_parameters = lambda number, values: services.kept.setdefault(number, {}).update(
         values
     )
-    rows, refused = [], []
+    rows, rejected = [], []
     with make(f"{ENVS}:Everything", **settings) as source:
         for size in (2, 5, 12, 1):
             given = {"state": np.ones((size, 3))} if stored else None
             rows.append({name: array.copy() for name, array in source.batch(size, given).items()})
-            refused.append(source.take_refused())
+            rejected.append(source.pop_rejected())
             if apply:
                 source.apply({"y": rows[-1]["state"] + 1})
         fields = source.fields
     shown = [[one for one in services.shown if one[0] == number] for number in (1, 2, 3)]
     kept = dict(sorted(services.kept.items()))
-    return rows, refused, [f.to_dict() for f in fields], kept, shown
+    return rows, rejected, [f.to_dict() for f in fields], kept, shown
 
 
 @pytest.mark.parametrize(
@@ -68,9 +68,9 @@ def test_all_that_an_environment_does_is_the_same_over_tcp(
     theirs = observed(lambda *a, **k: clients(*a, run_ahead=0, **k), services, **given)
     for mine, other in zip(ours, theirs, strict=True):
         same(mine, other)
-    rows, refused, _, kept, shown = ours
+    rows, rejected, _, kept, shown = ours
     assert all(kept[number]["closed"] for number in kept)
-    assert bool(refused[2]) == bool(settings.get("record_wrong_samples"))
+    assert bool(rejected[2]) == bool(settings.get("record_wrong_samples"))
     assert bool(shown[0]) == ("visualizer" in settings)
     assert (kept[1]["sub_steps"] > 0) == ("simulations_per_step" in settings)
     assert any(row["last"].any() for row in rows) == apply

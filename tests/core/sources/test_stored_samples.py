@@ -117,13 +117,13 @@ def test_each_row_is_made_of_its_stored_row_the_same_over_tcp(local, clients, in
         assert (theirs.batch(3)["seen"] == -1).all()
 
 
-def test_a_sample_that_is_refused_is_tried_again_with_the_same_stored_row(local):
+def test_a_sample_that_is_rejected_is_tried_again_with_the_same_stored_row(local):
     settings = {"env_kwargs": {"refuse": 2}, "record_wrong_samples": True}
     with local(DOUBLING, **settings) as source:
         stored = {"x": np.arange(8.0).reshape(4, 2), "times": np.zeros(4, int)}
         stored |= {name: np.arange(4) for name in ("env_id", "episode", "step")}
         made = source.batch(4, stored)
-        wrong = source.take_refused()
+        wrong = source.pop_rejected()
     assert np.array_equal(made["x"], stored["x"])
     assert made["step"].tolist() == [0, 2, 4, 6]
     assert wrong["step"].tolist() == [1, 3, 5]
@@ -250,7 +250,7 @@ def test_samples_that_are_held_back_are_not_replayed(source_dir):
     assert times.sum() == 30 and training.validation_loss < 1e-12
 
 
-def test_too_many_refused_samples_end_the_training_and_are_kept(source_dir):
+def test_too_many_rejected_samples_end_the_training_and_are_kept(source_dir):
     config = through(refuse=2, max_wrong_samples_per_step=0, record_wrong_samples=True)
     with pytest.raises(WrongSamplesError, match="Instance 1, step 1"):
         train(source_dir, config)

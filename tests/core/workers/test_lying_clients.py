@@ -121,7 +121,7 @@ LATER = {
     "rows that were there": (rows(1), "steps do not rise"),
     "rows before the first": (rows(-5), "steps do not rise"),
     "neither true nor false": (rows(2, flag=7), '"flag" is neither true nor false'),
-    "refused rows": (pack(Kind.WRONG, rows(2)[HEADER.size :], 1), "nobody asked for"),
+    "rejected rows": (pack(Kind.WRONG, rows(2)[HEADER.size :], 1), "nobody asked for"),
     "fields again": (FIELDS, "fields of its rows twice"),
     "ready again": (READY, "defined its fields twice"),
     "an answer to nobody": (pack(Kind.ANSWER, encode({}), 1), "ANSWER, which is not for a client"),

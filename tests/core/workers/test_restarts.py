@@ -209,17 +209,17 @@ def test_what_was_drawn_and_kept_is_not_repeated(clients, services, fresh_notes)
     assert seen[0][1] == {1: 1, 2: 1}
 
 
-def test_refused_rows_are_those_of_a_run_without_failure(clients, fresh_notes):
+def test_rejected_rows_are_those_of_a_run_without_failure(clients, fresh_notes):
     seen = []
     for fault in ("", "kill", "leave"):
         kwargs = {"refuse": 3, "fault": fault, "at": 11, "pace": 0.002}
         settings = {"num_clients": 2, "record_wrong_samples": True, "restarts": 1}
-        refused = []
+        rejected = []
         with clients(WANDERER, env_kwargs=kwargs, **settings) as source:
             for size in (5, 20, 11):
                 source.batch(size)
-                refused.append(source.take_refused())
-        seen.append(digest([batch for batch in refused if batch]))
+                rejected.append(source.pop_rejected())
+        seen.append(digest([batch for batch in rejected if batch]))
         fresh_notes()
     assert len(set(seen)) == 1
 

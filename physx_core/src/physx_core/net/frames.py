@@ -62,7 +62,7 @@ class Kind(enum.IntEnum):
     STORED = 19
     """Server: stored rows that the next rows shall be made of [how many]."""
     WRONG = 20
-    """Client: rows that `check_sample` refused, as in ROWS, before the next accepted [how many]."""
+    """Client: rows that `check_sample` rejected, sent before the next accepted ones [how many]."""
     AGAIN = 21
     """Client: makes rows again that the server has from a client before it [how many so far]."""
     REQUEST = 22

@@ -12,7 +12,7 @@ from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, listed
 from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
 from physx_core.pipelines.run_description import describe_dataset, describe_environment_config
-from physx_core.pipelines.storage import describe_environment, open_own, recording_refused
+from physx_core.pipelines.storage import describe_environment, open_own, record_rejected
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
@@ -83,10 +83,10 @@ class DataGeneration(Pipeline):
     def batch_produce(self) -> None:
         """Make a batch and store it; the samples are committed when this returns.
 
-        With ``record_wrong_samples`` what `check_sample` refused meanwhile is stored too, in the
+        With ``record_wrong_samples`` what `check_sample` rejected meanwhile is stored too, in the
         mode "wrong".
         """
-        with recording_refused(self.source, self.dataset):
+        with record_rejected(self.source, self.dataset):
             self.batch = self.source.batch(self.batch_size)
             if self.batch_id == 0:
                 self.dataset.define_fields(self._mode, self.source.fields)
@@ -123,8 +123,8 @@ class DataGeneration(Pipeline):
             )
         if self._mode == WRONG:
             raise ConfigError(
-                'The mode "wrong" is that of samples which check_sample refused. Make samples for '
-                f"{listed(MODES)}, with record_wrong_samples=True to keep those that are refused."
+                'The mode "wrong" is that of samples which check_sample rejected. Make samples for '
+                f"{listed(MODES)}, with record_wrong_samples=True to keep those that are rejected."
             )
         seed = chosen_seed(config.seed)
         self.session = Session.create(self.session_dir, self.session_name, self.new_session)

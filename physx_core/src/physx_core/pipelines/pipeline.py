@@ -165,7 +165,7 @@ class Pipeline(ABC):
             in_process: Whether they must run in this process.
             replayed: Folder of the dataset whose samples they replay; what its environments saved
                 can be loaded. None: they make new samples.
-            accept_all: Whether samples that `check_sample` refuses count like the others.
+            accept_all: Whether samples that `check_sample` rejects count like the others.
         """
         services = RunServices(self.session.dataset_dir, self.observers, predict, replayed)
         source: Source

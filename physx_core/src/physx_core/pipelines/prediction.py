@@ -18,7 +18,7 @@ from physx_core.pipelines.storage import (
     describe_environment,
     open_existing,
     open_own,
-    recording_refused,
+    record_rejected,
 )
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.session import Session
@@ -63,7 +63,7 @@ class Prediction(Pipeline):
     step_nb: int = at_least(-1, -1)
     """Number of steps; -1: until Ctrl-C."""
     record: bool = False
-    """Store samples and predictions in the session's dataset, mode "prediction"; refused samples
+    """Store samples and predictions in the session's dataset, mode "prediction"; rejected samples
     too, with `record_wrong_samples`."""
 
     kind: ClassVar[str] = "prediction"
@@ -108,7 +108,7 @@ class Prediction(Pipeline):
     def predict(self) -> None:
         """Step the environments, ask the network, and give its answers to the environments."""
         count = self.source.instance_nb
-        with recording_refused(self.source, self.dataset):
+        with record_rejected(self.source, self.dataset):
             stored = None if self._stored is None else self._stored.take_on(count)
             self.batch = self.source.batch(count, stored)
             self.prediction = self.learner.predict(self.batch)

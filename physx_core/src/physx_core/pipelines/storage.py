@@ -64,7 +64,7 @@ def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) 
         return
     if config.mode == WRONG:
         raise ConfigError(
-            'The mode "wrong" holds samples that check_sample refused: environments neither make '
+            'The mode "wrong" holds samples that check_sample rejected: environments neither make '
             "them nor replay them for a training. To look at them: physx replay."
         )
     if environment.load_samples and environment.always_produce:
@@ -79,7 +79,7 @@ def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) 
         )
 
 
-def refuse_environments(environment: EnvironmentConfig) -> None:
+def reject_environments(environment: EnvironmentConfig) -> None:
     """Tell why environments cannot take part in a training of several processes.
 
     Raises:
@@ -141,11 +141,11 @@ def is_copy(directory: Path) -> bool:
 
 
 @contextlib.contextmanager
-def recording_refused(source: Source, dataset: Dataset | None) -> Iterator[None]:
-    """Store what `check_sample` refuses of the batch that is made meanwhile, behind the batch.
+def record_rejected(source: Source, dataset: Dataset | None) -> Iterator[None]:
+    """Store what `check_sample` rejects of the batch that is made meanwhile, behind the batch.
 
-    It goes to the mode "wrong", also where too many refused samples end the run. If the batch
-    cannot be made for another reason, what was refused is not stored either.
+    It goes to the mode "wrong", also where too many rejected samples end the run. If the batch
+    cannot be made for another reason, what was rejected is not stored either.
 
     Args:
         source: Makes the batch.
@@ -154,13 +154,13 @@ def recording_refused(source: Source, dataset: Dataset | None) -> Iterator[None]
     try:
         yield
     except WrongSamplesError:
-        _store_refused(source, dataset)
+        _store_rejected(source, dataset)
         raise
-    _store_refused(source, dataset)
+    _store_rejected(source, dataset)
 
 
-def _store_refused(source: Source, dataset: Dataset | None) -> None:
-    rows = source.take_refused()
+def _store_rejected(source: Source, dataset: Dataset | None) -> None:
+    rows = source.pop_rejected()
     if rows and dataset is not None:
         dataset.define_fields(WRONG, source.fields)
         dataset.append(WRONG, rows)

@@ -26,7 +26,7 @@ from physx_core.pipelines.storage import (
     describe_environment,
     open_existing,
     open_own,
-    refuse_environments,
+    reject_environments,
 )
 from physx_core.pipelines.training_data import TrainingData
 from physx_core.pipelines.training_record import BestEpoch, TrainingRecord
@@ -331,7 +331,7 @@ class Training(Pipeline):
         self.group = join(config.device)
         self._leads = self.group.leads
         if self.group.size > 1 and self.environment_config is not None and not self.resume:
-            refuse_environments(self.environment_config)
+            reject_environments(self.environment_config)
 
     def _begin_with(self, last: checkpoint.Checkpoint | None) -> None:
         """Begin at the first epoch, or where a checkpoint was written."""

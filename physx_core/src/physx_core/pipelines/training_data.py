@@ -12,7 +12,7 @@ from physx_core.dataset import Dataset, Subset
 from physx_core.dataset.write.definitions import compare_fields
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import RESERVED, Field
-from physx_core.pipelines.storage import recording_refused
+from physx_core.pipelines.storage import record_rejected
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.sources.source import Source
 from physx_core.statistics import Normalization
@@ -150,7 +150,7 @@ class TrainingData:
     def next_batch(self) -> Batch:
         """Return the next batch in physical units; stored already if environments made it."""
         if self._at_work and self.source is not None:
-            with recording_refused(self.source, self.dataset):
+            with record_rejected(self.source, self.dataset):
                 if self._stored is not None:
                     return self._replayed(self.source, self._stored)
                 batch = self.source.batch(self._batch_size)

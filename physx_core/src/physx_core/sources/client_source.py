@@ -18,7 +18,7 @@ from physx_core.errors import (
 from physx_core.fields import Field
 from physx_core.net.frames import Kind, pack
 from physx_core.net.values import encode
-from physx_core.rows import ROW_FIELDS, joined
+from physx_core.rows import ROW_FIELDS, concatenate
 from physx_core.sources.source import Source, check_stored
 from physx_core.typing import Batch
 from physx_core.workers.row_codec import row_bytes
@@ -59,14 +59,14 @@ class ClientSource(Source):
                 rows depend on a network that is trained, or on predictions that are applied.
             total: How many rows will ever be asked for; no client makes rows beyond. None: nobody
                 knows.
-            accept_all: Whether samples that `check_sample` refuses count like the others.
+            accept_all: Whether samples that `check_sample` rejects count like the others.
         """
         self.instance_nb = config.num_clients
         self.fields = []
         self._group = ClientGroup(config, services, seed, accept_all=accept_all)
-        self._refusals = 0
+        self._rejections = 0
         if config.record_wrong_samples:
-            self._refusals = config.max_wrong_samples_per_step + 1
+            self._rejections = config.max_wrong_samples_per_step + 1
         self._failed_row: int | None = None
         self._run_ahead, self._total = run_ahead, total
         self._asked = 0
@@ -103,7 +103,7 @@ class ClientSource(Source):
             check_stored(stored, size)
             if self._run_ahead != 0:
                 raise UsageError("Stored rows need ClientSource(run_ahead=0).")
-        self.take_refused()
+        self.pop_rejected()
         self._first, self._asked = self._asked, self._asked + size
         try:
             if stored is not None:
@@ -141,13 +141,13 @@ class ClientSource(Source):
             raise UsageError("apply() needs ClientSource(run_ahead=0).")
         self._send_shares(Kind.APPLY, prediction, "the prediction", at_once)
 
-    def take_refused(self) -> Batch:
-        """Return what was refused: see `Source.take_refused`."""
+    def pop_rejected(self) -> Batch:
+        """Return what was rejected: see `Source.pop_rejected`."""
         blocks: list[Batch] = []
-        for number, peer in sorted(self._group.server.peers.items()) if self._refusals else ():
+        for number, peer in sorted(self._group.server.peers.items()) if self._rejections else ():
             if self._table and peer.row_fields == self._table:
-                blocks += peer.refused.take(self._end_of_refused(number))
-        return joined(blocks)
+                blocks += peer.rejected.take(self._end_of_rejected(number))
+        return concatenate(blocks)
 
     def close(self) -> None:
         """Close the environments and end the clients: see `Source.close`."""
@@ -191,8 +191,8 @@ class ClientSource(Source):
                 else:
                     peer.send_with_next(message)
 
-    def _end_of_refused(self, number: int) -> int | None:
-        """Return the step before which an instance's refused rows belong to the last batch.
+    def _end_of_rejected(self, number: int) -> int | None:
+        """Return the step before which an instance's rejected rows belong to the last batch.
 
         None: all that there are, as its last row could not be made.
         """
@@ -220,7 +220,7 @@ class ClientSource(Source):
                 allowed = max(needed, min(allowed, self._wanted(number, self._total)))
             if peer.granted < needed or allowed - peer.granted > ahead // 4:
                 peer.granted = allowed
-                peer.refusable = allowed * self._refusals
+                peer.rejected_limit = allowed * self._rejections
                 peer.send(pack(Kind.CREDIT, number=allowed))
 
     def _without_table(self) -> list[int]:
@@ -255,10 +255,10 @@ class ClientSource(Source):
         if failed:
             row = min(failed)
             earlier = [number for number in owing if self._next_row(number) < row]
-            if not (earlier and self._refusals and isinstance(failed[row], WrongSamplesError)):
+            if not (earlier and self._rejections and isinstance(failed[row], WrongSamplesError)):
                 self._failed_row = row
                 raise failed[row]
-            return earlier  # what was refused before it is wanted too
+            return earlier  # what was rejected before it is wanted too
         return owing
 
     def _next_row(self, number: int) -> int:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from physx_core.components.environment import Services
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import UsageError
-from physx_core.rows import ROW_FIELDS, Columns, joined, row_of, shaped_by
+from physx_core.rows import ROW_FIELDS, RowBuffer, concatenate, copy_row, infer_shapes
 from physx_core.sources.source import Source, check_stored
 from physx_core.typing import Batch
 from physx_core.workers.instance import Instance, instance_arguments
@@ -31,7 +31,7 @@ class LocalSource(Source):
             config: Which environment, and how many instances.
             services: What the environments may ask of the run.
             seed: Seed of all instances.
-            accept_all: Whether samples that `check_sample` refuses count like the others.
+            accept_all: Whether samples that `check_sample` rejects count like the others.
         """
         self.instance_nb = config.num_clients
         self.fields = []
@@ -41,7 +41,7 @@ class LocalSource(Source):
             Instance(**instance_arguments(config, number, seed, accept_all))
             for number in range(1, self.instance_nb + 1)
         ]
-        self._columns: Columns | None = None
+        self._columns: RowBuffer | None = None
         self._next = 0
         self._last = range(0)
 
@@ -56,17 +56,17 @@ class LocalSource(Source):
         if stored is not None:
             check_stored(stored, size)
         if self._config.record_wrong_samples:
-            self.take_refused()
+            self.pop_rejected()
         columns = self._columns
         if columns is not None and columns.capacity < size:
-            columns = self._columns = Columns(columns.fields[: -len(ROW_FIELDS)], size)
+            columns = self._columns = RowBuffer(columns.fields[: -len(ROW_FIELDS)], size)
         instances, count = self._instances, self.instance_nb
         self._last = range(self._next, self._next + size)
         for row in range(size):
             instance = instances[self._next % count]
-            sample = instance.step(None if stored is None else row_of(stored, row))
+            sample = instance.step(None if stored is None else copy_row(stored, row))
             if columns is None:
-                columns = self._columns = Columns(shaped_by(instance.fields, sample), size)
+                columns = self._columns = RowBuffer(infer_shapes(instance.fields, sample), size)
                 self.fields = columns.fields
             columns.put(
                 row, sample, instance.instance_id, instance.last_episode, instance.last_step
@@ -76,17 +76,17 @@ class LocalSource(Source):
             raise UsageError(f"A batch has at least one row, not {size}.")
         return columns.rows(size)
 
-    def take_refused(self) -> Batch:
-        """Return what was refused: see `Source.take_refused`."""
+    def pop_rejected(self) -> Batch:
+        """Return what was rejected: see `Source.pop_rejected`."""
         blocks = []
         for instance in self._instances:
-            if instance.refused is not None:
+            if instance.rejected is not None:
                 if self._columns is None:
-                    fields = instance.refused.shaped(instance.fields)
+                    fields = instance.rejected.shaped(instance.fields)
                 else:
                     fields = self._columns.fields[: -len(ROW_FIELDS)]
-                blocks.append(instance.refused.take(fields, instance.instance_id))
-        return joined(blocks)
+                blocks.append(instance.rejected.take(fields, instance.instance_id))
+        return concatenate(blocks)
 
     def apply(self, prediction: Batch) -> None:
         """Give predictions to the instances: see `Source.apply`."""

@@ -47,20 +47,20 @@ class Source(ABC):
                 dictionary of arrays. None: nothing is replayed, and it finds None.
 
         Raises:
-            WrongSamplesError: `check_sample` refused too many samples in a row.
+            WrongSamplesError: `check_sample` rejected too many samples in a row.
             SampleError: A sample cannot be stored; names the field, instance and step.
             PhysxError: An environment or client failed.
         """
 
     @abstractmethod
-    def take_refused(self) -> Batch:
-        """Return what `check_sample` refused while the last batch was made, and forget it.
+    def pop_rejected(self) -> Batch:
+        """Return what `check_sample` rejected while the last batch was made, and forget it.
 
-        They have the same fields as other rows and come by instance, then by step; a refused row
+        They have the same fields as other rows and come by instance, then by step; a rejected row
         belongs to the batch that holds the next accepted one of its instance. After a
-        `WrongSamplesError` they are all those that were refused before it. An invalid one, for
-        example with NaN, is left out: see `physx_core.rows.Refused`. Empty without refused rows
-        and where ``record_wrong_samples`` is off.
+        `WrongSamplesError` they are all those that were rejected before it. An invalid one, for
+        example with NaN, is left out: see `physx_core.rows.RejectedSamples`. Empty without
+        rejected rows and where ``record_wrong_samples`` is off.
         """
 
     @abstractmethod

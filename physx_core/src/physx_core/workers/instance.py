@@ -13,7 +13,7 @@ from physx_core.config import EnvironmentConfig
 from physx_core.errors import EnvironmentFailedError, PhysxError, UsageError, WrongSamplesError
 from physx_core.fields import Field
 from physx_core.plugins import resolve
-from physx_core.rows import Refused
+from physx_core.rows import RejectedSamples
 from physx_core.typing import Sample
 
 
@@ -44,7 +44,7 @@ class Instance:
             sample.
         last_step: Number of the step that made the last sample, counted from 0.
         last_episode: Number of the trajectory that the last sample belongs to, counted from 0.
-        refused: The samples that `check_sample` refused, if they are recorded; else None.
+        rejected: The samples that `check_sample` rejected, if they are recorded; else None.
     """
 
     def __init__(
@@ -69,8 +69,8 @@ class Instance:
             instance_nb: How many instances run together.
             seed: Seed of the whole run.
             simulations_per_step: Calls of `step` for one sample.
-            max_wrong_samples: How many samples in a row `check_sample` may refuse.
-            record_wrong: Whether the samples that it refuses are kept in `refused`.
+            max_wrong_samples: How many samples in a row `check_sample` may reject.
+            record_wrong: Whether the samples that it rejects are kept in `rejected`.
             accept_all: Whether a sample counts whatever `check_sample` says, as in a replay.
         """
         self.instance_id = instance_id
@@ -78,7 +78,7 @@ class Instance:
         self.fields: list[Field] = []
         self.last_step = -1
         self.last_episode = 0
-        self.refused = Refused() if record_wrong else None
+        self.rejected = RejectedSamples() if record_wrong else None
         self._reference = environment
         self._arguments: dict[str, Any] = {
             **env_kwargs,
@@ -127,10 +127,10 @@ class Instance:
 
         Args:
             stored: A stored row that the environment shall replay, or None. It is the same one for
-                all sub-steps, and again after a sample that was refused.
+                all sub-steps, and again after a sample that was rejected.
 
         Raises:
-            WrongSamplesError: `check_sample` refused too many samples in a row.
+            WrongSamplesError: `check_sample` rejected too many samples in a row.
             UnknownFieldError: The step gave no data.
             EnvironmentFailedError: The environment raised.
         """
@@ -144,12 +144,12 @@ class Instance:
             environment.step_index += 1
             if accepted or self._accepts_all:
                 return sample
-            if self.refused is not None:
-                self.refused.note(sample, self.last_episode, self.last_step)
+            if self.rejected is not None:
+                self.rejected.note(sample, self.last_episode, self.last_step)
             wrong += 1
             if wrong > self._max_wrong_samples:
                 raise WrongSamplesError(
-                    f"check_sample() refused {wrong} samples in a row; "
+                    f"check_sample() rejected {wrong} samples in a row; "
                     f"max_wrong_samples_per_step is {self._max_wrong_samples}.",
                     instance_id=self.instance_id,
                     step=self.last_step,

@@ -114,8 +114,8 @@ class RowQueue:
         return moved
 
 
-class RefusedRows:
-    """Rows of one client that `check_sample` refused, in the order of their steps.
+class RejectedRows:
+    """Rows of one client that `check_sample` rejected, in the order of their steps.
 
     Attributes:
         count: How many arrived in all.

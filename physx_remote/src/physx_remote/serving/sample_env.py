@@ -13,7 +13,7 @@ from physx_core import Field
 from physx_core.components import Event
 from physx_core.errors import ActionError, ConfigError, EpisodeError, UsageError, listed, nearest
 from physx_core.fields import is_finite
-from physx_core.rows import Columns, row_of, shaped_by
+from physx_core.rows import RowBuffer, copy_row, infer_shapes
 from physx_core.typing import Array, Sample
 from physx_core.workers import Instance
 
@@ -68,7 +68,7 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         self._prediction: Sample = {}
         self._parameters: dict[str, Any] = {}
         self._instance: Instance | None = None
-        self._columns = Columns(self._learn_fields(), 1)
+        self._columns = RowBuffer(self._learn_fields(), 1)
         fields = {field.name: field for field in self._columns.fields if field.role == "training"}
         self._observed = [n for n in fields if n not in (REWARD, TERMINATED, TRUNCATED)]
         self.observation_space = spaces.Dict({n: _space(fields[n]) for n in self._observed})
@@ -194,7 +194,7 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         try:
             if all(field.shape is not None for field in instance.fields):
                 return instance.fields
-            return shaped_by(instance.fields, instance.step())
+            return infer_shapes(instance.fields, instance.step())
         finally:
             self.close()
 
@@ -207,7 +207,7 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         self._columns.put(
             0, sample, instance.instance_id, instance.last_episode, instance.last_step
         )
-        row = row_of(self._columns.rows(1), 0)
+        row = copy_row(self._columns.rows(1), 0)
         observation = {name: row.pop(name) for name in self._observed}
         reward = float(row.pop(REWARD, 0.0))
         terminated = bool(row.pop(TERMINATED, False))

@@ -103,7 +103,7 @@ class _Client:
         self.failure: PhysxError | None = None
         self.is_forsaken = False
         self._link, self._instance = link, instance
-        self._producer = Producer(link, instance, skip["rows"], skip["refused"])
+        self._producer = Producer(link, instance, skip["rows"], skip["rejected"])
         self._services = RemoteServices(link, self._producer.flush, skip["shown"])
 
     def live(self, draw: bool) -> None:

@@ -11,7 +11,7 @@ from physx_core.errors import ConnectionRefusedByPeerError, NotFiniteError, Phys
 from physx_core.fields import Field
 from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.values import decode, encode
-from physx_core.rows import ROW_FIELDS, Columns, row_of, shaped_by
+from physx_core.rows import ROW_FIELDS, RowBuffer, copy_row, infer_shapes
 from physx_core.typing import Sample
 from physx_core.workers.client.link import Link, RunEnded
 from physx_core.workers.instance import Instance
@@ -30,7 +30,7 @@ class Producer:
         failure: Why rows that were made cannot be sent.
     """
 
-    def __init__(self, link: Link, instance: Instance, skip: int = 0, refused: int = 0) -> None:
+    def __init__(self, link: Link, instance: Instance, skip: int = 0, rejected: int = 0) -> None:
         """Keep what rows are made with.
 
         Args:
@@ -38,13 +38,13 @@ class Producer:
             instance: What makes them; open.
             skip: How many rows the server has from a client before this one. They are made again,
                 but not sent.
-            refused: How many refused rows it has.
+            rejected: How many rejected rows it has.
         """
         self.made = 0
         self.failure: PhysxError | None = None
         self._link, self._instance = link, instance
-        self._skip, self._skip_refused = skip, refused
-        self._columns: Columns | None = None
+        self._skip, self._skip_rejected = skip, rejected
+        self._columns: RowBuffer | None = None
         self._announced = False
         self._stored: deque[Sample] = deque()
         self._credit = 0
@@ -67,7 +67,7 @@ class Producer:
                 self._make_row()
             except PhysxError:
                 self.flush()
-                self._send_last_refused()
+                self._send_last_rejected()
                 raise
             if self._is_due():
                 self.flush()
@@ -83,7 +83,7 @@ class Producer:
         Raises:
             RunEnded: There is a `failure`, or the server is gone. No environment can catch it.
         """
-        self._send_refused()
+        self._send_rejected()
         columns, count = self._columns, self._filled
         self.made -= count
         while columns is not None and count:
@@ -107,7 +107,7 @@ class Producer:
         sample = instance.step(self._stored.popleft() if self._stored else None)
         columns = self._columns
         if columns is None:
-            columns = self._columns = _columns(shaped_by(instance.fields, sample))
+            columns = self._columns = _columns(infer_shapes(instance.fields, sample))
         if self.made >= self._skip:
             number, episode, step = instance.instance_id, instance.last_episode, instance.last_step
             columns.put(self._filled, sample, number, episode, step)
@@ -115,35 +115,35 @@ class Producer:
         self._announce(columns)
         self.made += 1
 
-    def _announce(self, columns: Columns) -> None:
+    def _announce(self, columns: RowBuffer) -> None:
         """Tell the fields of the rows, once."""
         if not self._announced:
             self._announced = True
             table = [field.to_dict() for field in columns.fields]
             self._link.send(pack(Kind.FIELDS, encode(table)))
 
-    def _send_refused(self) -> None:
-        """Send what `check_sample` refused, once the fields' shapes are known."""
-        refused, columns = self._instance.refused, self._columns
-        if refused is None or columns is None or not self._announced:
+    def _send_rejected(self) -> None:
+        """Send what `check_sample` rejected, once the fields' shapes are known."""
+        rejected, columns = self._instance.rejected, self._columns
+        if rejected is None or columns is None or not self._announced:
             return
-        rows = refused.take(columns.fields[: -len(ROW_FIELDS)], self._instance.instance_id)
-        skipped = min(self._skip_refused, len(rows["step"]))
-        self._skip_refused -= skipped
+        rows = rejected.take(columns.fields[: -len(ROW_FIELDS)], self._instance.instance_id)
+        skipped = min(self._skip_rejected, len(rows["step"]))
+        self._skip_rejected -= skipped
         for start in range(skipped, len(rows["step"]), columns.capacity):
             part = {name: values[start : start + columns.capacity] for name, values in rows.items()}
             self._link.send_parts(pack_rows(part, len(part["step"]), Kind.WRONG))
 
-    def _send_last_refused(self) -> None:
-        """Send refused samples of an instance that has come to its end, if need be without rows."""
-        refused = self._instance.refused
-        if refused is None or self._announced:
+    def _send_last_rejected(self) -> None:
+        """Send the rejected samples of an instance that ended, even if it made no rows."""
+        rejected = self._instance.rejected
+        if rejected is None or self._announced:
             return
-        fields = refused.shaped(self._instance.fields)
+        fields = rejected.shaped(self._instance.fields)
         if all(field.shape is not None for field in fields):
             self._columns = _columns(fields)
             self._announce(self._columns)
-            self._send_refused()
+            self._send_rejected()
 
     def _is_due(self) -> bool:
         columns = self._columns
@@ -174,7 +174,7 @@ class Producer:
                 self._instance.apply({name: values[row] for name, values in prediction.items()})
         elif frame.kind is Kind.STORED:
             stored = decode(frame.payload)
-            self._stored.extend(row_of(stored, row) for row in range(frame.number))
+            self._stored.extend(copy_row(stored, row) for row in range(frame.number))
         elif frame.kind is Kind.CLOSE:
             raise RunEnded
         elif frame.kind not in (Kind.ANSWER, Kind.REFUSAL):  # those of an abandoned request
@@ -183,7 +183,7 @@ class Producer:
             )
 
 
-def _columns(fields: list[Field]) -> Columns:
+def _columns(fields: list[Field]) -> RowBuffer:
     """Return columns for one block of rows."""
     size = max(1, row_bytes([*fields, *ROW_FIELDS]))
-    return Columns(fields, min(max(1, _BLOCK_BYTES // size), _BLOCK_ROWS))
+    return RowBuffer(fields, min(max(1, _BLOCK_BYTES // size), _BLOCK_ROWS))

@@ -56,7 +56,7 @@ class ClientGroup:
             config: Which environment, how many clients, and what starts them.
             services: What the environments may ask of the run.
             seed: Seed of all instances.
-            accept_all: Whether samples that `check_sample` refuses count like the others.
+            accept_all: Whether samples that `check_sample` rejects count like the others.
         """
         self.config = config
         self._seed = list(seed)
@@ -308,7 +308,7 @@ class ClientGroup:
 
     def _setup(self, peer: Peer) -> bytes:
         """Return what a client is told first: the instance, and what of it is there already."""
-        skip = {"rows": peer.received, "refused": peer.refused.count, "shown": peer.shown}
+        skip = {"rows": peer.received, "rejected": peer.rejected.count, "shown": peer.shown}
         return self._encoded(peer.instance_id, skip=skip)
 
     def _encoded(self, instance_id: int, **progress: Any) -> bytes:

@@ -10,7 +10,7 @@ from physx_core.errors import PhysxError
 from physx_core.fields import Field
 from physx_core.net.frames import FrameReader
 from physx_core.net.handshake import HANDSHAKE_LIMIT, ServerHandshake
-from physx_core.workers.row_codec import RefusedRows, RowQueue
+from physx_core.workers.row_codec import RejectedRows, RowQueue
 from physx_core.workers.server.journal import Journal
 
 _PIECE = 1 << 16
@@ -30,8 +30,8 @@ class Peer:
         rows: Rows that arrived.
         received: How many rows arrived in all.
         granted: How many rows it may make in all.
-        refused: Rows that arrived and that its environment refused.
-        refusable: How many of those it may send in all.
+        rejected: Rows that arrived and that its environment rejected.
+        rejected_limit: How many of those it may send in all.
         failure: The error that it sent.
         failed_row: Row, counted from 0, that the error kept it from making.
         last_step: Step of its last row, -1 before the first.
@@ -64,8 +64,8 @@ class Peer:
         self.row_fields: list[Field] = []
         self.rows = RowQueue()
         self.received = self.granted = 0
-        self.refused = RefusedRows()
-        self.refusable = 0
+        self.rejected = RejectedRows()
+        self.rejected_limit = 0
         self.failure: PhysxError | None = None
         self.failed_row = 0
         self.last_step = -1
@@ -101,7 +101,7 @@ class Peer:
     def succeed(self, former: Peer) -> None:
         """Take the place of another client of the instance, with all that arrived from it."""
         self.rows, self.received, self.granted = former.rows, former.received, former.granted
-        self.refused, self.refusable = former.refused, former.refusable
+        self.rejected, self.rejected_limit = former.rejected, former.rejected_limit
         self.row_fields, self.last_step = former.row_fields, former.last_step
         self.shown, self.journal = former.shown, former.journal
         self._next_order = None if self.journal is None else 0

@@ -361,11 +361,11 @@ def _rows(peer: Peer, frame: Frame) -> None:
 
 def _wrong(peer: Peer, frame: Frame) -> None:
     count = frame.number
-    if not peer.row_fields or not 0 < count <= peer.refusable - peer.refused.count:
-        raise ConnectionRefusedByPeerError(f"It sent {count} refused rows that nobody asked for.")
+    if not peer.row_fields or not 0 < count <= peer.rejected_limit - peer.rejected.count:
+        raise ConnectionRefusedByPeerError(f"It sent {count} rejected rows that nobody asked for.")
     block = unpack_rows(frame.payload, peer.row_fields, count)
     check_rows(block, peer.instance_id, peer.last_step)
-    peer.refused.append(block, count)
+    peer.rejected.append(block, count)
 
 
 def _again(peer: Peer, frame: Frame) -> None:
