@@ -218,7 +218,7 @@ def test_robots_stand_on_any_ground(backend):
         (HeightField(heights, (0.1, 0.1)), up, 0.3),
     ):
         simulator = Simulator.build("ant", backend=backend, fixed_base=False, ground=ground)
-        positions = simulator.grounded(simulator.neutral())
+        positions = simulator.place_on_ground(simulator.neutral())
         lowest = -simulator.simulation.reach("robot", -normal, positions)
         assert lowest == pytest.approx(height, abs=1e-12)
 
@@ -237,7 +237,7 @@ def test_reach_of_shapes(backend):
 
 def test_snapshots_of_a_simulator(backend):
     simulator = Simulator.build("ant", backend=backend, fixed_base=False, period=2e-3)
-    simulator.start(simulator.grounded(simulator.neutral()), np.zeros(14))
+    simulator.start(simulator.place_on_ground(simulator.neutral()), np.zeros(14))
     simulator.step(20)
     state = simulator.snapshot()
     accelerations = simulator.robot_state.a.copy()

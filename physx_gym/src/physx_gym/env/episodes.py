@@ -18,7 +18,7 @@ from physx_gym.env.actions import Actions
 from physx_gym.env.observation_checks import ObservationChecks
 from physx_gym.env.pipeline_env import Info, PipelineEnv, Step
 from physx_gym.simulator.periods import Periods
-from physx_gym.simulator.simulator import Simulator, simulator_of
+from physx_gym.simulator.simulator import Simulator, make_simulator
 from physx_gym.spaces import copier, copy_tree, fill, neutral
 from physx_gym.telemetry.recording import Recording
 
@@ -71,7 +71,7 @@ class Episodes(PipelineEnv):
             ConfigError: An option cannot be.
         """
         if not isinstance(simulator, Simulator):
-            simulator, kwargs = simulator_of(simulator, kwargs), {}
+            simulator, kwargs = make_simulator(simulator, kwargs), {}
         inheritance.construct_next(Episodes, self, kwargs)
         inheritance.check_mode(render_mode, self.metadata["render_modes"])
         self.simulator, self.render_mode, self.debug = simulator, render_mode, bool(debug)

@@ -150,7 +150,7 @@ class RobotEnv(Episodes):
         lowest collision shape touches the ground. Called once at every reset; it draws from
         `np_random`, if at all.
         """
-        positions = self.simulator.grounded(self._neutral())
+        positions = self.simulator.place_on_ground(self._neutral())
         return positions, np.zeros(len(self.robot_state.v))
 
     def _initialize_buffers(self) -> None:

@@ -62,7 +62,7 @@ class AntEnv(RobotEnv):
         positions = self._neutral()
         middle = 0.5 * (self.simulator.layout.lower + self.simulator.layout.upper)
         positions[7:] = middle + self.np_random.uniform(-0.1, 0.1, 8)
-        return self.simulator.grounded(positions), self.np_random.normal(0.0, 0.05, 14)
+        return self.simulator.place_on_ground(positions), self.np_random.normal(0.0, 0.05, 14)
 
     def _initialize_buffers(self) -> None:
         self._place = self._before = float(self.robot_state.q[0])

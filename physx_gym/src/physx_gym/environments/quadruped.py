@@ -71,7 +71,7 @@ class QuadrupedEnv(RobotEnv):
     def _sample_state(self) -> tuple[Vector, Vector]:
         positions = self._neutral()
         positions[7:] = self._stand + self.np_random.uniform(-0.05, 0.05, 12)
-        return self.simulator.grounded(positions), np.zeros(18)
+        return self.simulator.place_on_ground(positions), np.zeros(18)
 
     def _initialize_buffers(self) -> None:
         self._previous[:] = 0.0

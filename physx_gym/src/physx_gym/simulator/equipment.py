@@ -1,4 +1,4 @@
-"""The motors and sensors of a simulation, read and driven at the moments of a control loop."""
+"""Motors and sensors of a simulation, driven and read by a control loop."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from physx_core.simulation import (
 from physx_core.typing import Vector
 
 _KINDS = {"ContactSensor": "Contact", "EffortSensor": "Effort", "ForceTorqueSensor": "ForceTorque"}
-"""Names of sensors' kinds in measurements, where they are not those of their classes."""
+"""Names of kinds of sensors in measurements, where they differ from the names of the classes."""
 
 
 def default_motors(layout: Layout, part: Part) -> tuple[Motor, ...]:
-    """Return a motor without imperfections for each joint that is driven by a limited torque."""
+    """Return an ideal motor for each joint that is driven by a limited torque."""
     modes = layout.modes or ("force",) * len(layout.joints)
     places = range(part.joints.start, part.joints.stop)
     driven = [i for i in places if modes[i] == "force" and math.isfinite(layout.max_torque[i])]
@@ -40,7 +40,7 @@ def default_motors(layout: Layout, part: Part) -> tuple[Motor, ...]:
 def default_sensors(
     simulation: Simulation, part: Part, motors: Sequence[Motor]
 ) -> tuple[Sensor, ...]:
-    """Return an encoder for each motor, and an inertial sensor on a base that floats."""
+    """Return an encoder for each motor and, if the base floats, an inertial sensor on it."""
     found: list[Sensor] = [Encoder(name=motor.joint, joint=motor.joint) for motor in motors]
     if part.floating and "accelerations" in simulation.features:
         base = simulation.layout.bodies[part.bodies.start]
@@ -60,8 +60,8 @@ class EquipmentState:
     """A snapshot of motors and sensors; plain and picklable.
 
     Attributes:
-        motors: Of the motors; None: there are none.
-        sensors: Of the sensors, likewise.
+        motors: State of the motors; None: there are none.
+        sensors: State of the sensors; None: there are none.
     """
 
     motors: MotorState | None
@@ -71,15 +71,15 @@ class EquipmentState:
 class Equipment:
     """Motors and sensors on a simulation.
 
-    They run once at each moment of the control loop where that is the same as before every physics
-    step: motors whose torque depends on the command alone, sensors without a past.
+    Motors whose torque depends on the command alone, and sensors without memory, run only when the
+    control loop commands and reads them; the others also before every physics step.
 
     Attributes:
-        motors: None: the robot has no motors.
-        sensors: None: there are no sensors.
+        motors: The motors; None: the robot has none.
+        sensors: The sensors; None: there are none.
         size: Number of values that the sensors measure.
-        most: Highest torques of the motors' shafts, shape (motors,), in N m or N.
-        command: Lets the motors take over their command, shape (motors,).
+        max_commands: Maximum torques of the motors' shafts, shape (motors,), in N m or N.
+        command: Sends a command, shape (motors,), to the motors.
         torques: Writes the torques on the motors' joints, shape (motors,), in N m or N.
     """
 
@@ -96,13 +96,13 @@ class Equipment:
         self.sensors = Sensors(simulation, world, sensors, random) if sensors else None
         self.size = 0 if self.sensors is None else self.sensors.size
         self._seen = np.zeros(0) if self.sensors is None else self.sensors.view
-        self.most = _highest(simulation.layout, motors)
-        self._steady = all(_steady(motor) for motor in motors)
-        self._drive = _Drive(simulation, motors)
+        self.max_commands = _max_commands(simulation.layout, motors)
+        self._memoryless = all(_is_memoryless(motor) for motor in motors)
+        self._direct = _DirectMotors(simulation, motors)
         self._lookup = _lookup(simulation.layout, self.sensor_list)
-        self.command: Callable[[Vector], None] = self._drive
-        self.torques: Callable[[Vector], None] = self._drive.torques
-        if self.motors is not None and not self._steady:
+        self.command: Callable[[Vector], None] = self._direct.command
+        self.torques: Callable[[Vector], None] = self._direct.torques
+        if self.motors is not None and not self._memoryless:
             self.command, self.torques = self.motors.set_commands, self._read_torques
         self._every = [
             1 if sensor.period is None else round(sensor.period / simulation.period)
@@ -113,7 +113,7 @@ class Equipment:
             for sensor in sensors
         )
         self._hooked = False
-        if self.motors is not None and not self._steady:
+        if self.motors is not None and not self._memoryless:
             self.motors.attach(simulation)
 
     @property
@@ -122,14 +122,14 @@ class Equipment:
         return () if self.sensors is None else self.sensors.sensors
 
     def begin(self, random: np.random.Generator, moment: int) -> None:
-        """Begin anew from the simulation's present state.
+        """Start from the simulation's present state.
 
         Args:
-            random: What errors of sensors are drawn from.
+            random: Generator of the errors of the sensors.
             moment: Measurements are read at multiples of so many physics steps.
         """
-        if self._steady:
-            self._drive.begin()
+        if self._memoryless:
+            self._direct.begin()
         elif self.motors is not None:
             self.motors.reset(self._simulation)
         if self.sensors is not None and self._lookup is None:
@@ -137,7 +137,7 @@ class Equipment:
             self._hook(moment)
 
     def _hook(self, moment: int) -> None:
-        """Let sensors measure before physics steps too, where that makes a difference."""
+        """Let sensors measure before physics steps too, if that makes a difference."""
         sensors = self.sensors
         if sensors is None:
             return
@@ -157,7 +157,7 @@ class Equipment:
         """Write what the sensors measure.
 
         Args:
-            state: Positions and velocities of the world, one after the other.
+            state: Positions, then velocities of the world, shape (nq + nv,).
             out: Shape (size,).
         """
         if self._lookup is not None:
@@ -167,7 +167,7 @@ class Equipment:
             out[:] = self._seen
 
     def by_kind(self, values: Vector) -> dict[str, Vector]:
-        """Return parts of an array of the sensors' values: for each kind (values, sensors)."""
+        """Return views of an array of the sensors' values: for each kind (values, sensors)."""
         found, begin = {}, 0
         sensors = self.sensor_list
         for kind in dict.fromkeys(type(sensor) for sensor in sensors):
@@ -179,14 +179,14 @@ class Equipment:
         return found
 
     def snapshot(self) -> EquipmentState:
-        """Return everything that `restore` needs to go on exactly from here."""
+        """Return everything that `restore` needs to continue exactly from here."""
         return EquipmentState(
             None if self.motors is None else self.motors.snapshot(),
             None if self.sensors is None else self.sensors.snapshot(),
         )
 
     def restore(self, state: EquipmentState, random: np.random.Generator, moment: int) -> None:
-        """Go back to a snapshot; see `begin` for the generator, which the snapshot winds back."""
+        """Return to a snapshot, with a generator that is in its state of then; see `begin`."""
         if self.motors is not None and state.motors is not None:
             self.motors.restore(state.motors)
         if self.sensors is not None and state.sensors is not None and self._lookup is None:
@@ -195,7 +195,7 @@ class Equipment:
             self._hook(moment)
 
 
-class _Drive:
+class _DirectMotors:
     """Motors whose torque depends on nothing but the command."""
 
     def __init__(self, simulation: Simulation, motors: Sequence[Motor]) -> None:
@@ -203,26 +203,26 @@ class _Drive:
         places = [layout.joints.index(each.joint) for each in motors if each.joint in layout.joints]
         self._places = np.array(places, np.intp)
         self._most = np.array([motor.max_torque for motor in motors])
-        tame = float(self._most.min(initial=np.inf))
-        self._tame = tame * tame  # square of a length up to which no command needs to be cut
+        weakest = float(self._most.min(initial=np.inf))
+        self._never_cut = weakest * weakest  # commands of a smaller squared length are not cut
         self._reduction = np.array([motor.reduction for motor in motors])
         self._geared = bool((self._reduction != 1.0).any())
         self._commands = simulation.commands()
-        self._own: Vector | None = None  # those of the motors, where they stand side by side
+        self._own: Vector | None = None  # view of the motors' commands, if they are adjacent
         first = places[0] if places else 0
         if places == list(range(first, first + len(places))):
             whole = len(places) == len(self._commands)
             self._own = self._commands if whole else self._commands[first : first + len(places)]
 
     def begin(self) -> None:
-        """Begin with commands of 0."""
+        """Start with commands of 0."""
         self._commands[:] = self._simulation.commands()
         self._commands[self._places] = 0.0
         self._simulation.set_commands(self._commands)
 
-    def __call__(self, command: Vector) -> None:
-        """Let torques act from now on."""
-        if command.dot(command) > self._tame:
+    def command(self, command: Vector) -> None:
+        """Apply torques, shape (motors,), from now on."""
+        if command.dot(command) > self._never_cut:
             command = np.minimum(np.maximum(command, -self._most), self._most)
         if self._geared:
             command = command * self._reduction
@@ -236,12 +236,15 @@ class _Drive:
         self._simulation.set_commands(self._commands)
 
     def torques(self, out: Vector) -> None:
-        """Write the torques on the joints, shape (motors,), as the joints' limits cut them."""
+        """Write the torques on the joints, shape (motors,), after clipping at the joint limits."""
         self._simulation.commands().take(self._places, None, out, "clip")
 
 
 def _lookup(layout: Layout, sensors: Sequence[Sensor]) -> Any:
-    """Return places of what sensors measure in positions and velocities; None: it is not there."""
+    """Return the places of the measured values in positions and velocities.
+
+    None: sensors measure something else, or with errors.
+    """
     found = []
     for sensor in sensors:
         exact = isinstance(sensor, Encoder) and sensor.reduction == 1.0 and sensor.period is None
@@ -254,15 +257,15 @@ def _lookup(layout: Layout, sensors: Sequence[Sensor]) -> Any:
     return np.array(found, np.intp) if found else None
 
 
-def _steady(motor: Motor) -> bool:
+def _is_memoryless(motor: Motor) -> bool:
     """Return whether a motor's torque depends on nothing but the command."""
-    rubs: Any = (motor.viscous, motor.dry)
-    friction = any(any(each) for each in rubs)
-    limited = math.isfinite(motor.max_velocity)
-    return not friction and not limited and motor.stiffness is None and motor.period is None
+    frictions: Any = (motor.viscous, motor.dry)
+    has_friction = any(any(each) for each in frictions)
+    is_limited = math.isfinite(motor.max_velocity)
+    return not has_friction and not is_limited and motor.stiffness is None and motor.period is None
 
 
-def _highest(layout: Layout, motors: Sequence[Motor]) -> Vector:
+def _max_commands(layout: Layout, motors: Sequence[Motor]) -> Vector:
     limits = dict(zip(layout.joints, layout.max_torque.tolist(), strict=True))
     found = [min(each.max_torque, limits[each.joint] / abs(each.reduction)) for each in motors]
     return np.array(found, np.float64)

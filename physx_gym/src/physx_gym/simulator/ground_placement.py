@@ -1,4 +1,4 @@
-"""How far a robot is from the ground that it shall stand on."""
+"""Placing robots and objects on the ground."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from physx_core.simulation import Ground, HeightField, Simulation, Stairs
 from physx_core.typing import Vector
 
 
-def rise(
+def offset_to_ground(
     simulation: Simulation, ground: Ground | Stairs | HeightField, name: str, positions: Vector
 ) -> Vector:
-    """Return the motion, shape (3,) in m, after which a robot or object touches the ground.
+    """Return the translation, shape (3,) in m, that puts a robot or object on the ground.
 
-    On a plane along its normal. On stairs and height fields upwards or downwards, above the highest
-    point that is under it.
+    On a plane it is along the normal; on stairs and height fields vertical, to the highest point
+    within the horizontal extent of the robot or object.
 
     Args:
-        simulation: Of a world with this ground.
+        simulation: Simulation of a world with this ground.
         ground: The ground.
         name: Name of the robot or object.
         positions: Of the whole world, shape (nq,).
@@ -33,16 +33,18 @@ def rise(
     if not np.isfinite([*sides, lowest]).all():
         return np.zeros(3)
     left, right, front, back = sides
-    return np.array([0.0, 0.0, _highest(ground, (-left, right), (-front, back)) - lowest])
+    return np.array([0.0, 0.0, _max_height(ground, (-left, right), (-front, back)) - lowest])
 
 
-def _highest(ground: Stairs | HeightField, x: tuple[float, float], y: tuple[float, float]) -> float:
-    """Return the highest point, in m, of a ground within ranges of x and y."""
+def _max_height(
+    ground: Stairs | HeightField, x: tuple[float, float], y: tuple[float, float]
+) -> float:
+    """Return the maximum height, in m, of a ground within ranges of x and y."""
     if isinstance(ground, Stairs):
         tops = [
             center[2] + 0.5 * size[2]
             for center, size in ground.boxes()
-            if _meet(x, center[0], size[0]) and _meet(y, center[1], size[1])
+            if _overlaps(x, center[0], size[0]) and _overlaps(y, center[1], size[1])
         ]
         return max(tops, default=0.0)
     part = ground.heights
@@ -55,5 +57,5 @@ def _highest(ground: Stairs | HeightField, x: tuple[float, float], y: tuple[floa
     return float(part.max())
 
 
-def _meet(ends: tuple[float, float], center: float, size: float) -> bool:
+def _overlaps(ends: tuple[float, float], center: float, size: float) -> bool:
     return ends[0] <= center + 0.5 * size and ends[1] >= center - 0.5 * size

@@ -1,15 +1,16 @@
-"""A world that is ready to run: options, forces, and the loop's steps."""
+"""A world with its engine, motors and sensors, ready to run."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from physx_core import checks
+from physx_core import checks, plugins
 from physx_core.errors import (
     ComponentNotFoundError,
     ConfigError,
@@ -17,18 +18,123 @@ from physx_core.errors import (
     SimulationError,
     UnknownOptionError,
 )
-from physx_core.simulation import Ground, HeightField, Robot, Stairs, World, Wrench
+from physx_core.simulation import (
+    Ground,
+    HeightField,
+    Layout,
+    Motor,
+    Part,
+    Robot,
+    Sensor,
+    Simulation,
+    Stairs,
+    State,
+    World,
+    Wrench,
+    with_rotors,
+)
 from physx_core.typing import Vector
-from physx_gym.simulator import options as nested_options
-from physx_gym.simulator.equipped_world import Engine, EquippedWorld, positive_or_none
+from physx_gym.defaults import BACKEND
+from physx_gym.env.shared_arrays import SharedArrays
+from physx_gym.simulator import options as option_tables
+from physx_gym.simulator.equipment import Equipment, default_motors, default_sensors
+from physx_gym.simulator.ground_placement import offset_to_ground
+from physx_gym.simulator.states import RobotState, StepperState
+
+_STEPPER = ("control_period", "observe_period")
 
 
-class Simulator(EquippedWorld):
+@dataclass(frozen=True)
+class Engine:
+    """A built engine; it can be rebuilt from the simulator's description.
+
+    Attributes:
+        simulation: The engine's simulation.
+        equipment: The motors and sensors on it.
+        part: Place of the controlled robot in the state.
+        first: The state right after building.
+    """
+
+    simulation: Simulation
+    equipment: Equipment
+    part: Part
+    first: State
+
+
+class Simulator(SharedArrays):
     """A world ready to run, whose engine is built when it is first needed.
 
-    It can be pickled and copied, also while it runs: the engine is then built anew and goes on from
-    the same state. See `EquippedWorld` for its constructor and attributes.
+    It can be pickled and copied, even while it runs: the copy builds an engine of its own and
+    continues from the same state.
+
+    Attributes:
+        world: The simulated world, without the rotors that the motors add.
+        backend: Reference of the engine.
+        control_period: Time between two commands, in s; None: a step of the environment.
+        observe_period: Time between two observations, in s; None: as between two commands.
+        builds: How often the engine has been built.
+        is_simulation_running: Whether an episode runs; shape ().
+        stepper_state: Time and number of physics steps.
+        values: All measured values: time, positions, velocities, sensors.
+        positions: Of the whole world, shape (nq,); a view of `values`.
+        velocities: Of the whole world, shape (nv,); a view of `values`.
+        robot_state: State of the controlled robot; its positions and velocities are views too.
+        measurements: The measured values as nested dictionaries of views.
     """
+
+    _left_out: ClassVar[frozenset[str]] = frozenset({"_engine"})
+
+    def __init__(
+        self,
+        world: World,
+        *,
+        backend: Any = BACKEND,
+        robot: str | None = None,
+        motors: Sequence[Motor] | None = None,
+        sensors: Sequence[Sensor] | None = None,
+        control_period: float | None = None,
+        observe_period: float | None = None,
+    ) -> None:
+        """Describe a simulator.
+
+        Args:
+            world: The world to simulate.
+            backend: Reference of the engine.
+            robot: Name of the controlled robot; None: the first.
+            motors: None: an ideal motor on each of the robot's joints that has a torque limit.
+            sensors: None: an encoder on each motor's joint and, if the base floats, an inertial
+                sensor on the root link, all ideal.
+            control_period: In s; None: once a step of the environment.
+            observe_period: In s; None: as often as commands.
+
+        Raises:
+            ConfigError: If an option is invalid.
+            ComponentNotFoundError: If the world has no robot of that name.
+        """
+        if not isinstance(world, World):
+            raise ConfigError(f"A Simulator needs a World, not {world!r}.")
+        names = [each.name for each in world.robots]
+        if not names:
+            raise ConfigError("The world has no robot to control: World([Robot(...)], ...).")
+        if robot is not None and robot not in names:
+            raise ComponentNotFoundError("robot", str(robot), "The world", names)
+        self.world, self.backend = world, backend
+        self._robot_name = names[0] if robot is None else robot
+        self._given_motors = _check_list("motors", Motor, motors)
+        self._given_sensors = _check_list("sensors", Sensor, sensors)
+        self._motors: tuple[Motor, ...] = self._given_motors or ()
+        self._sensors: tuple[Sensor, ...] = self._given_sensors or ()
+        self.control_period = _positive_or_none("control_period", control_period)
+        self.observe_period = _positive_or_none("observe_period", observe_period)
+        self.builds = 0
+        self.is_simulation_running = np.zeros((), np.bool_)
+        self.stepper_state = StepperState(dt=world.period)
+        self._random = np.random.default_rng()
+        self._forces: list[tuple[int, Wrench]] = []
+        self._pending: list[tuple[int, Wrench]] = []
+        self._moment = 1
+        self._engine: Engine | None = None
+        self._stale = False
 
     @classmethod
     def build(
@@ -43,22 +149,171 @@ class Simulator(EquippedWorld):
         package_dirs: Mapping[str, str | Path] | None = None,
         **options: Any,
     ) -> Self:
-        """Make a simulator of one robot.
+        """Return a simulator of one robot.
 
         Args:
-            urdf: Path of its URDF file, or the name of one that the backend knows.
+            urdf: Path of its URDF file, or the name of a robot that the backend provides.
             fixed_base: Whether its root link is welded to the world.
-            ground: What it stands on; None: a plane under a robot whose base floats, or nothing.
+            ground: The ground; None: a plane under a robot whose base floats, otherwise none.
             period: Of the physics, in s.
             gravity: In m/s².
-            objects: What else is in the world.
-            package_dirs: Folders of the packages that its meshes are in.
+            objects: Other objects in the world.
+            package_dirs: Folders of the packages that contain its meshes.
             options: Of `Simulator`.
         """
         if ground is None and not fixed_base:
             ground = Ground()
         robot = Robot(urdf, fixed_base=fixed_base, package_dirs=package_dirs or {})
         return cls(World([robot], period, gravity, objects, ground), **options)
+
+    # The engine ------------------------------------------------------------------------------
+
+    def _built(self) -> Engine:
+        """Return the engine; build it first if it is missing or if options have changed."""
+        engine = self._engine
+        if engine is None or self._stale:
+            engine = self._build()
+            self._allocate(engine)
+        return engine
+
+    def _build(self) -> Engine:
+        """Build engine, motors and sensors."""
+        self._drop()
+        world = with_rotors(self.world, self._given_motors or ())
+        simulation: Simulation = plugins.resolve("backend", self.backend).build(world)
+        part = simulation.layout.parts[self._robot_name]
+        if self._given_motors is None:
+            self._motors = default_motors(simulation.layout, part)
+        if self._given_sensors is None:
+            self._sensors = default_sensors(simulation, part, self._motors)
+        random = np.random.default_rng(0)  # biases are drawn again at each start
+        equipment = Equipment(simulation, world, self._motors, self._sensors, random)
+        self._sensors = equipment.sensor_list
+        self._engine = Engine(simulation, equipment, part, simulation.snapshot())
+        self._stale = False
+        self.builds += 1
+        return self._engine
+
+    def _drop(self) -> None:
+        if self._engine is not None:
+            self._engine.simulation.close()
+            self._engine = None
+
+    def _allocate(self, engine: Engine) -> None:
+        """Allocate the buffers of the measured values: views of one array."""
+        layout, part = engine.simulation.layout, engine.part
+        self._sizes = 1 + layout.nq, 1 + layout.nq + layout.nv
+        self.values = np.zeros(self._sizes[1] + engine.equipment.size)
+        self.positions = self.values[1 : self._sizes[0]]
+        self.velocities = self.values[self._sizes[0] : self._sizes[1]]
+        self._sensed, self._state = self.values[self._sizes[1] :], self.values[1 : self._sizes[1]]
+        q, v = self.positions[part.positions], self.velocities[part.velocities]
+        self.robot_state = RobotState(q, v, len(self._motors), self.stepper_state)
+        self.robot_state.connect(engine.simulation, engine.equipment, part)
+        self.measurements = self.views_of(self.values)
+        np.copyto(self.positions, engine.first.positions)
+
+    def views_of(self, values: Vector) -> dict[str, Any]:
+        """Return an array laid out like `values` as nested dictionaries of views."""
+        engine = self._built()
+        q, v = values[1 : self._sizes[0]], values[self._sizes[0] : self._sizes[1]]
+        agent = {"q": q[engine.part.positions], "v": v[engine.part.velocities]}
+        found: dict[str, Any] = {"t": values[:1].reshape(()), "states": {"agent": agent}}
+        sensed = engine.equipment.by_kind(values[self._sizes[1] :])
+        if sensed:
+            found["measurements"] = sensed
+        return found
+
+    def prepare(self) -> None:
+        """Build the engine now, unless it is built."""
+        self._built()
+
+    @property
+    def motors(self) -> tuple[Motor, ...]:
+        """The motors of the controlled robot, in the order of its command."""
+        if not self.builds:  # only the engine knows the robot's joints
+            self.prepare()
+        return self._motors
+
+    @property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """The sensors, grouped by kind."""
+        if not self.builds:
+            self.prepare()
+        return self._sensors
+
+    @property
+    def sensed(self) -> dict[str, Vector]:
+        """The latest measurement of the sensors of each kind, shape (values, sensors)."""
+        self.prepare()
+        found: dict[str, Vector] = self.measurements.get("measurements", {})
+        return found
+
+    @property
+    def simulation(self) -> Simulation:
+        """The engine's simulation."""
+        return self._built().simulation
+
+    @property
+    def layout(self) -> Layout:
+        """Names and places in the state of the whole world."""
+        return self._built().simulation.layout
+
+    @property
+    def robot(self) -> Part:
+        """Place of the controlled robot in the state."""
+        return self._built().part
+
+    @property
+    def engine(self) -> str:
+        """Name of the engine."""
+        return self._built().simulation.engine
+
+    @property
+    def period(self) -> float:
+        """Time of a physics step, in s."""
+        return self.world.period
+
+    def max_commands(self) -> Vector:
+        """Return the maximum torques of the motors' shafts, shape (motors,), in N m or N."""
+        return self._built().equipment.max_commands.copy()
+
+    # Initial positions -----------------------------------------------------------------------
+
+    def neutral(self) -> Vector:
+        """Return the robot's neutral positions, shape (nq,).
+
+        Joints are at 0, or in the middle of their limits if 0 is outside of them; a floating base
+        is where the world puts it.
+        """
+        engine = self._built()
+        found: Vector = engine.first.positions[engine.part.positions].copy()
+        layout, joints = engine.simulation.layout, engine.part.joints
+        lower, upper = layout.lower[joints], layout.upper[joints]
+        joint_positions = found[len(found) - len(lower) :]
+        joint_positions.fill(0.0)
+        outside = (lower > 0.0) | (upper < 0.0)
+        joint_positions[outside] = 0.5 * (lower + upper)[outside] if outside.any() else 0.0
+        return found
+
+    def place_on_ground(self, positions: Vector) -> Vector:
+        """Return the robot's positions with a floating base moved so that it stands on the ground.
+
+        Args:
+            positions: Of the robot, shape (nq,).
+
+        Returns:
+            New positions, with the base moved along the ground's normal until the robot touches
+            it; unchanged if there is no ground or nothing that can touch it.
+        """
+        engine = self._built()
+        q = np.array(positions, np.float64)
+        if self.world.ground is None or not engine.part.floating:
+            return q
+        whole = engine.first.positions.copy()
+        whole[engine.part.positions] = q
+        q[:3] += offset_to_ground(engine.simulation, self.world.ground, engine.part.name, whole)
+        return q
 
     # Options ---------------------------------------------------------------------------------
 
@@ -70,34 +325,34 @@ class Simulator(EquippedWorld):
             ``"stepper"``; ``"motors"`` by joint; ``"sensors"`` by name.
         """
         return {
-            "world": nested_options.world_options(self.world),
+            "world": option_tables.world_options(self.world),
             "stepper": {name: getattr(self, name) for name in _STEPPER},
-            "motors": nested_options.motor_options(self.motors),
-            "sensors": nested_options.sensor_options(self.sensors),
+            "motors": option_tables.motor_options(self.motors),
+            "sensors": option_tables.sensor_options(self.sensors),
         }
 
     def set_options(self, options: Mapping[str, Any]) -> None:
-        """Change options; those that are left out stay. The engine is rebuilt if it has to be.
+        """Change options; those that are left out stay. The engine is rebuilt if necessary.
 
         Args:
             options: In the form that `get_options` returns.
 
         Raises:
-            EpisodeError: An episode runs.
-            UnknownOptionError: There is no option of that name.
-            ConfigError: A value cannot be.
+            EpisodeError: If an episode runs.
+            UnknownOptionError: If there is no option of that name.
+            ConfigError: If a value is out of range.
         """
         self._check_stopped("set_options")
-        nested_options.check_known("", options, ("world", "stepper", "motors", "sensors"))
-        world = nested_options.change_world(self.world, options.get("world", {}))
+        option_tables.check_known("", options, ("world", "stepper", "motors", "sensors"))
+        world = option_tables.change_world(self.world, options.get("world", {}))
         motors = {motor.joint: motor for motor in self.motors}
-        motors = nested_options.change_each("motors", motors, options.get("motors", {}))
+        motors = option_tables.change_each("motors", motors, options.get("motors", {}))
         sensors = {sensor.name: sensor for sensor in self.sensors}
-        sensors = nested_options.change_each("sensors", sensors, options.get("sensors", {}))
+        sensors = option_tables.change_each("sensors", sensors, options.get("sensors", {}))
         stepper = options.get("stepper", {})
-        nested_options.check_known("stepper", stepper, _STEPPER)
+        option_tables.check_known("stepper", stepper, _STEPPER)
         for name, value in stepper.items():
-            setattr(self, name, positive_or_none(name, value))
+            setattr(self, name, _positive_or_none(name, value))
         if world is not self.world:
             self.world, self._stale, self.stepper_state.dt = world, True, world.period
         if tuple(motors.values()) != self.motors:
@@ -108,32 +363,32 @@ class Simulator(EquippedWorld):
             self._stale = True
 
     def seed(self, seed: Any) -> None:
-        """Draw all errors of sensors from a seed, from the next start on."""
+        """Seed the errors of the sensors, from the next start on."""
         self._random = np.random.default_rng(seed)
 
     def set_moment(self, steps: int) -> None:
-        """Say that measurements are read at multiples of so many physics steps from a start.
+        """Declare that measurements are only read at multiples of so many physics steps.
 
-        Sensors then measure no more often than that where it makes no difference.
+        Sensors then measure no more often than that, unless it makes a difference.
         """
         self._moment = steps
 
     # Forces ----------------------------------------------------------------------------------
 
     def register_force(self, wrench: Wrench, begin: float = 0.0) -> None:
-        """Let a force act in the episode that comes; to be called in `RobotEnv._setup`.
+        """Apply a force during the next episode; to be called in `RobotEnv._setup`.
 
-        `RobotEnv.reset` first removes what was registered before. To push a robot in an episode,
-        use ``simulation.apply_wrench``.
+        `RobotEnv.reset` first removes all forces registered before. To push a robot during an
+        episode, use ``simulation.apply_wrench``.
 
         Args:
-            wrench: Held, for a while, or along a profile; see `Wrench`.
-            begin: When it begins, in s after the episode's begin, rounded to a physics step.
+            wrench: Constant, limited in time, or along a profile; see `Wrench`.
+            begin: Time from the start of the episode, in s, rounded to a physics step.
 
         Raises:
-            EpisodeError: An episode runs.
-            ConfigError: It is no wrench, or begins before the episode.
-            ComponentNotFoundError: The world has no body of that name.
+            EpisodeError: If an episode runs.
+            ConfigError: If it is not a `Wrench`, or begins before the episode.
+            ComponentNotFoundError: If the world has no body of that name.
         """
         self._check_stopped("register_force")
         if not isinstance(wrench, Wrench):
@@ -145,10 +400,10 @@ class Simulator(EquippedWorld):
         self._forces = sorted([*self._forces, (frame, wrench)], key=lambda pair: pair[0])
 
     def remove_all_forces(self) -> None:
-        """Forget all registered forces.
+        """Remove all registered forces.
 
         Raises:
-            EpisodeError: An episode runs.
+            EpisodeError: If an episode runs.
         """
         self._check_stopped("remove_all_forces")
         self._forces = []
@@ -156,15 +411,15 @@ class Simulator(EquippedWorld):
     # Running ---------------------------------------------------------------------------------
 
     def start(self, positions: Vector, velocities: Vector) -> None:
-        """Begin at a state, at time 0.
+        """Start from a state, at time 0.
 
         Args:
-            positions: Of the robot that acts, shape (nq,), or of the whole world.
+            positions: Of the controlled robot, shape (nq,), or of the whole world.
             velocities: Likewise, shape (nv,).
 
         Raises:
-            EpisodeError: It runs already.
-            SimulationError: The state makes no sense.
+            EpisodeError: If an episode runs already.
+            SimulationError: If the state has the wrong size or is not finite.
         """
         self._check_stopped("start")
         engine = self._built()
@@ -177,48 +432,45 @@ class Simulator(EquippedWorld):
         engine.equipment.begin(self._random, self._moment)
         self._pending = list(self._forces)
         self.stepper_state.iter = 0
-        self._push(engine)
+        self._apply_forces(engine)
         self._measure(engine)
         self.robot_state.expire()
         self.is_simulation_running[...] = True
 
     def apply_command(self) -> None:
-        """Let the motors take over ``robot_state.command``."""
+        """Send ``robot_state.command`` to the motors."""
         engine = self._engine or self._built()
         engine.equipment.command(self.robot_state.command)
 
     def step(self, steps: int) -> None:
-        """Simulate physics steps, and measure.
-
-        Args:
-            steps: How many.
+        """Simulate a number of physics steps, then measure.
 
         Raises:
-            EpisodeError: It does not run.
-            SimulationError: The state is no longer finite.
+            EpisodeError: If no episode runs.
+            SimulationError: If the state is no longer finite.
         """
         engine, stepper = self._engine, self.stepper_state
         if engine is None or not self.is_simulation_running:
-            raise EpisodeError("The simulator does not run: call start, or reset.")
+            raise EpisodeError("The simulator is not running: call start, or reset.")
         if self._pending:
-            steps = self._step_pushed(engine, steps)
+            steps = self._step_to_forces(engine, steps)
         engine.simulation.step(steps)
         stepper.iter += steps
         self._measure(engine)
 
-    def _step_pushed(self, engine: Engine, steps: int) -> int:
-        """Simulate to the last force that begins within so many steps; return what is left."""
+    def _step_to_forces(self, engine: Engine, steps: int) -> int:
+        """Simulate up to the last force that begins within these steps; return the rest."""
         stepper = self.stepper_state
         while self._pending and self._pending[0][0] < stepper.iter + steps:
             ahead = self._pending[0][0] - stepper.iter
             engine.simulation.step(ahead)
             stepper.iter += ahead
             steps -= ahead
-            self._push(engine)
+            self._apply_forces(engine)
         return steps
 
-    def _push(self, engine: Engine) -> None:
-        """Let the registered forces act whose time has come."""
+    def _apply_forces(self, engine: Engine) -> None:
+        """Apply the registered forces that are due."""
         while self._pending and self._pending[0][0] <= self.stepper_state.iter:
             engine.simulation.apply_wrench(self._pending.pop(0)[1])
 
@@ -230,11 +482,11 @@ class Simulator(EquippedWorld):
         engine.equipment.measure(self._state, self._sensed)
 
     def stop(self) -> None:
-        """End the episode; what was measured last stays. Stopping again does nothing."""
+        """End the episode; the last measurement stays. Stopping again does nothing."""
         self.is_simulation_running[...] = False
 
     def close(self) -> None:
-        """Stop, and free the engine; it is built again when it is next needed."""
+        """Stop, and free the engine; it is rebuilt when it is next needed."""
         self.stop()
         if self._engine is not None:
             self.robot_state.disconnect()
@@ -244,7 +496,7 @@ class Simulator(EquippedWorld):
     # State -----------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """Return everything that `restore` needs to go on exactly from here; plain data."""
+        """Return everything that `restore` needs to continue exactly from here; plain data."""
         engine = self._built()
         return {
             "simulation": engine.simulation.snapshot(),
@@ -262,17 +514,15 @@ class Simulator(EquippedWorld):
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go back to a snapshot.
+        """Return to a snapshot.
 
         Raises:
-            SimulationError: It is of another simulator.
+            SimulationError: If the snapshot is of another simulator.
         """
-        self._restore(self._built(), state)
-
-    def _restore(self, engine: Engine, state: Mapping[str, Any]) -> None:
+        engine = self._built()
         values: Any = state.get("values") if isinstance(state, Mapping) else None
         if np.shape(values) != self.values.shape:
-            raise SimulationError("The snapshot is not of this simulator: its values differ.")
+            raise SimulationError("The snapshot is not of this simulator: its values differ in size.")
         engine.simulation.restore(state["simulation"])
         self._random.bit_generator.state = state["random"]
         self._moment = state["moment"]
@@ -286,38 +536,36 @@ class Simulator(EquippedWorld):
         self.is_simulation_running[...] = state["running"]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the description and the buffers, with a snapshot of the engine."""
+        """Return the description, the buffers, and a snapshot of the engine."""
         found = super().__getstate__()
         if self._engine is not None and not self._stale:
             found["_snapshot"] = self.snapshot()
         return found
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take up description and buffers, and build the engine."""
+        """Restore description and buffers, and build the engine."""
         snapshot = state.pop("_snapshot", None)
         super().__setstate__(state)
         self._engine, self._stale = None, True
         if snapshot is not None:
             engine = self._build()
             self.robot_state.connect(engine.simulation, engine.equipment, engine.part)
-            self._restore(engine, snapshot)
+            self.restore(snapshot)
 
     def _check_stopped(self, method: str) -> None:
         if self.is_simulation_running:
             raise EpisodeError(
-                f"{method} is not for a running episode: call stop() first, or do it in _setup, "
-                "which reset calls."
+                f"{method} cannot be called during an episode: call stop() first, or do it in "
+                "_setup, which reset calls."
             )
 
 
-_STEPPER = ("control_period", "observe_period")
-
-
-def simulator_of(thing: Any, options: Mapping[str, Any]) -> Simulator:
-    """Return a simulator of a world, or of a robot's file or name.
+def make_simulator(thing: Any, options: Mapping[str, Any]) -> Simulator:
+    """Return a simulator of a world, or of the file or name of a robot.
 
     Raises:
-        ConfigError: It is none of these, or an option does not exist.
+        ConfigError: If the thing is none of these.
+        UnknownOptionError: If there is no option of a name.
     """
     make: Any = Simulator if isinstance(thing, World) else Simulator.build
     if not isinstance(thing, (World, str, Path)):
@@ -331,12 +579,35 @@ def simulator_of(thing: Any, options: Mapping[str, Any]) -> Simulator:
     unknown = set(options) - known
     if unknown:
         raise UnknownOptionError("Simulator", unknown, known)
-    found: Simulator = make(thing, **options)
+    simulator: Simulator = make(thing, **options)
+    return simulator
+
+
+def _check_list(option: str, kind: type[Any], given: Any) -> tuple[Any, ...] | None:
+    """Return a list of motors or sensors as a tuple; None stays None.
+
+    Raises:
+        ConfigError: If it is anything else.
+    """
+    if given is None:
+        return None
+    name = kind.__name__
+    wanted = f"{option} must be a list of {name}s, as in [{name}(...)]"
+    if isinstance(given, (str, Mapping)) or not isinstance(given, Iterable):
+        raise ConfigError(f"{wanted}, not {given!r}.")
+    found = tuple(given)
+    for each in found:
+        if not isinstance(each, kind):
+            raise ConfigError(f"{wanted}; {each!r} is not a {name}.")
     return found
 
 
+def _positive_or_none(option: str, value: float | None) -> float | None:
+    return None if value is None else checks.positive(option, value)
+
+
 def _whole(kind: str, given: Any, first: Vector, part: slice) -> Vector:
-    """Return a vector of the whole world with that of a robot in its place."""
+    """Return a vector of the whole world, given that of the robot or the whole one."""
     vector = np.asarray(given, np.float64)
     if vector.shape == first.shape:
         return vector

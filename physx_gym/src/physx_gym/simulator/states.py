@@ -1,4 +1,4 @@
-"""What a running simulation tells: the state of the robot that acts, and of the stepper."""
+"""State of the controlled robot and of the stepper."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from physx_gym.simulator.equipment import Equipment
 
 @dataclass
 class StepperState:
-    """Where an episode is in time.
+    """Progress of an episode.
 
     Attributes:
-        t: Time since its begin, in s.
+        t: Time since its start, in s.
         dt: Time of a physics step, in s.
-        iter: Physics steps since its begin.
+        iter: Physics steps since its start.
     """
 
     t: float = 0.0
@@ -29,19 +29,19 @@ class StepperState:
 
 
 class RobotState(SharedArrays):
-    """State of the robot that acts; the arrays stay the same and are updated in place.
+    """State of the controlled robot; the arrays stay the same and are updated in place.
 
     Attributes:
         q: Positions, shape (nq,), in the convention of `Layout`.
         v: Velocities, shape (nv,).
-        command: Command of the motors, shape (motors,), in N m or N of their shafts.
+        command: Torques commanded on the motors' shafts, shape (motors,), in N m or N.
     """
 
     _left_out: ClassVar[frozenset[str]] = frozenset({"_simulation", "_equipment"})
 
     def __init__(self, q: Vector, v: Vector, motors: int, stepper: StepperState) -> None:
         self.q, self.v = q, v
-        # Side by side, as they are recorded.
+        # Adjacent in memory, as they are recorded together.
         self._a, self.command, self._torques = np.split(
             np.zeros(len(v) + 2 * motors), [len(v), len(v) + motors]
         )
@@ -58,7 +58,7 @@ class RobotState(SharedArrays):
         self._when = -1
 
     def disconnect(self) -> None:
-        """Keep what was read last from now on."""
+        """Keep the last values from now on."""
         self._simulation = self._equipment = None
 
     @property
@@ -74,7 +74,7 @@ class RobotState(SharedArrays):
         return self._torques
 
     def refresh(self) -> None:
-        """Bring `a` and `torques` to the present."""
+        """Update `a` and `torques`."""
         simulation, equipment, frame = self._simulation, self._equipment, self._stepper.iter
         if self._when == frame or simulation is None or equipment is None:
             return
@@ -85,10 +85,10 @@ class RobotState(SharedArrays):
         equipment.torques(self._torques)
 
     def expire(self) -> None:
-        """Note that the simulation is in another state without having gone on."""
+        """Note that the simulation's state was set, not simulated."""
         self._when = -1
 
     def recall(self, accelerations: Vector, torques: Vector) -> None:
-        """Take up what a snapshot knew, and the engine forgets."""
+        """Restore what engines do not keep in their snapshots."""
         self._when = self._stepper.iter
         self._a[:], self._torques[:] = accelerations, torques
