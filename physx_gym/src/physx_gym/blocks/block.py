@@ -12,7 +12,7 @@ import numpy as np
 from physx_core.errors import ConfigError, SimulationError
 from physx_core.typing import Vector
 from physx_gym.env.pipeline_env import PipelineEnv
-from physx_gym.env.shared_arrays import SharedArrays
+from physx_gym.shared_arrays import SharedArrays
 from physx_gym.spaces import neutral
 
 

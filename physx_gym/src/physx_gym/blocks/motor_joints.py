@@ -10,7 +10,7 @@ import numpy as np
 from physx_core.errors import ConfigError, nearest
 from physx_core.simulation import Encoder
 from physx_core.typing import Vector
-from physx_gym.env.shared_arrays import SharedArrays
+from physx_gym.shared_arrays import SharedArrays
 
 if TYPE_CHECKING:
     from physx_gym.env.layers.layer import PipelineEnv

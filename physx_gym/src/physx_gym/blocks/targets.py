@@ -7,7 +7,7 @@ from numpy import add, fmax, fmin, multiply, negative, sqrt, subtract
 
 from physx_core.errors import ConfigError
 from physx_core.typing import Vector
-from physx_gym.env.shared_arrays import SharedArrays
+from physx_gym.shared_arrays import SharedArrays
 
 _ROUNDING = 1e-12
 """By how much of a bound's size rounding may carry a target beyond it."""

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from physx_core.errors import ActionError
-from physx_gym.env.shared_arrays import SharedArrays
+from physx_gym.shared_arrays import SharedArrays
 from physx_gym.spaces import Path, fill, format_path
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from physx_core.typing import Vector
+from physx_gym.defaults import BACKEND
 from physx_gym.env.layers.layer import Info
 from physx_gym.environments import limits
 from physx_gym.environments.one_motor import OneMotorEnv
@@ -27,7 +28,7 @@ class AcrobotEnv(OneMotorEnv):
     The task is that of R. S. Sutton, "Generalization in reinforcement learning", 1996.
     """
 
-    def __init__(self, *, backend: Any = "dart", continuous: bool = False, **options: Any) -> None:
+    def __init__(self, *, backend: Any = BACKEND, continuous: bool = False, **options: Any) -> None:
         """Make the environment.
 
         Args:

@@ -10,6 +10,7 @@ from gymnasium import spaces
 
 from physx_core.simulation import Ground, Robot, World
 from physx_core.typing import Vector
+from physx_gym.defaults import BACKEND
 from physx_gym.env.layers.layer import Info
 from physx_gym.env.robot_env import RobotEnv
 from physx_gym.environments import limits
@@ -33,7 +34,7 @@ class AntEnv(RobotEnv):
     advantage estimation", 2015, with another robot.
     """
 
-    def __init__(self, *, backend: Any = "dart", **options: Any) -> None:
+    def __init__(self, *, backend: Any = BACKEND, **options: Any) -> None:
         """Make the environment.
 
         Args:

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from physx_core.components import Factory
 from physx_core.simulation import JointSettings, Motor, Robot, World
 from physx_core.typing import Vector
+from physx_gym.defaults import BACKEND
 from physx_gym.env.layers.layer import Info
 from physx_gym.env.robot_env import RobotEnv
 from physx_gym.environments import limits
@@ -36,7 +37,7 @@ class ArmReachEnv(RobotEnv):
     truncated after 100 steps of 40 ms.
     """
 
-    def __init__(self, *, backend: Any = "dart", **options: Any) -> None:
+    def __init__(self, *, backend: Any = BACKEND, **options: Any) -> None:
         """Make the environment.
 
         Args:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from physx_core.typing import Vector
+from physx_gym.defaults import BACKEND
 from physx_gym.env.layers.layer import Info
 from physx_gym.environments import limits
 from physx_gym.environments.one_motor import OneMotorEnv
@@ -28,7 +29,7 @@ class CartpoleEnv(OneMotorEnv):
     that can solve difficult learning control problems", 1983.
     """
 
-    def __init__(self, *, backend: Any = "dart", continuous: bool = False, **options: Any) -> None:
+    def __init__(self, *, backend: Any = BACKEND, continuous: bool = False, **options: Any) -> None:
         """Make the environment.
 
         Args:

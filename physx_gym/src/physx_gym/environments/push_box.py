@@ -12,6 +12,7 @@ from gymnasium import spaces
 from physx_core.components import Factory
 from physx_core.simulation import Box, Ground, JointSettings, Motor, Robot, World
 from physx_core.typing import Vector
+from physx_gym.defaults import BACKEND
 from physx_gym.env.layers.layer import Info
 from physx_gym.env.robot_env import RobotEnv
 from physx_gym.environments import limits
@@ -35,7 +36,7 @@ class PushBoxEnv(RobotEnv):
     which terminates. It is truncated after 200 steps of 50 ms, or where the box is out of reach.
     """
 
-    def __init__(self, *, backend: Any = "dart", **options: Any) -> None:
+    def __init__(self, *, backend: Any = BACKEND, **options: Any) -> None:
         """Make the environment.
 
         Args:

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from physx_core.rotations import rotate_back_rows
 from physx_core.simulation import Ground, Robot, World
 from physx_core.typing import Vector
+from physx_gym.defaults import BACKEND
 from physx_gym.env.layers.layer import Info
 from physx_gym.env.robot_env import RobotEnv
 from physx_gym.environments import limits
@@ -37,7 +38,7 @@ class QuadrupedEnv(RobotEnv):
     0.12 m or leans by more than 1 rad, and is truncated after 1000 steps of 20 ms.
     """
 
-    def __init__(self, *, backend: Any = "dart", speed: float = 0.6, **options: Any) -> None:
+    def __init__(self, *, backend: Any = BACKEND, speed: float = 0.6, **options: Any) -> None:
         """Make the environment.
 
         Args:

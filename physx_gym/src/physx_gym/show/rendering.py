@@ -13,6 +13,7 @@ from physx_core import plugins
 from physx_core.components import Factory, Visualizer
 from physx_core.errors import UnknownOptionError, VisualizerError
 from physx_core.simulation import World
+from physx_gym.defaults import VIEWER
 from physx_gym.show.display import has_display
 from physx_gym.show.drawing import WorldDrawing
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from physx_gym.env.pipeline_env import PipelineEnv
 
 MODES = ("human", "rgb_array")
-VIEWER = "rerun"
-"""Visualizer that is used unless another one is named."""
 PICTURE_SIZE = (640, 480)
 """Width and height of a picture, in pixels, unless ``viewer_kwargs`` says otherwise."""
 
@@ -34,7 +33,7 @@ def open_viewer(title: str, instances: int = 1, **options: Any) -> Visualizer:
     Args:
         title: What its recording is called.
         instances: How many worlds are shown.
-        options: Of the visualizer; ``visualizer`` is its reference, `VIEWER` without it.
+        options: Of the visualizer; ``visualizer`` is its reference, by default `VIEWER`.
 
     Raises:
         PluginNotFoundError: It is not installed; the message says how to install it.

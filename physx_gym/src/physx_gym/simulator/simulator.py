@@ -35,7 +35,7 @@ from physx_core.simulation import (
 )
 from physx_core.typing import Vector
 from physx_gym.defaults import BACKEND
-from physx_gym.env.shared_arrays import SharedArrays
+from physx_gym.shared_arrays import SharedArrays
 from physx_gym.simulator import options as option_tables
 from physx_gym.simulator.equipment import Equipment, default_motors, default_sensors
 from physx_gym.simulator.ground_placement import offset_to_ground
@@ -522,7 +522,7 @@ class Simulator(SharedArrays):
         engine = self._built()
         values: Any = state.get("values") if isinstance(state, Mapping) else None
         if np.shape(values) != self.values.shape:
-            raise SimulationError("The snapshot is not of this simulator: its values differ in size.")
+            raise SimulationError("The snapshot is not of this simulator: its size differs.")
         engine.simulation.restore(state["simulation"])
         self._random.bit_generator.state = state["random"]
         self._moment = state["moment"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from physx_core.simulation import Part, Simulation
 from physx_core.typing import Vector
-from physx_gym.env.shared_arrays import SharedArrays
+from physx_gym.shared_arrays import SharedArrays
 from physx_gym.simulator.equipment import Equipment
 
 

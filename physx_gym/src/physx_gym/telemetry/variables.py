@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physx_core.errors import ConfigError
-from physx_gym.env.shared_arrays import SharedArrays
+from physx_gym.shared_arrays import SharedArrays
 
 Array = NDArray[Any]
 Leaf = tuple[tuple[Any, ...], Array]
