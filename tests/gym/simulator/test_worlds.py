@@ -176,7 +176,11 @@ def test_after_close():
     ("options", "error", "message"),
     [
         ({"render_mode": 3}, UnknownOptionError, 'no option "3". Options: human, rgb_array'),
-        ({"motors": ["slider"]}, ConfigError, r"as in \[Motor\(\.\.\.\)\]; 'slider' is not a Motor"),
+        (
+            {"motors": ["slider"]},
+            ConfigError,
+            "'slider' is not a Motor",
+        ),
         ({"motors": Motor(joint="slider")}, ConfigError, "must be a list of Motors"),
         ({"sensors": Encoder(name="a", joint="hinge")}, ConfigError, "must be a list of Sensors"),
         ({"sensors": "hinge"}, ConfigError, "must be a list of Sensors"),
