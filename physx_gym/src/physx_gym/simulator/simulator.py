@@ -36,7 +36,7 @@ from physx_core.simulation import (
 from physx_core.typing import Vector
 from physx_gym.defaults import BACKEND
 from physx_gym.shared_arrays import SharedArrays
-from physx_gym.simulator import options as option_tables
+from physx_gym.simulator import options as nested_options
 from physx_gym.simulator.equipment import Equipment, default_motors, default_sensors
 from physx_gym.simulator.ground_placement import offset_to_ground
 from physx_gym.simulator.states import RobotState, StepperState
@@ -325,10 +325,10 @@ class Simulator(SharedArrays):
             ``"stepper"``; ``"motors"`` by joint; ``"sensors"`` by name.
         """
         return {
-            "world": option_tables.world_options(self.world),
+            "world": nested_options.world_options(self.world),
             "stepper": {name: getattr(self, name) for name in _STEPPER},
-            "motors": option_tables.motor_options(self.motors),
-            "sensors": option_tables.sensor_options(self.sensors),
+            "motors": nested_options.motor_options(self.motors),
+            "sensors": nested_options.sensor_options(self.sensors),
         }
 
     def set_options(self, options: Mapping[str, Any]) -> None:
@@ -343,14 +343,14 @@ class Simulator(SharedArrays):
             ConfigError: If a value is out of range.
         """
         self._check_stopped("set_options")
-        option_tables.check_known("", options, ("world", "stepper", "motors", "sensors"))
-        world = option_tables.change_world(self.world, options.get("world", {}))
+        nested_options.check_known("", options, ("world", "stepper", "motors", "sensors"))
+        world = nested_options.change_world(self.world, options.get("world", {}))
         motors = {motor.joint: motor for motor in self.motors}
-        motors = option_tables.change_each("motors", motors, options.get("motors", {}))
+        motors = nested_options.change_each("motors", motors, options.get("motors", {}))
         sensors = {sensor.name: sensor for sensor in self.sensors}
-        sensors = option_tables.change_each("sensors", sensors, options.get("sensors", {}))
+        sensors = nested_options.change_each("sensors", sensors, options.get("sensors", {}))
         stepper = options.get("stepper", {})
-        option_tables.check_known("stepper", stepper, _STEPPER)
+        nested_options.check_known("stepper", stepper, _STEPPER)
         for name, value in stepper.items():
             setattr(self, name, _positive_or_none(name, value))
         if world is not self.world:
