@@ -76,7 +76,7 @@ def sequential(folder: Path) -> Callable[[], int]:
 
 
 def shuffled(
-    dataset: Dataset, batch_size: int, policy: str, learn: Callable[..., None]
+    dataset: Dataset, batch_size: int, strategy: str, learn: Callable[..., None]
 ) -> Callable[[], int]:
     """Return a round of one shuffled epoch."""
 
@@ -84,7 +84,7 @@ def shuffled(
         forget(dataset.directory)
         total = 0
         for batch in dataset.batches(
-            "training", batch_size, shuffle=True, seed=0, reuse=True, policy=policy
+            "training", batch_size, shuffle=True, seed=0, reuse=True, strategy=strategy
         ):
             learn(**batch)
             total += sum(values.nbytes for values in batch.values())
@@ -122,8 +122,8 @@ def measure(root: Path, limited: bool) -> None:
     for number, (title, (shapes, batch_size, expected)) in enumerate(CASES.items()):
         folder = root / str(number)
         with Dataset.open(folder) as dataset:
-            policy = "auto" if limited else expected
-            chosen = dataset.reading_policy("training") if limited else expected
+            strategy = "auto" if limited else expected
+            chosen = dataset.reading_strategy("training") if limited else expected
             step = trainer(*shapes.values())
             sizes: list[int] = []
 
@@ -137,8 +137,8 @@ def measure(root: Path, limited: bool) -> None:
 
             candidates = {
                 "sequential read": sequential(folder),
-                "batches": epoch(shuffled(dataset, batch_size, policy, lambda **_: None)),
-                "training": epoch(shuffled(dataset, batch_size, policy, step)),
+                "batches": epoch(shuffled(dataset, batch_size, strategy, lambda **_: None)),
+                "training": epoch(shuffled(dataset, batch_size, strategy, step)),
             }
             measured = rates(candidates, ROUNDS)
         count = sum(path.stat().st_size for path in files(folder))

@@ -12,7 +12,7 @@ from physx_core import Dataset, Field, Normalization
 from physx_core.dataset.read import memory
 from physx_core.errors import ConfigError, DatasetError
 
-POLICIES = ["memory", "disk exact", "disk windowed"]
+STRATEGIES = ["memory", "disk exact", "disk windowed"]
 
 
 @pytest.fixture
@@ -48,11 +48,11 @@ def ids_of(batches):
 
 def test_what_fits_is_read_into_memory(tmp_path):
     with stored(tmp_path, 100, 3) as dataset:
-        assert dataset.reading_policy("training") == "memory"
+        assert dataset.reading_strategy("training") == "memory"
 
 
 @pytest.mark.parametrize(
-    ("width", "names", "policy"),
+    ("width", "names", "strategy"),
     [
         (3, None, "disk windowed"),
         (512, None, "disk exact"),
@@ -61,24 +61,26 @@ def test_what_fits_is_read_into_memory(tmp_path):
         (511, None, "disk exact"),  # 4096 bytes and 4
     ],
 )
-def test_what_does_not_fit_is_read_as_its_rows_are_large(tmp_path, no_memory, width, names, policy):
+def test_what_does_not_fit_is_read_as_its_rows_are_large(
+    tmp_path, no_memory, width, names, strategy
+):
     with stored(tmp_path, 100, width) as dataset:
-        assert dataset.reading_policy("training", names) == policy
+        assert dataset.reading_strategy("training", names) == strategy
 
 
 def test_memory_that_is_taken_already_counts_as_there(tmp_path, monkeypatch):
     with stored(tmp_path, 100, 3) as dataset:
         list(dataset.batches("training", 10))
         monkeypatch.setattr(memory, "available_memory", lambda: 0)
-        assert dataset.reading_policy("training") == "memory"
+        assert dataset.reading_strategy("training") == "memory"
 
 
-def test_a_policy_that_does_not_exist(tmp_path):
+def test_a_strategy_that_does_not_exist(tmp_path):
     with stored(tmp_path, 10, 3) as dataset:
-        with pytest.raises(ConfigError, match='no reading policy "ram".*disk exact.*memory'):
-            dataset.batches("training", 2, policy="ram")
+        with pytest.raises(ConfigError, match='no reading strategy "ram".*disk exact.*memory'):
+            dataset.batches("training", 2, strategy="ram")
         with pytest.raises(DatasetError, match='no field "z"'):
-            dataset.reading_policy("training", ["z"])
+            dataset.reading_strategy("training", ["z"])
 
 
 def test_memory_is_known():
@@ -104,8 +106,8 @@ def test_rows_from_the_disk_are_those_from_memory(tmp_path, no_memory, dtype):
         for shuffle in (False, True):
             batches = [
                 list(dataset.batches("training", 64, shuffle=shuffle, seed=3, epochs=2,
-                                     dtype=dtype, policy=policy))
-                for policy in ("memory", "disk exact")
+                                     dtype=dtype, strategy=strategy))
+                for strategy in ("memory", "disk exact")
             ]  # fmt: skip
             assert len(batches[0]) == len(batches[1]) == 32
             for first, second in zip(*batches, strict=True):
@@ -116,14 +118,16 @@ def test_rows_from_the_disk_are_those_from_memory(tmp_path, no_memory, dtype):
 
 def test_the_order_of_writing_is_the_same_in_all(tmp_path):
     with stored(tmp_path, 1000, 7) as dataset:
-        for policy in POLICIES:
-            assert_array_equal(ids_of(dataset.batches("training", 33, policy=policy)), range(1000))
+        for strategy in STRATEGIES:
+            assert_array_equal(
+                ids_of(dataset.batches("training", 33, strategy=strategy)), range(1000)
+            )
 
 
 def test_small_fields_are_in_memory_beside_large_ones(tmp_path, monkeypatch):
     monkeypatch.setattr(memory, "available_memory", lambda: 50_000)
     with stored(tmp_path, 500, 600) as dataset:
-        assert dataset.reading_policy("training") == "disk exact"
+        assert dataset.reading_strategy("training") == "disk exact"
         for batch in dataset.batches("training", 64, shuffle=True):
             assert_array_equal(batch["x"][:, 0], batch["id"])
             assert_array_equal(batch["y"], 2 * batch["id"])
@@ -154,7 +158,7 @@ def test_windows_give_every_row_once_from_all_over(wide):
     with Dataset.open(wide) as dataset:
         ids, count = np.empty(5_000_000, np.int64), 0
         batches = dataset.batches(
-            "training", 1024, shuffle=True, seed=1, reuse=True, policy="disk windowed"
+            "training", 1024, shuffle=True, seed=1, reuse=True, strategy="disk windowed"
         )
         for number, batch in enumerate(batches):
             if number % 500 == 0:
@@ -165,7 +169,7 @@ def test_windows_give_every_row_once_from_all_over(wide):
         assert count == len(ids)
         assert np.bincount(ids, minlength=len(ids)).max() == 1
         other = dataset.batches(
-            "training", 100_000, shuffle=True, seed=1, epochs=2, policy="disk windowed"
+            "training", 100_000, shuffle=True, seed=1, epochs=2, strategy="disk windowed"
         )
         found = [next(other)["id"] for _ in range(51)]
         assert_array_equal(np.concatenate(found[:50]), ids)  # whatever the size of batches
@@ -175,14 +179,14 @@ def test_windows_give_every_row_once_from_all_over(wide):
 # Normalization ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("strategy", STRATEGIES)
 @pytest.mark.parametrize("dtype", [None, "float32"])
 @pytest.mark.parametrize("reuse", [False, True])
-def test_normalized_in_place(tmp_path, policy, dtype, reuse):
+def test_normalized_in_place(tmp_path, strategy, dtype, reuse):
     with stored(tmp_path, 300, 4) as dataset:
         known = dataset.normalization
         epochs = dataset.batches(
-            "training", 64, shuffle=True, epochs=2, dtype=dtype, reuse=reuse, policy=policy,
+            "training", 64, shuffle=True, epochs=2, dtype=dtype, reuse=reuse, strategy=strategy,
             normalize=True,
         )  # fmt: skip
         for batch in epochs:
@@ -193,7 +197,7 @@ def test_normalized_in_place(tmp_path, policy, dtype, reuse):
             assert_allclose(batch["y"], y, atol=1e-5)
             assert batch["id"].dtype == np.int64 and batch["y"].dtype == np.float32
         assert_array_equal(dataset["training"]["id"][:], range(300))
-        assert_array_equal(next(dataset.batches("training", 300, policy=policy))["y"][5], 10)
+        assert_array_equal(next(dataset.batches("training", 300, strategy=strategy))["y"][5], 10)
 
 
 def test_normalized_by_what_is_given(tmp_path):

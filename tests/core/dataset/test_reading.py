@@ -12,7 +12,7 @@ from numpy.testing import assert_array_equal
 from physx_core import Dataset, Field
 from physx_core.errors import DatasetError
 
-POLICIES = ["memory", "disk exact", "disk windowed"]
+STRATEGIES = ["memory", "disk exact", "disk windowed"]
 WRITER = """
 import os, sys, time
 import numpy as np
@@ -98,9 +98,9 @@ def large_rows(tmp_path):
         yield dataset
 
 
-@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("strategy", STRATEGIES)
 @pytest.mark.parametrize("damage", ["truncated", "missing", "damaged"])
-def test_damage_before_reading(large_rows, policy, damage):
+def test_damage_before_reading(large_rows, strategy, damage):
     path = large_rows.directory / "run_training_x_7.h5"
     if damage == "truncated":
         os.truncate(path, 100_000)
@@ -109,15 +109,15 @@ def test_damage_before_reading(large_rows, policy, damage):
     else:
         path.write_bytes(bytes(path.stat().st_size))
     with pytest.raises(DatasetError, match=rf"x_7\.h5.* {damage}"):
-        list(large_rows.batches("training", 10, shuffle=True, policy=policy))
+        list(large_rows.batches("training", 10, shuffle=True, strategy=strategy))
     with pytest.raises(DatasetError, match=rf"x_7\.h5.* {damage}"):
         large_rows["training"]["x"][[1, 2]]
 
 
-@pytest.mark.parametrize("policy", POLICIES[1:])
+@pytest.mark.parametrize("strategy", STRATEGIES[1:])
 @pytest.mark.parametrize("shuffle", [False, True])
-def test_a_file_that_is_cut_while_it_is_read(large_rows, policy, shuffle):
-    batches = large_rows.batches("training", 10, shuffle=shuffle, epochs=None, policy=policy)
+def test_a_file_that_is_cut_while_it_is_read(large_rows, strategy, shuffle):
+    batches = large_rows.batches("training", 10, shuffle=shuffle, epochs=None, strategy=strategy)
     next(batches)
     for number in range(20):
         os.truncate(large_rows.directory / f"run_training_x_{number}.h5", 100_000)
@@ -152,8 +152,8 @@ def test_rows_that_come_are_seen_after_refresh(tmp_path):
                 assert reader.num_samples("training") == count
                 index = np.arange(count - 1, -1, -1)
                 assert_array_equal(reader["training"]["x"][index][:, 1], 2 * index)
-                for policy in POLICIES:
-                    batches = reader.batches("training", 64, shuffle=True, policy=policy)
+                for strategy in STRATEGIES:
+                    batches = reader.batches("training", 64, shuffle=True, strategy=strategy)
                     found = np.concatenate([batch["id"] for batch in batches])
                     assert_array_equal(np.sort(found), np.arange(count))
 
@@ -191,9 +191,9 @@ def check_all_rows(dataset, rng):
     index = rng.integers(0, count, 100)
     assert_array_equal(dataset["training"]["x"][index][:, 2], index)
     assert_array_equal(dataset["training"]["id"][-50:], np.arange(count)[-50:])
-    for policy in POLICIES:
+    for strategy in STRATEGIES:
         total = 0
-        for batch in dataset.batches("training", 256, shuffle=True, seed=0, policy=policy):
+        for batch in dataset.batches("training", 256, shuffle=True, seed=0, strategy=strategy):
             assert_array_equal(batch["x"], batch["id"][:, None] + np.zeros(batch["x"].shape[1]))
             total += batch["id"].sum()
         assert total == count * (count - 1) // 2

@@ -76,7 +76,7 @@ def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> 
     try:
         stored = dataset.num_samples(mode)
         if stored:
-            print(f"  reading policy: {dataset.reading_policy(mode)}")
+            print(f"  reading strategy: {dataset.reading_strategy(mode)}")
             _print_episodes(dataset, mode, stored)
     except DatasetError as error:
         print(textwrap.fill(f"damaged: {error}", _WIDTH, initial_indent="  "))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from physx_core.closeable import Closeable
-from physx_core.dataset.read import strategy as policies
+from physx_core.dataset.read import strategy as strategies
 from physx_core.dataset.read.cache import ColumnCache
 from physx_core.dataset.read.episodes import Episode, find_episodes
 from physx_core.dataset.read.reader import Reader
@@ -94,7 +94,7 @@ class Dataset(Changes, Closeable):
         folder = Path(directory)
         options = WriterOptions(session, max_file_size, durable, shared)
         writer, lock = create(folder, options, info or {})
-        return cls(folder, writer.ledger.manifest, writer, lock)
+        return cls(folder, writer.store.manifest, writer, lock)
 
     @classmethod
     def open(
@@ -131,7 +131,7 @@ class Dataset(Changes, Closeable):
             return cls(folder, recovery.load(folder))
         options = WriterOptions(session, max_file_size, durable, shared)
         writer, lock = extend(folder, options)
-        return cls(folder, writer.ledger.manifest, writer, lock)
+        return cls(folder, writer.store.manifest, writer, lock)
 
     @property
     def writable(self) -> bool:
@@ -226,7 +226,7 @@ class Dataset(Changes, Closeable):
         dtype: DTypeLike | None = None,
         reuse: bool = False,
         normalize: bool | Mapping[str, Normalization] = False,
-        policy: policies.Choice = "auto",
+        strategy: strategies.Choice = "auto",
     ) -> Iterator[Batch]:
         """Go through the samples of a mode in batches.
 
@@ -243,7 +243,7 @@ class Dataset(Changes, Closeable):
                 then valid until the next.
             normalize: Whether floating fields are normalized, in place, by the mean and deviation
                 of all samples of the mode; or the normalization to use.
-            policy: How samples are read, see `physx_core.dataset.read.strategy`; ``auto``: as
+            strategy: How samples are read, see `physx_core.dataset.read.strategy`; ``auto``: as
                 suits the fields' sizes and the free memory.
 
         Returns:
@@ -251,7 +251,7 @@ class Dataset(Changes, Closeable):
 
         Raises:
             DatasetError: There is no such mode or field, or the mode has no samples.
-            ConfigError: `batch_size` or `epochs` is out of range, or there is no such policy.
+            ConfigError: `batch_size` or `epochs` is out of range, or there is no such strategy.
         """
         self._reading()
         if isinstance(normalize, bool):
@@ -266,12 +266,14 @@ class Dataset(Changes, Closeable):
                 np.random.default_rng(seed) if shuffle else None,
                 None if dtype is None else np.dtype(dtype),
                 reuse,
-                policies.check(policy),
+                strategies.check(strategy),
                 normalize,
             )
         )
 
-    def reading_policy(self, mode: str, fields: Sequence[str] | None = None) -> policies.Policy:
+    def reading_strategy(
+        self, mode: str, fields: Sequence[str] | None = None
+    ) -> strategies.Strategy:
         """Return how `batches` reads by itself: ``memory``, ``disk exact`` or ``disk windowed``.
 
         Args:
@@ -283,7 +285,7 @@ class Dataset(Changes, Closeable):
         """
         self._reading()
         names = list(self._reader.mode(mode).fields if fields is None else fields)
-        return self._columns.policy(mode, names, None)
+        return self._columns.strategy(mode, names, None)
 
     def episodes(self, mode: str) -> list[Episode]:
         """Return the trajectories of a mode, each with the numbers of its rows in order of time.

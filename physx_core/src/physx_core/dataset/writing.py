@@ -131,7 +131,7 @@ class Changes:
         values = updating.checked(fields, numbers, rows, single=single)
         with files.storing(f"{len(numbers)} updated rows of mode {mode!r}"):
             writer.wait()
-            updating.update_rows(writer.ledger, mode, numbers, values, durable=writer.durable)
+            updating.update_rows(writer.store, mode, numbers, values, durable=writer.durable)
         self._forget_moved()
 
     def merge(self, directory: str | Path) -> None:
@@ -233,7 +233,7 @@ class Changes:
     def _alone(self, what: str) -> Writer:
         """Return the writer, if it is the only one, with all samples stored."""
         appender = self._writing()
-        if appender.writer.ledger.shared:
+        if appender.writer.store.shared:
             raise UsageError(
                 f"To {what}, have the dataset for yourself: open it without shared=True."
             )
@@ -243,17 +243,17 @@ class Changes:
     @contextlib.contextmanager
     def _changing(self, what: str) -> Iterator[Manifest]:
         writer = self._writing().writer
-        with files.storing(what), writer.ledger.changing() as manifest:
+        with files.storing(what), writer.store.change() as manifest:
             yield manifest
 
     def _keep_statistics(self) -> None:
         """Store statistics that were computed anew; several writers leave that to the next."""
-        if self._writer is not None and not self._writer.ledger.shared:
+        if self._writer is not None and not self._writer.store.shared:
             with self._changing("The statistics"):
                 pass
 
     def _forget_moved(self) -> None:
         """Forget rows kept in memory that are not what is stored any more."""
-        if self._writer is not None and self._writer.ledger.moved:
-            self._writer.ledger.moved = False
+        if self._writer is not None and self._writer.store.moved:
+            self._writer.store.moved = False
             self._columns.clear()

@@ -8,10 +8,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from physx_core.dataset.read import strategy as policy
+from physx_core.dataset.read import strategy
 from physx_core.dataset.read.mapping import MappedColumn
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.read.strategy import Policy
+from physx_core.dataset.read.strategy import Strategy
 from physx_core.fields import Field
 from physx_core.typing import Array
 
@@ -71,7 +71,7 @@ class ColumnCache:
         self._loaded: dict[tuple[str, str, np.dtype[Any]], MemoryColumn] = {}
         self._mapped: dict[tuple[str, str], MappedColumn] = {}
 
-    def policy(self, mode: str, names: Sequence[str], dtype: np.dtype[Any] | None) -> Policy:
+    def strategy(self, mode: str, names: Sequence[str], dtype: np.dtype[Any] | None) -> Strategy:
         """Return how the rows of fields are best read now.
 
         Args:
@@ -83,7 +83,7 @@ class ColumnCache:
             DatasetError: There is no such mode or field.
         """
         fields = [self.reader.field(mode, name) for name in names]
-        return policy.choose(sum(self.missing(mode, name, dtype) for name in names), fields)
+        return strategy.choose(sum(self.missing(mode, name, dtype) for name in names), fields)
 
     def load(self, mode: str, name: str, dtype: np.dtype[Any] | None = None) -> MemoryColumn:
         """Return all rows of a field that are committed now, in memory.

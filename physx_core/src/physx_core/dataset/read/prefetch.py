@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset.read import strategy as policy
+from physx_core.dataset.read import strategy
 from physx_core.dataset.read.cache import ColumnCache, Index, MemoryColumn
 from physx_core.dataset.read.disk import DiskColumn
 from physx_core.typing import Batch
@@ -92,9 +92,9 @@ def _small(
     columns: ColumnCache, mode: str, names: Sequence[str], dtype: np.dtype[Any] | None
 ) -> set[str]:
     """Return the fields of small rows that fit into memory together, the smallest first."""
-    left, found = policy.budget(), set()
+    left, found = strategy.budget(), set()
     for size, name in sorted((columns.missing(mode, name, dtype), name) for name in names):
-        if size <= left and columns.reader.field(mode, name).nbytes < policy.LARGE_ROW:
+        if size <= left and columns.reader.field(mode, name).nbytes < strategy.LARGE_ROW:
             left -= size
             found.add(name)
     return found

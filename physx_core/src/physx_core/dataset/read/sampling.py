@@ -14,7 +14,7 @@ import numpy as np
 from physx_core.dataset.read.cache import ColumnCache, Index, MemoryColumn, wanted
 from physx_core.dataset.read.disk import DiskColumn
 from physx_core.dataset.read.prefetch import ExactEpoch
-from physx_core.dataset.read.strategy import Policy
+from physx_core.dataset.read.strategy import Strategy
 from physx_core.dataset.read.windows import WindowedEpoch
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.statistics import Normalization
@@ -34,7 +34,7 @@ class Batches:
         random: Draws a permutation for each epoch; None: the order of the rows.
         dtype: Type that floating fields are converted to; None: each keeps its own.
         reuse: Whether every batch is given in the same arrays.
-        policy: How rows are read; None: as suits their size and the free memory.
+        strategy: How rows are read; None: as suits their size and the free memory.
         normalization: What normalizes fields, by name; other fields stay as they are.
         subset: The only rows to give, rising; None: all.
     """
@@ -47,7 +47,7 @@ class Batches:
     random: np.random.Generator | None
     dtype: np.dtype[Any] | None
     reuse: bool
-    policy: Policy | None = None
+    strategy: Strategy | None = None
     normalization: Mapping[str, Normalization] = field(default_factory=dict)
     subset: Index | None = None
 
@@ -73,11 +73,11 @@ class Batches:
 
     def __iter__(self) -> Iterator[Batch]:
         """Yield the batches of all epochs."""
-        form, policy, size, count = _Form(self), self.policy, self.batch_size, 0
+        form, strategy, size, count = _Form(self), self.strategy, self.batch_size, 0
         while self.epochs is None or count < self.epochs:
-            if self.policy is None and policy in (None, "memory"):
-                policy = self.columns.policy(self.mode, self.names, self.dtype)
-            epoch = self._begin(policy or "memory")
+            if self.strategy is None and strategy in (None, "memory"):
+                strategy = self.columns.strategy(self.mode, self.names, self.dtype)
+            epoch = self._begin(strategy or "memory")
             try:
                 rows = epoch.rows
                 for start in range(0, rows, size):
@@ -90,14 +90,14 @@ class Batches:
                 epoch.close()
             count += 1
 
-    def _begin(self, policy: Policy) -> Epoch:
+    def _begin(self, strategy: Strategy) -> Epoch:
         mode, names, dtype, random = self.mode, self.names, self.dtype, self.random
-        if policy == "memory":
+        if strategy == "memory":
             loaded = [self.columns.load(mode, name, dtype) for name in names]
             return MemoryEpoch(loaded, random, self.subset)
         for name in names:
             self.columns.reader.check(mode, name)
-        if policy == "disk exact" and random is not None:
+        if strategy == "disk exact" and random is not None:
             return ExactEpoch(self.columns, mode, names, dtype, random, self.subset)
         disk = [DiskColumn(self.columns.reader, mode, name, dtype) for name in names]
         return WindowedEpoch(disk, random, self.subset)

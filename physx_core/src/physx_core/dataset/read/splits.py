@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from physx_core.dataset.read import strategy as policies
+from physx_core.dataset.read import strategy as strategies
 from physx_core.dataset.read.cache import ColumnCache
 from physx_core.dataset.read.episodes import find_episodes
 from physx_core.dataset.read.sampling import Batches
@@ -108,7 +108,7 @@ class Subset:
         dtype: DTypeLike | None = None,
         reuse: bool = False,
         normalize: bool | Mapping[str, Normalization] = False,
-        policy: policies.Choice = "auto",
+        strategy: strategies.Choice = "auto",
     ) -> Iterator[Batch]:
         """Go through the rows in batches; arguments and errors are those of `Dataset.batches`.
 
@@ -129,7 +129,7 @@ class Subset:
                 random,
                 kind,
                 reuse,
-                policies.check(policy),
+                strategies.check(strategy),
                 normalize,
                 self.rows,
             )

@@ -1,4 +1,4 @@
-"""Policies: how batches are read, chosen from the sizes of the fields and the free memory."""
+"""Strategies: how batches are read, chosen from the sizes of the fields and the free memory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from physx_core.dataset.read import memory
 from physx_core.errors import ConfigError, listed
 from physx_core.fields import Field
 
-Policy: TypeAlias = Literal["memory", "disk exact", "disk windowed"]
+Strategy: TypeAlias = Literal["memory", "disk exact", "disk windowed"]
 """How batches are read.
 
 - ``memory``: the fields are read into memory once; a shuffled epoch is an exact permutation.
@@ -18,7 +18,7 @@ Policy: TypeAlias = Literal["memory", "disk exact", "disk windowed"]
 - ``disk windowed``: blocks of rows are read in random order, and the rows of 64 blocks at a time
   are shuffled. Every row comes once in an epoch, but rows of the same block come near each other.
 """
-Choice: TypeAlias = Policy | Literal["auto"]
+Choice: TypeAlias = Strategy | Literal["auto"]
 
 LARGE_ROW = 4096
 """Bytes from which a row is worth reading alone: a disk gives no less."""
@@ -26,7 +26,7 @@ LARGE_ROW = 4096
 _SHARE = 0.5
 
 
-def choose(missing: int, fields: Sequence[Field]) -> Policy:
+def choose(missing: int, fields: Sequence[Field]) -> Strategy:
     """Choose how to read.
 
     Args:
@@ -44,17 +44,16 @@ def budget() -> int:
     return int(_SHARE * memory.available_memory())
 
 
-def check(policy: str) -> Policy | None:
-    """Return a policy that was asked for by name; None for ``auto``.
+def check(strategy: str) -> Strategy | None:
+    """Return a strategy that was asked for by name; None for ``auto``.
 
     Raises:
-        ConfigError: There is no such policy.
+        ConfigError: There is no such strategy.
     """
-    if policy == "auto":
+    if strategy == "auto":
         return None
-    for known in get_args(Policy):
-        if policy == known:
+    for known in get_args(Strategy):
+        if strategy == known:
             return known  # type: ignore[no-any-return]
-    raise ConfigError(
-        f'There is no reading policy "{policy}". Policies: {listed(["auto", *get_args(Policy)])}.'
-    )
+    known_names = listed(["auto", *get_args(Strategy)])
+    raise ConfigError(f'There is no reading strategy "{strategy}". Strategies: {known_names}.')

@@ -1,4 +1,4 @@
-"""The ledger: the manifest in memory and on the disk, changed in whole steps."""
+"""The store: the manifest in memory and on the disk, changed in whole steps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from physx_core.dataset.store.manifest import Manifest, Mode
 
 
 @dataclass
-class Ledger:
+class ManifestStore:
     """The manifest of a dataset that is written, by one writer or by several.
 
     Where several writers share a dataset, they take turns: each step begins with what the others
@@ -33,7 +33,7 @@ class Ledger:
     moved: bool = False
 
     @contextlib.contextmanager
-    def changing(self) -> Iterator[Manifest]:
+    def change(self) -> Iterator[Manifest]:
         """Give the manifest to be changed, and store it at the end; or leave all as it was.
 
         Raises:

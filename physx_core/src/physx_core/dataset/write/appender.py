@@ -23,7 +23,7 @@ class Appender:
     """
 
     def __init__(self, writer: Writer) -> None:
-        self._ledger, self._manifest = writer.ledger, writer.ledger.manifest
+        self._store, self._manifest = writer.store, writer.store.manifest
         self.writer = writer
         self._buffers: dict[str, RowBuffer] = {}
 
@@ -36,7 +36,7 @@ class Appender:
         known = self._manifest.modes.get(mode)
         if known is not None and _completed(mode, known, given) == known.fields:
             return
-        with files.storing(f"The fields of mode {mode!r}"), self._ledger.changing() as manifest:
+        with files.storing(f"The fields of mode {mode!r}"), self._store.change() as manifest:
             known = manifest.modes.setdefault(mode, Mode(given))
             known.fields = _completed(mode, known, given)
 

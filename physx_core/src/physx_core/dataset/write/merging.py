@@ -38,8 +38,8 @@ def take_partitions(writer: Writer, source: Path, given: Manifest) -> None:
     try:
         for name, partitions in pairs.items():
             for old, new in partitions:
-                _copy_files(writer.ledger.directory, source, name, given.modes[name], old, new)
-        with writer.ledger.changing() as manifest:
+                _copy_files(writer.store.directory, source, name, given.modes[name], old, new)
+        with writer.store.change() as manifest:
             for name, partitions in pairs.items():
                 _accept(manifest.modes[name], given.modes[name], partitions)
     except BaseException:
@@ -55,7 +55,7 @@ def drop_partition(writer: Writer, mode_name: str, session: str | None, index: i
         DatasetError: There is no such partition, or there are several.
         OSError: The manifest cannot be written; nothing has changed.
     """
-    mode = writer.ledger.manifest.modes[mode_name]
+    mode = writer.store.manifest.modes[mode_name]
     found = [p for p in mode.partitions if p.index == index and session in (None, p.session)]
     if len(found) != 1:
         there = ", ".join(f"{p.index} of {p.session!r}" for p in mode.partitions) or "none"
@@ -64,13 +64,13 @@ def drop_partition(writer: Writer, mode_name: str, session: str | None, index: i
             f"Mode {mode_name!r} has {what} {index}"
             f"{'' if session is None else f' of session {session!r}'}. There are: {there}."
         )
-    with writer.ledger.changing() as manifest:
+    with writer.store.change() as manifest:
         mode = manifest.modes[mode_name]
         del mode.partitions[mode.place(found[0])]
         mode.dropped.append(found[0])
         if found[0].counted:
             mode.forget_statistics()
-    writer.ledger.moved = True
+    writer.store.moved = True
     _forget(writer, {mode_name: [found[0]]})
     return found[0].rows
 
@@ -78,7 +78,7 @@ def drop_partition(writer: Writer, mode_name: str, session: str | None, index: i
 def _reserve(writer: Writer, given: Manifest) -> dict[str, Pairs]:
     """List the partitions to come as dropped, so that their names are taken."""
     pairs: dict[str, Pairs] = {}
-    with writer.ledger.changing() as manifest:
+    with writer.store.change() as manifest:
         for name, other in given.modes.items():
             mode, found = manifest.modes[name], pairs.setdefault(name, [])
             for old in other.partitions:
@@ -122,10 +122,10 @@ def _accept(mode: Mode, other: Mode, pairs: Pairs) -> None:
 def _forget(writer: Writer, partitions: Mapping[str, list[Partition]]) -> None:
     """Remove the files of dropped partitions, and then their entries."""
     for name, dropped in partitions.items():
-        mode = writer.ledger.manifest.modes[name]
+        mode = writer.store.manifest.modes[name]
         for partition in dropped:
-            remove_files(writer.ledger.directory, name, mode, partition)
-    with writer.ledger.changing() as manifest:
+            remove_files(writer.store.directory, name, mode, partition)
+    with writer.store.change() as manifest:
         for name, dropped in partitions.items():
             keys = {partition.key for partition in dropped}
             mode = manifest.modes[name]

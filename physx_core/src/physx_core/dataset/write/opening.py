@@ -14,7 +14,7 @@ from physx_core.dataset.repair import recovery
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.manifest import Manifest, plain_info
 from physx_core.dataset.store.manifest_parsing import SESSION
-from physx_core.dataset.store.manifest_store import Ledger
+from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.virtual_index import write_index
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import ConfigError, DatasetError
@@ -42,10 +42,10 @@ class WriterOptions:
         if not self.max_file_size > 0:
             raise ConfigError(f"max_file_size is {self.max_file_size} GB but must be positive.")
 
-    def writer(self, ledger: Ledger) -> Writer:
+    def writer(self, store: ManifestStore) -> Writer:
         """Return the writer; without a session's name, it goes on in the last session."""
-        session = self.session or next(reversed(ledger.manifest.sessions), "run")
-        return Writer(ledger, session, self.max_file_size, self.durable)
+        session = self.session or next(reversed(store.manifest.sessions), "run")
+        return Writer(store, session, self.max_file_size, self.durable)
 
 
 def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> tuple[Writer, int]:
@@ -73,7 +73,7 @@ def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> tup
             except BaseException:
                 os.close(lock)
                 raise
-    return options.writer(Ledger(folder, manifest, options.shared)), lock
+    return options.writer(ManifestStore(folder, manifest, options.shared)), lock
 
 
 def extend(folder: Path, options: WriterOptions) -> tuple[Writer, int]:
@@ -98,7 +98,7 @@ def extend(folder: Path, options: WriterOptions) -> tuple[Writer, int]:
 def _extended(folder: Path, options: WriterOptions, lock: int, alone: bool) -> Writer:
     try:
         manifest = recovery.load(folder)
-        writer = options.writer(Ledger(folder, manifest, options.shared))
+        writer = options.writer(ManifestStore(folder, manifest, options.shared))
         if alone:
             if recovery.repair(folder, manifest):
                 write_index(folder, writer.session, manifest)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from physx_core import files
 from physx_core.dataset.store.manifest import Partition
-from physx_core.dataset.store.manifest_store import Ledger
+from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.partition_format import inspect
 from physx_core.dataset.write.checks import check_names, check_rows
 from physx_core.errors import FieldShapeError, MissingFieldError
@@ -71,12 +71,12 @@ def checked(
 
 
 def update_rows(
-    ledger: Ledger, mode_name: str, index: Index, rows: Batch, *, durable: bool
+    store: ManifestStore, mode_name: str, index: Index, rows: Batch, *, durable: bool
 ) -> None:
     """Write rows over others; sealed partitions lose their checksums until the dataset is closed.
 
     Args:
-        ledger: What the dataset holds.
+        store: What the dataset holds.
         mode_name: Name of the mode.
         index: Numbers of the rows, all in range.
         rows: Field name to new rows, checked.
@@ -86,34 +86,34 @@ def update_rows(
         DatasetError: A partition is missing or damaged.
         OSError: The storage fails; rows before may have been updated.
     """
-    mode = ledger.manifest.modes[mode_name]
+    mode = store.manifest.modes[mode_name]
     starts = np.cumsum([0, *(partition.rows for partition in mode.partitions)])
     owners = np.searchsorted(starts, index, side="right") - 1
     touched = [mode.partitions[owner] for owner in np.unique(owners)]
-    _announce(ledger, mode_name, touched)
+    _announce(store, mode_name, touched)
     for partition in touched:
         partition = mode.partitions[mode.place(partition)]
         here = np.flatnonzero(owners == mode.place(partition))
         places = index[here] - starts[mode.place(partition)]
         for name, block in rows.items():
-            path = ledger.directory / partition.file_name(mode_name, name)
+            path = store.directory / partition.file_name(mode_name, name)
             offset = _offset(path, partition, mode.fields[name])
             _write(path, offset, places, block[here], durable=durable)
 
 
-def _announce(ledger: Ledger, mode_name: str, touched: list[Partition]) -> None:
+def _announce(store: ManifestStore, mode_name: str, touched: list[Partition]) -> None:
     """Note, before anything is written, that checksums and statistics do not hold any more."""
-    mode = ledger.manifest.modes[mode_name]
+    mode = store.manifest.modes[mode_name]
     for partition in touched:
         partition.running = {}
     if any(partition.checksums or partition.counted for partition in touched):
-        with ledger.changing() as manifest:
+        with store.change() as manifest:
             mode = manifest.modes[mode_name]
             if any(partition.counted for partition in touched):
                 mode.forget_statistics()
             for partition in touched:
                 mode.swap(replace(partition, checksums={}, counted=False))
-    ledger.moved = True
+    store.moved = True
 
 
 def _offset(path: Path, partition: Partition, field: Field) -> int:

@@ -15,7 +15,7 @@ from physx_core.dataset.repair import recovery
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store import mode_statistics as coverage
 from physx_core.dataset.store.manifest import Mode, Partition
-from physx_core.dataset.store.manifest_store import Ledger
+from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.partition_file import PartitionFile
 from physx_core.dataset.store.sealing import remove_files, seal
 from physx_core.dataset.store.syncing import Syncer
@@ -99,12 +99,12 @@ class Writer:
     """Appends checked rows to the modes of a dataset."""
 
     def __init__(
-        self, ledger: Ledger, session: str, max_file_size: float, durable: bool = False
+        self, store: ManifestStore, session: str, max_file_size: float, durable: bool = False
     ) -> None:
         """Keep where and how to write.
 
         Args:
-            ledger: What the dataset holds; kept up to date here and on the disk.
+            store: What the dataset holds; kept up to date here and on the disk.
             session: Name of the session that writes.
             max_file_size: Size in GB at which a partition is full.
             durable: Whether a commit waits for the disk; otherwise files are synced about once a
@@ -112,11 +112,11 @@ class Writer:
         """
         self.session = session
         self.durable = durable
-        self.ledger = ledger
-        self._directory = ledger.directory
+        self.store = store
+        self._directory = store.directory
         self._max_nbytes = int(max_file_size * 1e9) - _HEADER
         self._syncer = None if durable else Syncer()
-        self._reader = Reader(ledger.directory, ledger.manifest)
+        self._reader = Reader(store.directory, store.manifest)
         self._open: dict[str, OpenPartition] = {}
         self._sealing: deque[tuple[str, Future[Partition]]] = deque()
         self._sealed: list[tuple[str, Partition]] = []
@@ -147,7 +147,7 @@ class Writer:
                 done += part
             except OSError as error:
                 what = f"{count - done} of {count} rows of mode {mode_name!r}"
-                safe = f"The {self.ledger.manifest.modes[mode_name].rows} samples before them"
+                safe = f"The {self.store.manifest.modes[mode_name].rows} samples before them"
                 raise files.not_stored(what, error, safe) from error
 
     def refresh(self) -> bool:
@@ -156,10 +156,10 @@ class Writer:
         Raises:
             DatasetError: The manifest is not valid any more.
         """
-        if self.ledger.shared:
+        if self.store.shared:
             with files.storing("What other writers did"), files.turn(self._directory):
-                self.ledger.reload(recovery.load(self._directory))
-        moved, self.ledger.moved = self.ledger.moved, False
+                self.store.reload(recovery.load(self._directory))
+        moved, self.store.moved = self.store.moved, False
         return moved
 
     def finish(self, mode_name: str) -> None:
@@ -223,7 +223,7 @@ class Writer:
         entry = opened.partition
         entry.writing = not opened.free  # one that is full keeps its files as they are
         opened.close()
-        fields = self.ledger.manifest.modes[mode_name].fields
+        fields = self.store.manifest.modes[mode_name].fields
         work = self._sealer.submit(_sealed, self._directory, mode_name, fields, replace(entry))
         self._sealing.append((mode_name, work))
 
@@ -234,7 +234,7 @@ class Writer:
             self._sealed.append((mode_name, work.result()))
         if not self._sealed:
             return
-        with self.ledger.changing() as manifest:
+        with self.store.change() as manifest:
             for mode_name, entry in self._sealed:
                 mode = manifest.modes[mode_name]
                 if entry.rows:
@@ -246,13 +246,13 @@ class Writer:
         empty = [(name, entry) for name, entry in self._sealed if not entry.rows]
         self._sealed.clear()
         for mode_name, entry in empty:
-            remove_files(self._directory, mode_name, self.ledger.manifest.modes[mode_name], entry)
+            remove_files(self._directory, mode_name, self.store.manifest.modes[mode_name], entry)
 
     def _begin(self, mode_name: str) -> OpenPartition:
         """Create the files of a partition, then list it; only then rows may be committed."""
         parts: dict[str, PartitionFile] = {}
         try:
-            with self.ledger.changing() as manifest:
+            with self.store.change() as manifest:
                 mode = manifest.modes[mode_name]
                 row_nbytes = max(1, *(field.nbytes for field in mode.fields.values()))
                 capacity = max(1, self._max_nbytes // row_nbytes)
@@ -284,9 +284,9 @@ class Writer:
 
     def _complete(self) -> None:
         """Compute what is missing: checksums of updated partitions, statistics, the index."""
-        if self.ledger.shared:
+        if self.store.shared:
             return
-        manifest = self.ledger.manifest
+        manifest = self.store.manifest
         changed = recovery.complete_checksums(self._directory, manifest)
         for name, mode in manifest.modes.items():
             if any(partition.sealed and not partition.counted for partition in mode.partitions):
