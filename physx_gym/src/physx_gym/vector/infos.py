@@ -1,4 +1,4 @@
-"""Infos of several environments as records of numbers, where all have the same names."""
+"""Infos of a vector environment as records of numbers, while all have the same layout."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ _KINDS = {kind.__name__: kind for kind in _CODES}
 
 
 class _Entry(NamedTuple):
-    """A name of an info: a number of some type, or a dictionary with entries of its own."""
+    """An entry of an info: a number of some type, or a dictionary with entries of its own."""
 
     name: str
     kind: type[Any]
-    below: list[_Entry]
+    inner: list[_Entry]
 
 
 class InfoLayout:
-    """Names and types of infos that hold numbers alone, and dictionaries of them.
+    """Names and types of infos that hold only numbers, and dictionaries of them.
 
     Attributes:
-        names: Pairs of a name and what it is: a type's name, or the pairs of a dictionary.
-        dtype: An info as a record; its fields are the numbers, in their order.
+        names: Pairs of a name and the name of its type, or the pairs of a dictionary.
+        dtype: Type of an info as a record; its fields are the numbers, in order.
     """
 
     def __init__(self, names: Sequence[Any]) -> None:
-        """Take the names.
+        """Create the layout of names.
 
         Raises:
-            ValueError: They are no names of numbers.
+            ValueError: If one is not that of a number.
         """
         self.names = names
-        self._entries = _entries(names)
+        self._entries = _parse(names)
         kinds = [*_kinds(self._entries)]
         self.dtype = np.dtype([(str(place), kind) for place, kind in enumerate(kinds)])
         self._codes = "=" + "".join(_CODES[kind] for kind in kinds)
 
     @classmethod
     def of(cls, info: Mapping[str, Any]) -> InfoLayout | None:
-        """Return the layout of an info; None: it holds nothing, or other things than numbers."""
+        """Return the layout of an info; None if it is empty, or holds anything but numbers."""
         try:
-            return cls(_names(info))
+            return cls(_describe(info))
         except ValueError:
             return None
 
@@ -60,10 +60,10 @@ class InfoLayout:
 
         Args:
             info: A dictionary.
-            target: Bytes to write to, from their begin.
+            target: Bytes to write to, from the first one on.
 
         Returns:
-            Whether it is of this layout and there is room; otherwise nothing is written.
+            Whether the info has this layout and fits; otherwise nothing is written.
         """
         values: list[Any] = []
         if not _gather(self._entries, info, values) or self.dtype.itemsize > len(target):
@@ -75,22 +75,22 @@ class InfoLayout:
         return True
 
     def records(self, data: Array) -> Array:
-        """Return the records that begin each row of bytes, shape (rows,)."""
+        """Return the records at the start of each row of bytes, shape (rows,)."""
         return data[:, : self.dtype.itemsize].copy().view(self.dtype)[:, 0]
 
     def info(self, record: Any) -> dict[str, Any]:
-        """Return the info that a record was made of."""
+        """Return the info that a record was written from."""
         return _info(self._entries, iter(record))
 
     def columns(self, records: Array, given: Array) -> dict[str, Any]:
-        """Return records as Gymnasium's infos of a vector environment.
+        """Return records in the form of the infos of Gymnasium's vector environments.
 
         Args:
             records: Shape (environments,).
-            given: Which of them are given, shape (environments,); the others count as zeros.
+            given: Which of them are valid, shape (environments,); the others become zeros.
 
         Returns:
-            Each name with its array, shape (environments,), and ``_name`` with which environments
+            For each name an array of shape (environments,), and, as ``_name``, which environments
             have it.
         """
         if not given.all():
@@ -98,43 +98,43 @@ class InfoLayout:
         return _columns(self._entries, (records[name] for name in self.dtype.names or ()), given)
 
 
-def _names(info: Mapping[str, Any]) -> list[Any]:
+def _describe(info: Mapping[str, Any]) -> list[Any]:
     return [
-        (name, _names(value) if isinstance(value, dict) else type(value).__name__)
+        (name, _describe(value) if isinstance(value, dict) else type(value).__name__)
         for name, value in info.items()
     ]
 
 
-def _entries(names: Sequence[Any]) -> list[_Entry]:
+def _parse(names: Sequence[Any]) -> list[_Entry]:
     entries = []
     for name, what in names:
         kind = dict if isinstance(what, (list, tuple)) else _KINDS.get(what)
         if kind is None or name.startswith("_") or name == "final_obs":  # Gymnasium's own
-            raise ValueError(f"{name} is no number")
-        entries.append(_Entry(name, kind, _entries(what) if kind is dict else []))
+            raise ValueError(f"{name} is not a number")
+        entries.append(_Entry(name, kind, _parse(what) if kind is dict else []))
     if not entries:
         raise ValueError("there are no numbers")
     return entries
 
 
 def _kinds(entries: Sequence[_Entry]) -> Iterator[type[Any]]:
-    for _, kind, below in entries:
-        if below:
-            yield from _kinds(below)
+    for _, kind, inner in entries:
+        if inner:
+            yield from _kinds(inner)
         else:
             yield kind
 
 
 def _gather(entries: Sequence[_Entry], info: Mapping[str, Any], values: list[Any]) -> bool:
-    """Add an info's numbers to a list; return whether it has these entries and no others."""
+    """Append an info's numbers to a list; return whether it has exactly these entries."""
     if len(info) != len(entries):
         return False
-    for name, kind, below in entries:
+    for name, kind, inner in entries:
         value: Any = info.get(name)
         if type(value) is not kind:
             return False
-        if below:
-            if not _gather(below, value, values):
+        if inner:
+            if not _gather(inner, value, values):
                 return False
         else:
             values.append(value)
@@ -143,13 +143,13 @@ def _gather(entries: Sequence[_Entry], info: Mapping[str, Any], values: list[Any
 
 def _info(entries: Sequence[_Entry], values: Iterator[Any]) -> dict[str, Any]:
     return {
-        name: _info(below, values) if below else kind(next(values)) for name, kind, below in entries
+        name: _info(inner, values) if inner else kind(next(values)) for name, kind, inner in entries
     }
 
 
 def _columns(entries: Sequence[_Entry], columns: Iterator[Array], given: Array) -> dict[str, Any]:
     found: dict[str, Any] = {}
-    for name, _, below in entries:
-        found[name] = _columns(below, columns, given) if below else next(columns).copy()
+    for name, _, inner in entries:
+        found[name] = _columns(inner, columns, given) if inner else next(columns).copy()
         found[f"_{name}"] = given.copy()
     return found

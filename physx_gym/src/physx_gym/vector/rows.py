@@ -1,4 +1,4 @@
-"""What a client of a parallel vector environment sends after each step: records of bytes."""
+"""Layout of the rows that a client of a parallel vector environment sends after each step."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from physx_gym.spaces import SpaceFields
 ROW = "row"
 """Name of the field that holds the records."""
 LENGTH = 8
-"""Bytes of the length in front of a text."""
+"""Bytes of the length in front of a packed value."""
 _INFO_BYTES = 512
 
 
-class Info(enum.IntEnum):
-    """How a record holds an info."""
+class InfoKind(enum.IntEnum):
+    """The form in which a record holds an info."""
 
     NONE = 0
-    """There is none."""
+    """There is no info."""
     NUMBERS = 1
-    """As a record of the layout that the client told last."""
-    TEXT = 2
-    """As a text, or not at all if that is empty: then it came before the row."""
+    """A record of the layout that the client announced last."""
+    PACKED = 2
+    """A packed value; if that is empty, the client sent the info before the row."""
 
 
 class RowLayout:
-    """Where everything lies in a row, which has a record for each of a client's environments.
+    """Layout of a row, which has a record for each of a client's environments.
 
     Attributes:
-        dtype: A record: the fields of the observation; ``reward``, ``terminated``, ``truncated``;
-            the fields of the last observation of an episode that is over, where such are sent, with
-            ``final_`` in front; ``info``: an `Info`; ``infos``: the bytes of the info.
+        dtype: Type of a record: the fields of the observation; ``reward``, ``terminated``,
+            ``truncated``; if they are sent, the fields of the last observation of a finished
+            episode, prefixed with ``final_``; ``info``: an `InfoKind`; ``infos``: the info's bytes.
         field: The row as a field of bytes.
     """
 
     def __init__(self, observations: SpaceFields, share: int, *, has_finals: bool) -> None:
-        """Work it out.
+        """Compute the layout.
 
         Args:
             observations: Fields of an observation.
-            share: How many environments a client has.
+            share: Number of environments of a client.
             has_finals: Whether last observations are sent.
         """
         entries = [(field.name, field.dtype, field.shape or ()) for field in observations.fields]
@@ -57,17 +57,17 @@ class RowLayout:
         self.field = Field(ROW, (share * self.dtype.itemsize,), "uint8")
 
     def records(self, rows: Array) -> Array:
-        """Return the records of rows, shape (rows, bytes), one behind the other."""
+        """Return the records of rows, shape (rows, bytes), as one array, shape (records,)."""
         return rows.reshape(-1).view(self.dtype)
 
 
-def put_text(target: Array, text: bytes) -> None:
-    """Write a text to the begin of an array of bytes, after its length."""
-    whole = len(text).to_bytes(LENGTH, "little") + text
+def put_packed(target: Array, encoded: bytes) -> None:
+    """Write an encoded value, preceded by its length, to the start of an array of bytes."""
+    whole = len(encoded).to_bytes(LENGTH, "little") + encoded
     target[: len(whole)] = np.frombuffer(whole, np.uint8)
 
 
-def text_value(data: Array) -> Any:
-    """Return the value of a text that `put_text` wrote; None: it is empty."""
+def unpack(data: Array) -> Any:
+    """Return the value that `put_packed` wrote; None if it is empty."""
     length = int.from_bytes(data[:LENGTH].tobytes(), "little")
     return decode(data[LENGTH : LENGTH + length].tobytes()) if length else None

@@ -1,4 +1,4 @@
-"""Several environments in several processes, stepped together."""
+"""Vector environment whose environments run in several processes."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from physx_core.typing import Array, Batch, Sample
 from physx_gym.bridge.making import make_env
 from physx_gym.spaces import SpaceFields
 from physx_gym.vector.infos import InfoLayout
-from physx_gym.vector.rows import ROW, Info, RowLayout, text_value
-from physx_gym.vector.worker import COMMAND, FORBIDDEN, VectorWorker, packed
+from physx_gym.vector.rows import ROW, InfoKind, RowLayout, unpack
+from physx_gym.vector.worker import COMMAND, FORBIDDEN, VectorWorker, pack_commands
 
 _LOG = logging.getLogger("physx")
 
@@ -32,11 +32,12 @@ _LOG = logging.getLogger("physx")
 class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
     """A vector environment whose environments are stepped in client processes.
 
-    ``gymnasium.make_vec("physx/Ant-v0", num_envs=4)`` makes one. It does what Gymnasium's
-    `AsyncVectorEnv` does, with the clients of a data generation: spawned, authenticated, watched,
-    and ended in every case. An environment that raises is named with its traceback.
+    ``gymnasium.make_vec("physx/Ant-v0", num_envs=4)`` creates one. It does what Gymnasium's
+    `AsyncVectorEnv` does, with clients like those of a data generation: they are spawned,
+    authenticated and monitored, and always end with it. If an environment raises, the error has
+    its traceback.
 
-    Infos come back as far as they are plain values and arrays; a warning names those that are not.
+    Infos may hold plain values and arrays; others are left out, and a warning names them.
     """
 
     def __init__(
@@ -55,17 +56,18 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         Args:
             env: Id of the environment, ``"package.module:Class"``, ``"script.py:Class"``, or the
                 class.
-            num_envs: How many environments.
-            env_kwargs: Keyword arguments of each.
-            processes: How many processes share the environments; None: as many as there are
-                processors, but no more than environments.
+            num_envs: Number of environments.
+            env_kwargs: Keyword arguments of each environment.
+            processes: Number of processes that share the environments; None: one for each
+                processor, but no more than environments.
             autoreset_mode: What happens after the end of an episode.
             copy: Whether observations are copies; otherwise they are valid until the next call.
-            timeout: How long a step may take, in s.
+            timeout: Longest duration of a step, in s.
 
         Raises:
-            ConfigError: A value cannot be, or a space holds values without a fixed shape.
-            PhysxError: An environment or a process failed.
+            ConfigError: If a value is out of range, or values of a space do not have a fixed shape.
+            UnknownOptionError: If the autoreset mode is unknown.
+            PhysxError: If an environment or a process fails.
         """
         if num_envs < 1 or (processes is not None and processes < 1):
             raise ConfigError("num_envs and processes must be at least 1.")
@@ -82,7 +84,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         self._share, self._copy = share, copy
         has_finals = mode is AutoresetMode.SAME_STEP
         self._row = RowLayout(self._observations, share, has_finals=has_finals)
-        self._notes = _Notes()
+        self._reports = _Reports()
         config = EnvironmentConfig(
             VectorWorker,
             num_clients=-(-num_envs // share),
@@ -96,21 +98,21 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             },
         )
         self._clients = config.num_clients
-        source = ClientSource(config, self._notes, [0], run_ahead=0)
+        source = ClientSource(config, self._reports, [0], run_ahead=0)
         self._source: ClientSource | None = source
         with contextlib.ExitStack() as stack:
             stack.enter_context(source)
-            self._answer()
+            self._receive()
             stack.pop_all()
 
     def _describe(self, name: str, options: Mapping[str, Any], mode: AutoresetMode) -> None:
-        with_spaces = make_env(name, options)
-        self.single_observation_space = with_spaces.observation_space
-        self.single_action_space = with_spaces.action_space
-        self.metadata = {**with_spaces.metadata, "autoreset_mode": mode}
-        self.render_mode = with_spaces.render_mode
-        self.spec = with_spaces.spec
-        with_spaces.close()
+        """Take over spaces and metadata from a single environment, which is closed again."""
+        env = make_env(name, options)
+        self.single_observation_space = env.observation_space
+        self.single_action_space = env.action_space
+        self.metadata = {**env.metadata, "autoreset_mode": mode}
+        self.render_mode, self.spec = env.render_mode, env.spec
+        env.close()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._mode = mode
@@ -129,41 +131,38 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
 
         Args:
             seed: Environment i gets ``seed + i``; or a seed for each.
-            options: Handed to each environment's `reset`, except for ``reset_mask``, shape
-                (num_envs,): which environments are reset, where the mode is `DISABLED`.
+            options: Passed to `reset` of each environment, except for ``reset_mask``, shape
+                (num_envs,): which environments are reset if the autoreset mode is `DISABLED`.
 
         Raises:
-            ConfigError: The number of seeds, or the mask, does not fit.
+            ConfigError: If the number or type of the seeds, or the mask, is wrong.
         """
         count = self.num_envs
-        seeds: list[int | None] = [None] * count
-        try:
-            if seed is not None:
-                each = range(seed, seed + count) if isinstance(seed, int) else seed
-                seeds = [None if one is None else operator.index(one) for one in each]
-        except TypeError as error:
-            raise ConfigError(f"The seeds are {seed!r} but must be whole numbers.") from error
         options = dict(options or {})
-        mask = np.ones(count, np.bool_)
-        if "reset_mask" in options:
-            mask = np.asarray(options.pop("reset_mask"))
+        mask = np.asarray(options.pop("reset_mask", np.ones(count, np.bool_)))
+        seeds = self._seeds(seed)
         if len(seeds) != count or mask.shape != (count,) or mask.dtype != np.bool_:
             raise ConfigError(
                 f"reset() of {count} environments got {len(seeds)} seeds, and a mask of shape "
                 f"{mask.shape} and type {mask.dtype}: give one seed and one bool for each."
             )
         if not mask.any():
-            raise ConfigError("reset_mask resets no environment.")
-        rest = options or None
+            raise ConfigError("reset_mask does not select any environment.")
+        shares = zip(self._split(seeds), self._split(mask.tolist()), strict=True)
         self._command(
-            "reset",
-            [
-                {"seeds": s, "mask": m, "options": rest}
-                for s, m in zip(self._shared(seeds), self._shared(mask.tolist()), strict=True)
-            ],
+            "reset", [{"seeds": s, "mask": m, "options": options or None} for s, m in shares]
         )
-        records = self._answer()
+        records = self._receive()
         return self._observed(records), self._infos(records, {})
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        try:
+            each = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
+            return [None if one is None else operator.index(one) for one in each]
+        except TypeError as error:
+            raise ConfigError(f"The seeds are {seed!r} but must be whole numbers.") from error
 
     def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Step all environments.
@@ -176,11 +175,11 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             environments, and infos.
 
         Raises:
-            ActionError: The actions are not of the space's shape.
-            PhysxError: An environment raised, or a process failed.
+            ActionError: If the actions do not have the shape of the space.
+            PhysxError: If an environment raises, or a process fails.
         """
-        self._open().apply(self._shares_of(actions), at_once=False)
-        records = self._answer()
+        self._open().apply(self._split_actions(actions), at_once=False)
+        records = self._receive()
         terminated, truncated = records["terminated"].copy(), records["truncated"].copy()
         finals: dict[int, Any] = {}
         if self._mode is AutoresetMode.SAME_STEP:
@@ -191,13 +190,13 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         infos = self._infos(records, finals)
         return self._observed(records), records["reward"].copy(), terminated, truncated, infos
 
-    def _shares_of(self, actions: Any) -> Batch:
+    def _split_actions(self, actions: Any) -> Batch:
         """Return the actions by client: arrays of shape (clients, share, *shape)."""
         shares: Batch = {}
         try:
             given = self._actions.arrays(actions)
         except (TypeError, ValueError, LookupError) as error:
-            raise ActionError(f"These are no actions of {self.action_space}: {error}.") from error
+            raise ActionError(f"The actions do not fit {self.action_space}: {error}.") from error
         for field in self._actions.fields:
             wanted = (self.num_envs, *(field.shape or ()))
             array = given[field.name]
@@ -212,8 +211,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             shares[field.name] = array.reshape(self._clients, self._share, *wanted[1:])
         return shares
 
-    def _answer(self) -> Array:
-        """Return what became of the last actions or commands, as records, shape (num_envs,)."""
+    def _receive(self) -> Array:
+        """Return the results of the last actions or command as records, shape (num_envs,)."""
         return self._row.records(self._open().batch(self._clients)[ROW])[: self.num_envs]
 
     def _observed(self, records: Array) -> Any:
@@ -224,45 +223,45 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _infos(self, records: Array, finals: Mapping[int, Any]) -> dict[str, Any]:
         kinds, data = records["info"], records["infos"]
-        layout = self._notes.layout
+        layout = self._reports.layout
         found = kinds.tobytes()
-        if Info.TEXT not in found and not finals:
-            if Info.NUMBERS not in found:
+        if InfoKind.PACKED not in found and not finals:
+            if InfoKind.NUMBERS not in found:
                 return {}
             if layout is not None:
-                return layout.columns(layout.records(data), kinds == Info.NUMBERS)
+                return layout.columns(layout.records(data), kinds == InfoKind.NUMBERS)
         infos: dict[str, Any] = {}
-        told: list[tuple[int, dict[str, Any]]] = []
+        new: list[tuple[int, dict[str, Any]]] = []
         for i, kind in enumerate(kinds.tolist()):
             client, place = divmod(i, self._share)
             info: dict[str, Any] = {}
-            if kind == Info.NUMBERS:
-                info = self._notes.info(client, data[i])
-            elif kind == Info.TEXT:
-                said = text_value(data[i]) or self._notes.said(client)["infos"][str(place)]
-                told.append((client, said))
-                info = said["info"]
+            if kind == InfoKind.NUMBERS:
+                info = self._reports.info(client, data[i])
+            elif kind == InfoKind.PACKED:
+                report = unpack(data[i]) or self._reports.last(client)["infos"][str(place)]
+                new.append((client, report))
+                info = report["info"]
             if i in finals:
                 info = {"final_obs": finals[i], **info}
             if info:
                 infos = self._add_info(infos, info, i)
-        for client, said in told:  # from the next row on
-            self._notes.learn(client, said)
+        for client, report in new:  # valid from the next row on
+            self._reports.learn(client, report)
         return infos
 
-    # Everything else ------------------------------------------------------------------------
+    # Other methods -------------------------------------------------------------------------
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call a method of each environment, or read an attribute; return what each gives.
+        """Call a method of each environment, or read an attribute; return the results.
 
         Raises:
-            UsageError: It is `reset`, `step` or `close`, or what it gives cannot be sent.
+            UsageError: If it is `reset`, `step` or `close`, or a result cannot be sent.
         """
         if name in FORBIDDEN:
-            raise UsageError(f'call("{name}") would go past this object: use {name}() itself.')
+            raise UsageError(f'call("{name}") would bypass this object: use {name}() itself.')
         self._command("call", [(name, list(args), kwargs)] * self._clients)
-        self._answer()
-        results = [self._notes.said(client)["results"] for client in range(self._clients)]
+        self._receive()
+        results = [self._reports.last(client)["results"] for client in range(self._clients)]
         return tuple(itertools.chain.from_iterable(results))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -273,16 +272,16 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         """Set an attribute of each environment: one value for all, or a list with one for each.
 
         Raises:
-            ConfigError: There are more or fewer values than environments.
+            ConfigError: If the number of values is not that of the environments.
         """
         each = list(values) if isinstance(values, (list, tuple)) else [values] * self.num_envs
         if len(each) != self.num_envs:
             raise ConfigError(f"{len(each)} values for {self.num_envs} environments.")
-        self._command("set", [(name, share) for share in self._shared(each)])
-        self._answer()
+        self._command("set", [(name, share) for share in self._split(each)])
+        self._receive()
 
     def render(self) -> tuple[Any, ...]:
-        """Return what each environment renders."""
+        """Return the frame that each environment renders."""
         return self.call("render")
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -297,10 +296,10 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         return self._source
 
     def _command(self, name: str, arguments: Sequence[Any]) -> None:
-        """Have each client obey a command in the place of actions."""
-        self._open().apply({COMMAND: packed(name, arguments)}, at_once=False)
+        """Send each client a command instead of actions."""
+        self._open().apply({COMMAND: pack_commands(name, arguments)}, at_once=False)
 
-    def _shared(self, values: Sequence[Any]) -> list[list[Any]]:
+    def _split(self, values: Sequence[Any]) -> list[list[Any]]:
         """Return the values of each client's environments."""
         return [
             list(values[first : first + self._share])
@@ -308,53 +307,52 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         ]
 
 
-class _Notes:
-    """What clients say beside their rows; the services of the run that they think they are in.
+class _Reports:
+    """Collects what clients report besides their rows, as the services of their run.
 
     Attributes:
-        layout: Layout of the infos of all clients that told one; None where they differ.
+        layout: Layout of the infos of all clients; None if they differ.
     """
 
     def __init__(self) -> None:
         self.layout: InfoLayout | None = None
-        self._said: dict[int, dict[str, Any]] = {}
+        self._last: dict[int, dict[str, Any]] = {}
         self._layouts: dict[int, InfoLayout] = {}
         self._left_out: set[str] = set()
 
-    def said(self, client: int) -> dict[str, Any]:
-        """Return what a client, counted from 0, said before its last row."""
-        return self._said[client]
+    def last(self, client: int) -> dict[str, Any]:
+        """Return what a client, counted from 0, reported before its last row."""
+        return self._last[client]
 
     def info(self, client: int, data: Array) -> dict[str, Any]:
-        """Return an info that is a record of the layout that a client told last."""
+        """Return an info from a record of the layout that a client announced last."""
         layout = self._layouts[client]
         return layout.info(layout.records(data[np.newaxis])[0])
 
-    def learn(self, client: int, said: Mapping[str, Any]) -> None:
-        """Note the layout that was told with an info; warn of what was left out."""
-        if "layout" in said:
-            self._layouts[client] = layout = InfoLayout(said["layout"])
+    def learn(self, client: int, report: Mapping[str, Any]) -> None:
+        """Remember the layout that an info was reported with; warn of entries left out."""
+        if "layout" in report:
+            self._layouts[client] = layout = InfoLayout(report["layout"])
             differ = any(other.names != layout.names for other in self._layouts.values())
             self.layout = None if differ else layout
-        new = set(said.get("left_out", [])) - self._left_out
+        new = set(report.get("left_out", [])) - self._left_out
         if new:
             self._left_out |= new
             _LOG.warning(
-                "Infos of these names are left out, for they hold more than plain values and "
-                "arrays: %s.",
+                "Info entries are left out because they are neither plain values nor arrays: %s.",
                 ", ".join(sorted(new)),
             )
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Keep what a client says before its row."""
-        self._said[instance_id - 1] = values
+        """Store what a client reports before its row."""
+        self._last[instance_id - 1] = values
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return nothing: workers do not ask."""
+        """Return nothing: workers do not ask for parameters."""
         return {}
 
     def predict(self, fields: Sample) -> Sample:
-        """Refuse: workers do not ask."""
+        """Raise an error: workers do not ask for predictions."""
         raise UsageError("A vector environment has no network.")
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:

@@ -1,4 +1,4 @@
-"""The part of a parallel vector environment that lives in a client."""
+"""Worker of a parallel vector environment: steps a share of the environments in a client."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from physx_core.typing import Array, Sample
 from physx_gym.bridge.making import make_env
 from physx_gym.spaces import SpaceFields
 from physx_gym.vector.infos import InfoLayout
-from physx_gym.vector.rows import LENGTH, ROW, Info, RowLayout, put_text, text_value
+from physx_gym.vector.rows import LENGTH, ROW, InfoKind, RowLayout, put_packed, unpack
 
 COMMAND = "command"
-"""Entry of a prediction that is no action but says what else to do."""
+"""Entry of a prediction that holds a command instead of actions."""
 FORBIDDEN = ("reset", "step", "close")
-"""Methods that `call` does not call."""
+"""Methods that `call` rejects."""
 
 
 class VectorWorker(Environment):
     """Steps some of a vector environment's environments; a row holds one step of all of them.
 
-    An action, or a command, comes as the prediction; the next row is what became of it: see
-    `RowLayout`. Infos that are too long for it, and what methods return, go by `save_parameters`
-    before the row, which waits for an answer.
+    Actions, or a command, arrive as the prediction; the next row is their result: see `RowLayout`.
+    Infos that do not fit, and results of methods, are sent through `save_parameters` before the
+    row; that call waits for an answer.
     """
 
     def __init__(
@@ -42,12 +42,12 @@ class VectorWorker(Environment):
         autoreset: str,
         **kwargs: Any,
     ) -> None:
-        """Keep what the environments are made from.
+        """Store the arguments of the environments.
 
         Args:
             env: See `physx_gym.bridge.making.make_env`.
-            num_envs: Number of the vector environment's environments.
-            share: How many of them one client has; the last client may have fewer.
+            num_envs: Number of environments of the whole vector environment.
+            share: Number of environments of each client; the last one may have fewer.
             make_kwargs: Keyword arguments of each environment.
             autoreset: Value of an `AutoresetMode`.
             kwargs: Those of `Environment`.
@@ -60,14 +60,14 @@ class VectorWorker(Environment):
         self._mode = AutoresetMode(autoreset)
         self._envs: list[gymnasium.Env[Any, Any]] = []
         self._command: Mapping[str, Any] | None = None
-        self._layout: InfoLayout | None = None  # of infos, that was told last
+        self._layout: InfoLayout | None = None  # the one announced last
 
     def create(self) -> None:
-        """Make the environments."""
+        """Create the environments."""
         self._envs = [make_env(self._name, self._options) for _ in range(self._count)]
         self._actions = SpaceFields(self._envs[0].action_space, "action")
         self._observations = SpaceFields(self._envs[0].observation_space, "observation")
-        self._over = np.zeros(self._share, np.bool_)
+        self._is_over = np.zeros(self._share, np.bool_)
 
     def init_database(self) -> None:
         """Define the row."""
@@ -79,14 +79,14 @@ class VectorWorker(Environment):
         self.define_training_fields([layout.field])
 
     def apply_prediction(self, prediction: Sample) -> None:
-        """Keep the actions or the command for the next step."""
+        """Store the actions or the command for the next step."""
         self._command = prediction
 
     def step(self) -> None:
-        """Do what the last prediction asked for."""
+        """Execute what the last prediction asked for."""
         command, self._command = self._command, None
         if command is not None and COMMAND in command:
-            self._obey(text_value(command[COMMAND]))
+            self._execute(unpack(command[COMMAND]))
         elif command is not None:
             self._advance(command)
         self.set_training_data(**{ROW: self._bytes})
@@ -102,7 +102,7 @@ class VectorWorker(Environment):
         infos: list[dict[str, Any]] = []
         row = self._row
         for place, env in enumerate(self._envs):
-            if self._mode is AutoresetMode.NEXT_STEP and self._over[place]:
+            if self._mode is AutoresetMode.NEXT_STEP and self._is_over[place]:
                 infos.append(self._reset(place, None, None))
                 continue
             action = self._actions.value({name: each[place] for name, each in actions.items()})
@@ -115,10 +115,10 @@ class VectorWorker(Environment):
                     row[f"final_{name}"][place] = value
                 observation, reset_info = env.reset()
                 info = {**reset_info, "final_info": info}
-            self._over[place] = over
+            self._is_over[place] = over
             self._put(place, observation)
             infos.append(info)
-        self._tell(infos)
+        self._put_infos(infos)
 
     def _put(self, place: int, observation: Any) -> None:
         for name, value in self._observations.arrays(observation).items():
@@ -131,12 +131,12 @@ class VectorWorker(Environment):
         self._put(place, observation)
         self._row["reward"][place] = 0.0
         self._row["terminated"][place] = self._row["truncated"][place] = False
-        self._over[place] = False
+        self._is_over[place] = False
         return info
 
     # Commands -------------------------------------------------------------------------------
 
-    def _obey(self, command: Mapping[str, Any]) -> None:
+    def _execute(self, command: Mapping[str, Any]) -> None:
         arguments = command["arguments"]
         if command["name"] == "reset":
             infos = [
@@ -145,51 +145,51 @@ class VectorWorker(Environment):
                 else {}
                 for i in range(self._count)
             ]
-            self._tell(infos)
+            self._put_infos(infos)
         elif command["name"] == "call":
             name, positional, named = arguments
-            results = [_called(env, name, positional, named) for env in self._envs]
+            results = [_call(env, name, positional, named) for env in self._envs]
             self.save_parameters(results=results)
         else:
             name, values = arguments
             for env, value in zip(self._envs, values, strict=False):
                 env.set_wrapper_attr(name, value)
 
-    def _tell(self, infos: Sequence[dict[str, Any]]) -> None:
-        """Send the infos, if there is anything in them; what cannot travel is named instead."""
-        known, long = self._layout, {}
+    def _put_infos(self, infos: Sequence[dict[str, Any]]) -> None:
+        """Write the infos into the row; entries that cannot be sent are only named."""
+        layout, long = self._layout, {}
         for place, info in enumerate(infos):
             target = self._row["infos"][place]
             if not info:
-                self._row["info"][place] = Info.NONE
-            elif known is not None and known.put(info, target):
-                self._row["info"][place] = Info.NUMBERS
+                self._row["info"][place] = InfoKind.NONE
+            elif layout is not None and layout.put(info, target):
+                self._row["info"][place] = InfoKind.NUMBERS
             else:
-                self._row["info"][place] = Info.TEXT
-                said, text = self._said(info)
-                is_long = LENGTH + len(text) > len(target)
-                put_text(target, b"" if is_long else text)
+                self._row["info"][place] = InfoKind.PACKED
+                report, encoded = self._report(info)
+                is_long = LENGTH + len(encoded) > len(target)
+                put_packed(target, b"" if is_long else encoded)
                 if is_long:
-                    long[str(place)] = said
+                    long[str(place)] = report
         if long:
             self.save_parameters(infos=long)
 
-    def _said(self, info: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
-        """Return an info as a value and as a text, with its layout, which the next may have."""
-        said: dict[str, Any] = {"info": {str(name): value for name, value in info.items()}}
-        layout = InfoLayout.of(said["info"])
+    def _report(self, info: Mapping[str, Any]) -> tuple[dict[str, Any], bytes]:
+        """Return an info with its layout, which later ones may share; as it is, and encoded."""
+        report: dict[str, Any] = {"info": {str(name): value for name, value in info.items()}}
+        layout = InfoLayout.of(report["info"])
         if layout is not None:
-            self._layout, said["layout"] = layout, layout.names
+            self._layout, report["layout"] = layout, layout.names
         try:
-            return said, encode(said, "infos")
+            return report, encode(report, "infos")
         except UsageError:
-            left_out: set[str] = set()
-            said["info"] = _plain(said["info"], left_out)
-            said["left_out"] = sorted(left_out)
-            return said, encode(said, "infos")
+            sent = {name: value for name, value in report["info"].items() if _is_sendable(value)}
+            report["left_out"] = sorted(report["info"].keys() - sent.keys())
+            report["info"] = sent
+            return report, encode(report, "infos")
 
 
-def _called(
+def _call(
     env: gymnasium.Env[Any, Any], name: str, positional: Sequence[Any], named: Mapping[str, Any]
 ) -> Any:
     attribute = env.get_wrapper_attr(name)
@@ -201,23 +201,18 @@ def _called(
     return result
 
 
-def _plain(info: Mapping[str, Any], left_out: set[str]) -> dict[str, Any]:
-    """Return what of an info can travel; add the names of the rest to `left_out`."""
-    found: dict[str, Any] = {}
-    for name, value in info.items():
-        try:
-            encode({"": value} if isinstance(value, dict) else value, str(name))
-        except UsageError:
-            left_out.add(str(name))
-            continue
-        found[str(name)] = value
-    return found
+def _is_sendable(value: Any) -> bool:
+    try:
+        encode({"": value} if isinstance(value, dict) else value, "info")
+    except UsageError:
+        return False
+    return True
 
 
-def packed(name: str, arguments: Sequence[Any]) -> Array:
+def pack_commands(name: str, arguments: Sequence[Any]) -> Array:
     """Return a command for each client, as bytes of one length, shape (clients, bytes)."""
-    texts = [encode({"name": name, "arguments": each}, name) for each in arguments]
-    rows = np.zeros((len(texts), LENGTH + max(map(len, texts))), np.uint8)
-    for row, text in zip(rows, texts, strict=True):
-        put_text(row, text)
+    commands = [encode({"name": name, "arguments": each}, name) for each in arguments]
+    rows = np.zeros((len(commands), LENGTH + max(map(len, commands))), np.uint8)
+    for row, command in zip(rows, commands, strict=True):
+        put_packed(row, command)
     return rows
