@@ -21,8 +21,8 @@ from .physx.observer import PhysxObserver as PhysxObserver
 from .physx.vector_env import PhysxVectorEnv as PhysxVectorEnv
 from .serving.connection import Connection as Connection
 from .serving.protocol import Protocol as Protocol
-from .serving.protocol import Service as Service
 from .serving.sample_env import SampleEnv as SampleEnv
-from .serving.service import SocketService as SocketService
+from .serving.service import Service as Service
+from .serving.socket_service import SocketService as SocketService
 from .serving.worlds import Worlds as Worlds
 from .serving.worlds import open_worlds as open_worlds

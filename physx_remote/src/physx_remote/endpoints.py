@@ -7,14 +7,10 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from physx_core.errors import ConfigError, UsageError
+from physx_core.net import check_address, parse_address
 from physx_core.plugins import resolve
-from physx_remote.serving.protocol import (
-    Protocol,
-    Service,
-    check_place,
-    find_protocol,
-    parse_address,
-)
+from physx_remote.serving.protocol import Protocol, find_protocol
+from physx_remote.serving.service import Service
 from physx_remote.serving.worlds import GYMNASIUM, called, open_worlds
 
 if TYPE_CHECKING:
@@ -49,7 +45,7 @@ def serve(
     Raises:
         PhysxError: There is no such environment or protocol, or it cannot listen there.
     """
-    check_place(address, port)
+    check_address(address, port)
     if env_kwargs is not None and not isinstance(env_kwargs, Mapping):
         raise ConfigError(f"env_kwargs is {env_kwargs!r} but must be a dictionary.")
     kind = find_protocol(protocol)(**options)

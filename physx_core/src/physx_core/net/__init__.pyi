@@ -1,5 +1,9 @@
 """Framed, authenticated TCP: what servers and clients of physx share."""
 
+from .addresses import check_address as check_address
+from .addresses import format_address as format_address
+from .addresses import parse_address as parse_address
+from .addresses import retry as retry
 from .flat import flat_prefix as flat_prefix
 from .frames import HEADER as HEADER
 from .frames import MAX_PAYLOAD as MAX_PAYLOAD

@@ -21,8 +21,7 @@ from physx_core.errors import ConfigError, UsageError
 from physx_core.net import TOKEN_VARIABLE
 from physx_remote.endpoints import serve
 from physx_remote.godot_rl.launch import write_launcher
-from physx_remote.serving.protocol import Service
-from physx_remote.serving.service import LOG
+from physx_remote.serving.service import LOG, Service
 
 _PORTS = {"godot-gym": 9090, "godot-rl": 0, "physx": 0}
 _WITH_TOKEN = "physx"

@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any, Literal, get_args
 
 from physx_core.errors import ConfigError, RequestError, UsageError
+from physx_core.net import check_address
 from physx_remote.godot_gym.frames_timer import Signal
 from physx_remote.godot_gym.messages import ERROR, encoded_extension
 from physx_remote.godot_gym.requests import JsonReader, parse_request
 from physx_remote.serving.connection import Connection
 from physx_remote.serving.framing import MAX_REQUEST, FrameReader, Reader, framed
-from physx_remote.serving.protocol import check_place
-from physx_remote.serving.service import LOG, SocketService, Work
+from physx_remote.serving.service import LOG
+from physx_remote.serving.socket_service import SocketService, Work
 
 Clients = Literal["queue", "refuse", "serve"]
 Reply = Literal["always", "observation-only"]
@@ -119,7 +120,7 @@ class Communication(SocketService):
             ConfigError: Port or address is none.
             RemoteError: It cannot listen there.
         """
-        check_place(address, port)
+        check_address(address, port)
         if self.is_listening:
             raise UsageError(f"The server listens already, at {self.address}.")
         if self._over:

@@ -9,7 +9,8 @@ from physx_remote.godot_gym.client import GodotGymEnv
 from physx_remote.godot_gym.communication import Communication
 from physx_remote.godot_gym.environment import RLEnvironment
 from physx_remote.godot_gym.gymnasium_scene import GymnasiumScene
-from physx_remote.serving.protocol import Protocol, Service, check_options
+from physx_remote.serving.protocol import Protocol, Scene, check_options
+from physx_remote.serving.service import Service
 from physx_remote.serving.worlds import Worlds
 
 
@@ -32,16 +33,17 @@ class GodotGym(Protocol):
         Communication(**options)  # checks the values
         self._options = options
 
-    def service(
-        self, worlds: Worlds | RLEnvironment, *, address: str, port: int
-    ) -> GodotGymService:
+    def service(self, worlds: Worlds | Scene, *, address: str, port: int) -> GodotGymService:
         """Return a listening service; see `Protocol.service`.
 
         Raises:
-            UsageError: If there are several worlds, or the environment was served before.
+            UsageError: If there are several worlds, the environment was served before, or it is
+                not an `RLEnvironment`.
             RemoteError: If it cannot listen there.
         """
-        environment = worlds if isinstance(worlds, RLEnvironment) else GymnasiumScene(worlds)
+        environment = GymnasiumScene(worlds) if isinstance(worlds, Worlds) else worlds
+        if not isinstance(environment, RLEnvironment):
+            raise UsageError(f"{type(environment).__name__} is not an RLEnvironment.")
         if environment.communication.is_listening:
             raise UsageError(
                 f"This {type(environment).__name__} is or was served already: create another one."

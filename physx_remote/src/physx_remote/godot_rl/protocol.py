@@ -26,8 +26,9 @@ from physx_core.errors import (
 from physx_remote.godot_rl.agents import Agents, Answer
 from physx_remote.serving.connection import Connection
 from physx_remote.serving.framing import MAX_REQUEST, FrameReader, framed
-from physx_remote.serving.protocol import Protocol, Service, check_options
-from physx_remote.serving.service import LOG, SocketService, Work
+from physx_remote.serving.protocol import Protocol, Scene, check_options
+from physx_remote.serving.service import LOG, Service
+from physx_remote.serving.socket_service import SocketService, Work
 from physx_remote.serving.worlds import Worlds
 
 PORT = 11008
@@ -82,7 +83,9 @@ class GodotRL(Protocol):
         self.action_repeat, self.seed = action_repeat, seed
         self.timeout, self.max_request = timeout, max_request
 
-    def service(self, worlds: Any, *, address: str = "127.0.0.1", port: int = 0) -> Service:
+    def service(
+        self, worlds: Worlds | Scene, *, address: str = "127.0.0.1", port: int = 0
+    ) -> Service:
         """Connect to a trainer and return the service of the worlds.
 
         Args:

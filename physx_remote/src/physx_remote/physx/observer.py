@@ -10,7 +10,7 @@ import numpy as np
 
 from physx_core import Closeable
 from physx_core.errors import RemoteProtocolError
-from physx_core.net import Frame, Kind, pack_value
+from physx_core.net import Frame, Kind, pack_value, parse_address
 from physx_core.typing import Array
 from physx_remote.physx.client import introduced_leaves
 from physx_remote.physx.link import PhysxLink
@@ -77,8 +77,6 @@ class PhysxObserver(Closeable):
             ConfigError: There is no token.
             RemoteError: Nothing answers, or the tokens differ.
         """
-        from physx_remote.serving.protocol import parse_address
-
         place = parse_address(address) if isinstance(address, str) else address
         self._link = PhysxLink(place, OBSERVE, **options)
         self._observations, self._actions = introduced_leaves(self._link.introduction)

@@ -9,11 +9,10 @@ from physx_core.errors import ConfigError, UsageError
 from physx_core.net import MAX_PAYLOAD, checked_token, given_token
 from physx_remote.physx.service import PhysxService
 from physx_remote.serving.framing import MAX_REQUEST
-from physx_remote.serving.protocol import Protocol
+from physx_remote.serving.protocol import Protocol, Scene
 from physx_remote.serving.worlds import Worlds
 
 if TYPE_CHECKING:
-    from physx_remote.godot_gym.environment import RLEnvironment
     from physx_remote.physx.client import PhysxEnv
     from physx_remote.physx.vector_env import PhysxVectorEnv
 
@@ -73,7 +72,7 @@ class Physx(Protocol):
             "max_snapshots": max_snapshots,
         }
 
-    def service(self, worlds: Worlds | RLEnvironment, *, address: str, port: int) -> PhysxService:
+    def service(self, worlds: Worlds | Scene, *, address: str, port: int) -> PhysxService:
         """Return a service that listens; see `Protocol.service`.
 
         Raises:

@@ -37,7 +37,8 @@ from physx_remote.physx.wire import (
 from physx_remote.physx.world_requests import Outcome, Requests, reported
 from physx_remote.serving.connection import Connection
 from physx_remote.serving.framing import Reader
-from physx_remote.serving.service import LOG, SocketService, Work
+from physx_remote.serving.service import LOG
+from physx_remote.serving.socket_service import SocketService, Work
 from physx_remote.serving.spaces import describe_space
 from physx_remote.serving.worlds import Worlds
 

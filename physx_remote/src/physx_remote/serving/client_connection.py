@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import socket
-import time
 from collections.abc import Callable
 from typing import ClassVar
 
 from physx_core.errors import RemoteClosedError, RemoteError, RemoteTimeoutError
+from physx_core.net import retry
 
 _RETRY = 0.1
 
@@ -39,19 +39,15 @@ class Connection:
             RemoteTimeoutError: Nothing listens at the address in time.
             RemoteError: The address does not exist.
         """
-        until = time.monotonic() + patience
-        while True:
-            try:
-                return connect(max(until - time.monotonic(), 0.001))
-            except (ConnectionRefusedError, TimeoutError) as error:
-                if time.monotonic() + _RETRY > until:
-                    raise RemoteTimeoutError(
-                        f"Nothing answers at {self.name} within {patience:g} s: {error}. Start the "
-                        f"{self._server} first, or give a longer connect_timeout."
-                    ) from error
-                time.sleep(_RETRY)
-            except OSError as error:
-                raise RemoteError(f"{self.name} cannot be reached: {error}.") from error
+        try:
+            return retry(connect, patience, _RETRY, ConnectionRefusedError, TimeoutError)
+        except (ConnectionRefusedError, TimeoutError) as error:
+            raise RemoteTimeoutError(
+                f"Nothing answers at {self.name} within {patience:g} s: {error}. Start the "
+                f"{self._server} first, or give a longer connect_timeout."
+            ) from error
+        except OSError as error:
+            raise RemoteError(f"{self.name} cannot be reached: {error}.") from error
 
     def _check_open(self) -> None:
         """Check that the connection is not closed.

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import socket
-import time
 from typing import Any
 
-from physx_core.errors import ConnectionRefusedByPeerError, UnansweredError
+from physx_core.errors import ConfigError, ConnectionRefusedByPeerError, UnansweredError
+from physx_core.net.addresses import parse_address, retry
 from physx_core.net.frames import Kind
 from physx_core.net.handshake import introduce
 from physx_core.net.remote_errors import decode_error
@@ -41,14 +41,11 @@ def join(
         ConnectionRefusedByPeerError: Nothing answers at the address, not a server with this token,
             or the server has no place for the instance.
     """
-    until = time.monotonic() + patience
-    while True:
-        try:
-            return _try_to_join(address, token, instance)
-        except UnansweredError:
-            if time.monotonic() + _PAUSE > until:
-                raise
-        time.sleep(_PAUSE)
+
+    def attempt(seconds: float) -> tuple[Link, dict[str, Any]]:
+        return _try_to_join(address, token, instance)
+
+    return retry(attempt, patience, _PAUSE, UnansweredError)
 
 
 def _try_to_join(address: str, token: str, instance: int) -> tuple[Link, dict[str, Any]]:
@@ -70,14 +67,12 @@ def _try_to_join(address: str, token: str, instance: int) -> tuple[Link, dict[st
 
 
 def _connection(address: str) -> socket.socket:
-    host, _, port = address.rpartition(":")
     what = f'No server can be reached at "{address}"'
     advice = "Give the HOST:PORT at which the run listens."
     try:
-        place = (host.strip("[]"), int(port))
-        return socket.create_connection(place, timeout=_ANSWER_TIME)
-    except (ValueError, OverflowError, socket.gaierror) as error:
-        raise ConnectionRefusedByPeerError(f"{what}: {error}. {advice}") from error
+        return socket.create_connection(parse_address(address), timeout=_ANSWER_TIME)
+    except (ConfigError, socket.gaierror) as error:
+        raise ConnectionRefusedByPeerError(f"{what}: {error} {advice}") from error
     except OSError as error:
         raise UnansweredError(f"{what}: {error}. {advice}") from error
 

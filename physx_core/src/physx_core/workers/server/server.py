@@ -15,6 +15,7 @@ from physx_core.errors import (
     PhysxError,
     SampleError,
 )
+from physx_core.net.addresses import format_address
 from physx_core.net.frames import MAX_PAYLOAD, Frame, Kind, pack
 from physx_core.net.remote_errors import decode_error, encode_error
 from physx_core.net.spin_wait import awaited, has_core_for_each
@@ -115,7 +116,7 @@ class Server:
             raise ConfigError("The server is not open.")
         host, port = self._listener.getsockname()[:2]
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-        return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        return format_address(host, port)
 
     def pump(self, timeout: float) -> None:
         """Do what there is to do; wait up to `timeout` s for the first of it.

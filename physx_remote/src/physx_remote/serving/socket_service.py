@@ -1,0 +1,395 @@
+"""SocketService: one thread and one selector serve all connections, one request at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import selectors
+import socket
+import threading
+import time
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterator
+
+from physx_core.errors import RemoteProtocolError
+from physx_remote.serving.connection import MOMENT, Connection, listening_socket
+from physx_remote.serving.framing import FrameReader, Reader
+from physx_remote.serving.service import LOG, Service
+from physx_remote.serving.timers import Timers
+
+_ACCEPTED_AT_ONCE = 16
+_READ = selectors.EVENT_READ
+_SLICE = 0.02
+_PAUSE = 0.5
+
+Work = Iterator[float]
+"""A request in progress: yields how long it wants to be left alone, in s."""
+
+
+class SocketService(Service):
+    """Connections of a service.
+
+    `received` is called with one message after the other, whoever sent it; while the work that it
+    returns is in progress no other message is handed on, but connections are accepted, read and
+    closed, and timers run. Who sends faster than it is served, or does not read what it is sent,
+    waits.
+    """
+
+    def __init__(self, *, max_clients: int = 256) -> None:
+        """Begin without any connection.
+
+        Args:
+            max_clients: How many connections are open at most; who comes then is closed at once.
+        """
+        self.address = ("", 0)
+        self.connections: list[Connection] = []
+        self._max_clients = max_clients
+        self._selector: selectors.BaseSelector
+        self._waker: socket.socket
+        self._wakes: socket.socket
+        self._listener: socket.socket | None = None
+        self._ready: deque[Connection] = deque()
+        self._timers = Timers()
+        self._work: tuple[Connection, Work] | None = None
+        self._recent: Connection | None = None
+        self._resume_at = self._looked = 0.0
+        self._lock = threading.RLock()
+        self._is_open = self._is_polling = self._has_more = self._over = self._released = False
+
+    # What a subclass implements ---------------------------------------------------------------
+
+    @abstractmethod
+    def received(self, connection: Connection, body: bytes) -> Work | None:
+        """Handle one message; return the rest of the work if it is not done at once."""
+
+    def opened(self, connection: Connection) -> None:
+        """Handle a new connection."""
+
+    def closed(self, connection: Connection) -> None:
+        """Handle the end of a connection; nothing can be sent on it."""
+
+    def drained(self, connection: Connection) -> None:
+        """Handle that all is sent which had to wait."""
+
+    def admits(self, connection: Connection) -> bool:
+        """Return whether a message of this connection may be handled now."""
+        return True
+
+    def new_reader(self) -> Reader:
+        """Return what cuts the messages out of a new connection's stream."""
+        return FrameReader()
+
+    # What a subclass calls ----------------------------------------------------------------------
+
+    def listen(self, address: str, port: int) -> None:
+        """Begin to accept connections.
+
+        Args:
+            address: Address of this machine.
+            port: Port, 0 for any that is free.
+
+        Raises:
+            RemoteError: The address is not one of this machine, or the port is in use.
+        """
+        self._open()
+        self._listener = listening_socket(address, port)
+        self.address = self._listener.getsockname()[:2]
+        self._selector.register(self._listener, selectors.EVENT_READ)
+
+    def adopt(self, connected: socket.socket) -> Connection:
+        """Serve a socket that is connected already."""
+        self._open()
+        host, port = connected.getpeername()[:2]
+        connection = Connection(connected, self.new_reader(), f"{host}:{port}")
+        self.connections.append(connection)
+        connection.watch(self._selector)
+        self.opened(connection)
+        return connection
+
+    def send(self, connection: Connection, *parts: bytes | memoryview) -> None:
+        """Send parts as one piece; a broken connection is dropped and nothing else happens."""
+        if connection.closed:
+            return
+        try:
+            connection.send(parts)
+        except OSError as error:
+            self.drop(connection, f"{error}")
+            return
+        if connection.outgoing:
+            connection.watch(self._selector)
+
+    def drop(self, connection: Connection, reason: str = "") -> None:
+        """Close a connection; what it asked for is finished, but not answered.
+
+        Args:
+            connection: The connection.
+            reason: What happened, for the log; empty: nothing that needs attention.
+        """
+        if connection.closed:
+            return
+        if reason:
+            LOG.warning("Connection of %s ended: %s", connection.name, reason)
+        connection.close(self._selector)
+        self.connections.remove(connection)
+        if connection in self._ready:
+            self._ready.remove(connection)
+        self.closed(connection)
+
+    def after(self, seconds: float, action: Callable[[], None]) -> None:
+        """Call a function once, some time from now, between messages."""
+        self._timers.add(seconds, action)
+
+    # The loop -------------------------------------------------------------------------------
+
+    def poll(self, timeout: float | None = 0.0) -> bool:
+        """Handle what has arrived; see `Service.poll`."""
+        # Of this and `close`, which another thread may be in, at least one sees the other at work.
+        self._is_polling = True
+        try:
+            if not self._over:
+                self._cycle(timeout)
+        finally:
+            self._is_polling = False
+            if self._over:
+                self._release()
+        return not self._over
+
+    def close(self) -> None:
+        """End all connections; may be called by any thread, and within a request."""
+        self._over = True
+        if not self._is_polling:
+            self._release()
+            return
+        with self._lock, contextlib.suppress(BlockingIOError):
+            if self._is_open and not self._released:
+                self._wakes.send(b"x")
+
+    def _cycle(self, timeout: float | None) -> None:
+        if not self._is_open:
+            self._open()
+        if not self._came_soon(timeout):
+            self._look(timeout)
+        if self._work is not None or self._ready or self._timers.next < math.inf:
+            self._turn()
+        else:
+            self._has_more = False
+
+    def _came_soon(self, timeout: float | None) -> bool:
+        """Handle the next message of a quick client that is alone, if it comes within a moment."""
+        connection, self._recent = self._recent, None
+        if connection is None or not connection.is_quick or connection.closed:
+            return False
+        if len(self.connections) > 1 or self._work is not None:
+            return False
+        wait = self._wait(timeout)
+        if (wait is not None and wait < MOMENT) or time.monotonic() - self._looked > _SLICE:
+            return False
+        try:
+            if not connection.receive_soon():
+                return False
+        except OSError as error:
+            self.drop(connection, str(error))
+            return True
+        self._answer(connection)
+        return True
+
+    def _look(self, timeout: float | None) -> None:
+        """Handle what the selector sees."""
+        has_guests = False
+        for key, events in self._selector.select(self._wait(timeout)):
+            if key.data is not None:
+                self._serve(key.data, events)
+            elif key.fileobj is self._waker:
+                self._waker.recv(1024)
+            else:
+                has_guests = True
+        self._looked = time.monotonic()
+        if has_guests:  # those who left make room first
+            self._accept()
+
+    def _open(self) -> None:
+        """Take what the loop needs from the system."""
+        with self._lock:
+            if self._is_open or self._released:
+                return
+            self._is_open = True
+            self._selector = selectors.DefaultSelector()
+            self._waker, self._wakes = socket.socketpair()
+            self._waker.setblocking(False)
+            self._wakes.setblocking(False)
+            self._selector.register(self._waker, selectors.EVENT_READ)
+
+    def _release(self) -> None:
+        with self._lock:
+            if self._released:
+                return
+            self._released = True
+            if not self._is_open:
+                return
+            self._work = None
+            for connection in [*self.connections]:
+                self.drop(connection)
+            if self._listener is not None:
+                self._listener.close()
+            self._waker.close()
+            self._wakes.close()
+            self._selector.close()
+
+    def _wait(self, timeout: float | None) -> float | None:
+        """Return how long nothing happens, unless something arrives."""
+        if self._has_more:
+            return 0.0
+        moment = self._timers.next
+        if self._work is not None:
+            moment = min(moment, self._resume_at)
+        if moment == math.inf:
+            return timeout
+        wait = max(0.0, moment - time.monotonic())
+        return wait if timeout is None else min(wait, timeout)
+
+    def _turn(self) -> None:
+        """Run timers, and work until there is none, or others have waited long enough."""
+        begin = time.monotonic()
+        self._timers.call_due()
+        self._has_more = True
+        while not self._over:
+            if self._work is not None:
+                if self._resume_at > time.monotonic():
+                    self._has_more = False
+                    return
+                self._go_on()
+            else:
+                connection = self._next()
+                if connection is None:
+                    self._has_more = False
+                    return
+                self._begin(connection)
+            if time.monotonic() - begin > _SLICE:
+                return
+
+    def _next(self) -> Connection | None:
+        """Return whose message is to be handled now: the one that waits longest."""
+        for _ in range(len(self._ready)):
+            connection = self._ready.popleft()
+            if not connection.outgoing and self.admits(connection):
+                return connection
+            self._ready.append(connection)
+        return None
+
+    def _begin(self, connection: Connection) -> None:
+        body, connection.body = connection.body, None
+        try:
+            work = self.received(connection, body or b"")
+        except BaseException as error:
+            self._failed(connection, error)
+            return
+        if work is None:
+            self._after(connection)
+            return
+        self._work = connection, work
+        self._go_on()
+
+    def _go_on(self) -> None:
+        """Run the work in progress until it wants to wait or is done."""
+        if self._work is None:
+            return
+        connection, work = self._work
+        try:
+            self._resume_at = time.monotonic() + next(work)
+        except StopIteration:
+            self._work = None
+            self._after(connection)
+        except BaseException as error:
+            self._work = None
+            self._failed(connection, error)
+
+    def _failed(self, connection: Connection, error: BaseException) -> None:
+        """Give up the connection whose request could not be handled."""
+        if not isinstance(error, Exception):
+            self.drop(connection, f"interrupted by {type(error).__name__}")
+            raise error
+        LOG.error("A request of %s failed", connection.name, exc_info=error)
+        self.drop(connection, f"{type(error).__name__}: {error}")
+
+    def _after(self, connection: Connection) -> None:
+        """Look for the next message of a connection, or for its end."""
+        if connection.closed:
+            return
+        connection.touch()
+        if connection.is_quiet and connection.events == _READ:
+            self._recent = connection
+            return
+        try:
+            if connection.next_body():
+                self._ready.append(connection)
+            elif connection.ended and not connection.outgoing:
+                half = connection.reader.waiting
+                self.drop(connection, f"in the middle of a message ({half} bytes)" if half else "")
+                return
+        except RemoteProtocolError as error:
+            self.drop(connection, str(error))
+            return
+        connection.watch(self._selector)
+
+    def _serve(self, connection: Connection, events: int) -> None:
+        """Read and write what a connection has and takes."""
+        if connection.closed:
+            return
+        had_body = connection.body is not None
+        try:
+            if events & selectors.EVENT_WRITE:
+                connection.flush()
+                if not connection.outgoing:
+                    self.drained(connection)
+            if events & selectors.EVENT_READ:
+                connection.receive()
+        except OSError as error:
+            self.drop(connection, str(error))
+            return
+        if had_body and connection.ended and not self.admits(connection):
+            self.drop(connection, "it left before its turn came")
+        elif had_body or (self._work is not None and self._work[0] is connection):
+            connection.watch(self._selector)
+        elif self._ready or self._work is not None or self._over:
+            self._after(connection)
+        else:
+            self._answer(connection)
+
+    def _answer(self, connection: Connection) -> None:
+        """Handle the message that has just arrived, where nobody else waits."""
+        try:
+            if connection.next_body() and self.admits(connection) and not connection.outgoing:
+                self._begin(connection)
+                return
+        except RemoteProtocolError as error:
+            self.drop(connection, str(error))
+            return
+        self._after(connection)
+
+    def _accept(self) -> None:
+        """Take some of those who wait at the door."""
+        for _ in range(_ACCEPTED_AT_ONCE):
+            if self._listener is None:
+                return
+            try:
+                connected, place = self._listener.accept()
+            except BlockingIOError:
+                return
+            except ConnectionError:  # it was gone before it was accepted
+                continue
+            except OSError as error:  # the process has too many files open
+                LOG.warning("No connection can be accepted for now: %s", error)
+                self._selector.unregister(self._listener)
+                self.after(_PAUSE, self._accept_again)
+                return
+            if len(self.connections) >= self._max_clients:
+                connected.close()
+                LOG.warning("%s:%s was turned away: too many are connected", *place[:2])
+                continue
+            with contextlib.suppress(OSError):  # gone already
+                self.adopt(connected)
+
+    def _accept_again(self) -> None:
+        if self._listener is not None:
+            self._selector.register(self._listener, selectors.EVENT_READ)
