@@ -1,4 +1,4 @@
-"""The plugin ``gym``: every environment that Gymnasium knows, by its id."""
+"""The plugin ``gym``: every environment that is registered with Gymnasium, by its id."""
 
 from __future__ import annotations
 

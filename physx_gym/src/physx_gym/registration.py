@@ -1,4 +1,4 @@
-"""The environments of physx in Gymnasium's registry."""
+"""Registers the environments of physx with Gymnasium."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium
 
-_HOMES = {
+_ENTRY_POINTS = {
     "Cartpole": "cartpole:CartpoleEnv",
     "Acrobot": "acrobot:AcrobotEnv",
     "Ant": "ant:AntEnv",
@@ -15,37 +15,38 @@ _HOMES = {
     "ArmReach": "arm_reach:ArmReachEnv",
     "PushBox": "push_box:PushBoxEnv",
 }
-_SOLVED = {"Cartpole": 475.0, "Acrobot": -100.0}
+_REWARD_THRESHOLDS = {"Cartpole": 475.0, "Acrobot": -100.0}
 
 
 def register() -> None:
     """Register ``physx/<Name>-v0`` for each environment; none is imported before it is made.
 
-    ``import physx_gym`` calls it, as is the custom of Gymnasium's packages.
+    ``import physx_gym`` calls it, and so does ``gymnasium.make("physx_gym:physx/Cartpole-v0")``,
+    which imports the package itself.
     """
-    for name, home in _HOMES.items():
-        identity = f"physx/{name}-v0"
-        if identity in gymnasium.registry:
+    for name, place in _ENTRY_POINTS.items():
+        id = f"physx/{name}-v0"
+        if id in gymnasium.registry:
             continue
         gymnasium.register(
-            identity,
-            entry_point=f"physx_gym.environments.{home}",
-            vector_entry_point=partial(make_vector, identity),
-            reward_threshold=_SOLVED.get(name),
+            id,
+            entry_point=f"physx_gym.environments.{place}",
+            vector_entry_point=partial(make_vector, id),
+            reward_threshold=_REWARD_THRESHOLDS.get(name),
         )
 
 
-def make_vector(identity: str, num_envs: int, **options: Any) -> Any:
+def make_vector(id: str, num_envs: int, **options: Any) -> Any:
     """Return a vector environment whose environments run in client processes.
 
     Args:
-        identity: Id of the environment.
-        num_envs: How many.
+        id: Id of the environment.
+        num_envs: Number of environments.
         options: ``processes``, ``autoreset_mode``, ``copy`` and ``timeout`` of `ParallelVectorEnv`;
-            the rest is for each environment.
+            all others are for each environment.
     """
     from physx_gym.vector.vector_env import ParallelVectorEnv
 
     names = ("processes", "autoreset_mode", "copy", "timeout")
     own = {name: options.pop(name) for name in names if name in options}
-    return ParallelVectorEnv(identity, num_envs, env_kwargs=options, **own)
+    return ParallelVectorEnv(id, num_envs, env_kwargs=options, **own)

@@ -1,4 +1,4 @@
-"""Gymnasium's environments as environments of physx, and networks as policies."""
+"""Gymnasium environments as physx environments, and networks as policies."""
 
 import gymnasium
 import numpy as np
@@ -19,7 +19,7 @@ from physx_gym.spaces import SpaceFields
 
 
 def lean(observation):
-    """Push a pole to where it falls."""
+    """Push the cart in the direction in which the pole falls."""
     return int(observation[2] + 0.5 * observation[3] > 0)
 
 
@@ -126,7 +126,7 @@ def push_along(observation):
     return np.array([0.5 + 10 * observation[1]], np.float32)
 
 
-def test_mistakes_are_named(tmp_path):
+def test_mistakes_are_reported(tmp_path):
     with pytest.raises(ConfigError, match="CartPole-v7"):
         generate(
             tmp_path,
@@ -166,16 +166,16 @@ SPACES = gymnasium.spaces
         (SPACES.MultiBinary(3), [[0.2, 0.6, 0.5]], [[0, 1, 0]]),
     ],
 )
-def test_what_a_networks_numbers_mean(space, outputs, wanted):
+def test_actions_from_predictions(space, outputs, wanted):
     actions = SpaceFields(space, "action")
     found = action_arrays(actions, {"out": np.array(outputs)})["action"]
     assert found.tolist() == wanted
     assert space.contains(actions.value({"action": found[0]}))
 
 
-def test_a_wrong_number_of_outputs_is_named():
+def test_a_wrong_number_of_outputs_is_reported():
     actions = SpaceFields(SPACES.Box(-1, 1, (2,)), "action")
-    with pytest.raises(UsageError, match=r"gives 3 numbers for the action"):
+    with pytest.raises(UsageError, match=r"predicts 3 values for the action"):
         action_arrays(actions, {"out": np.zeros((1, 3))})
     two = SpaceFields(SPACES.Tuple((SPACES.Discrete(2), SPACES.Discrete(2))), "action")
     with pytest.raises(UsageError, match="name it in pred_fields"):

@@ -1,6 +1,9 @@
 """The registered environments, on every engine that can run them."""
 
+import contextlib
 import pickle
+import subprocess
+import sys
 import warnings
 
 import gymnasium
@@ -11,6 +14,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from physx_core.errors import EpisodeError, FeatureNotSupportedError
 from physx_gym import RobotEnv
+from physx_gym.bridge.make_env import make_env
 
 ENGINES = ("dart", "pinocchio")
 NAMES = ("Cartpole", "Acrobot", "Ant", "Quadruped", "ArmReach", "PushBox")
@@ -18,8 +22,8 @@ ALL = [(n, b) for n in NAMES for b in ENGINES if (n, b) != ("PushBox", "pinocchi
 STEPS = {"pinocchio": 12, "dart": 40}
 
 
-class Nameless(gymnasium.Env):
-    """Without `compute_reward`, which stable-baselines3 takes for that of a goal environment."""
+class Plain(gymnasium.Env):
+    """Hides `compute_reward`, which stable-baselines3 takes for that of a goal environment."""
 
     def __init__(self, env):
         self.env, self.metadata = env, env.metadata
@@ -52,13 +56,33 @@ def run(env, actions, seed):
     return np.array(observations), np.array(rewards)
 
 
+@pytest.mark.parametrize(
+    "program",
+    [
+        'import gymnasium; env = gymnasium.make("physx_gym:physx/Cartpole-v0")',
+        'import gymnasium, physx_gym; env = gymnasium.make("physx/Cartpole-v0")',
+    ],
+)
+def test_environments_are_registered_by_the_import(program):
+    program += "; env.reset(seed=0); print(env.unwrapped.spec.id)"
+    done = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+    assert done.stdout.decode().strip() == "physx/Cartpole-v0"
+
+
+def test_an_id_may_name_the_module_that_registers_it(nothing_stays_behind):
+    name = "physx_gym:physx/Cartpole-v0"
+    assert make_env(name, {}).unwrapped.spec.id == "physx/Cartpole-v0"
+    with contextlib.closing(gymnasium.make_vec(name, num_envs=1)) as env:
+        assert env.reset(seed=0)[0].shape == (1, 4)
+
+
 @pytest.mark.parametrize(("name", "backend"), ALL)
 def test_checkers_find_nothing(name, backend):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = make(name, backend)
         check_env(env.unwrapped, skip_render_check=True)
-        sb3_check_env(Nameless(env), skip_render_check=True)
+        sb3_check_env(Plain(env), skip_render_check=True)
     env.close()
 
 
@@ -115,7 +139,7 @@ def test_an_acrobot_above_the_bar_terminates():
 
 
 @pytest.mark.parametrize("name", ["Ant", "Quadruped"])
-def test_legs_stand_fall_and_tell_their_rewards(name):
+def test_legged_robots_stand_fall_and_report_their_rewards(name):
     env = make(name, "dart")
     env.reset(seed=0)
     for _ in range(20):
@@ -131,7 +155,7 @@ def test_legs_stand_fall_and_tell_their_rewards(name):
 
 
 @pytest.mark.parametrize("backend", ENGINES)
-def test_an_arm_holds_its_pose_and_goes_where_it_is_told(backend):
+def test_an_arm_holds_its_pose_and_follows_commands(backend):
     env = make("ArmReach", backend)
     env.reset(seed=0)
     for _ in range(20):
@@ -190,7 +214,7 @@ def test_make_vec_runs_them_in_processes(nothing_stays_behind):
 
 
 class Own(RobotEnv):
-    """Calls its own attributes what an environment might call its own."""
+    """Has attributes whose names an environment might use itself."""
 
     def __init__(self):
         super().__init__("cartpole", 0.02)
@@ -199,7 +223,7 @@ class Own(RobotEnv):
             setattr(self, name, "mine")
 
     def _run(self):
-        raise AssertionError("nobody calls this")
+        raise AssertionError("this is not to be called")
 
     _begin = _refusal = _attend = _run
 
@@ -207,7 +231,7 @@ class Own(RobotEnv):
         return float(all(getattr(self, name) == "mine" for name in self.names))
 
 
-def test_subclasses_call_their_attributes_as_they_like():
+def test_subclasses_may_use_any_attribute_names():
     env = Own()
     env.reset(seed=0)
     assert env.step(np.ones(2))[1] == 1.0

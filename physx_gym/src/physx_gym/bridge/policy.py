@@ -18,11 +18,11 @@ from physx_gym.spaces import SpaceFields
 
 
 class Policy:
-    """Acts as a trained network says.
+    """Chooses actions with a trained network.
 
-    The network reads fields of the observation, named as `SpaceFields` names them with the prefix
-    ``observation``, and predicts those of the action, ``action``; a network with one output and an
-    action of one part need no names. A callable::
+    The network reads fields of the observation, which `SpaceFields` names with the prefix
+    ``observation``, and predicts those of the action, with the prefix ``action``; for a network
+    with one output and an action of one part the name does not matter. Policies are callable::
 
         policy = Policy("sessions/training", env)
         observation, reward, *_ = env.step(policy(observation))
@@ -40,12 +40,12 @@ class Policy:
 
         Args:
             session: Folder of the session that trained it, or of its checkpoints.
-            env: Environment whose spaces it acts in.
-            network: Which checkpoint, and what else to change; None: the last one.
+            env: Environment for whose spaces it is.
+            network: Which checkpoint to load, and other changes; None: the last one.
 
         Raises:
-            CheckpointError: There is no checkpoint, or it is damaged.
-            ConfigError: The network reads what is no part of the observation.
+            CheckpointError: If there is no checkpoint, or it is damaged.
+            ConfigError: If the network reads a field that the observation does not have.
         """
         self._learner = load_learner(session, network)
         if isinstance(env, gymnasium.vector.VectorEnv):
@@ -60,32 +60,36 @@ class Policy:
         for name in self._learner.network.net_fields:
             if name not in known:
                 raise ConfigError(
-                    f'The network reads the field "{name}", which is no part of the observation: '
+                    f'The network reads the field "{name}", which is not part of the observation: '
                     f"{listed(known)}."
                 )
 
     def __call__(self, observation: Any) -> Any:
         """Return the action for an observation; for a vector environment, those of all."""
         arrays = self._observations.arrays(observation)
-        if not self._many:
-            arrays = {name: array[np.newaxis] for name, array in arrays.items()}
-        predicted = self._learner.predict(arrays)
         if self._many:
+            predicted = self._learner.predict(arrays)
             return self._actions.batch(action_arrays(self._actions, predicted))
-        one = {name: values[0] for name, values in action_arrays(self._actions, predicted).items()}
-        return self._actions.value(one)
+        batch = {name: array[np.newaxis] for name, array in arrays.items()}
+        return single_action(self._actions, self._learner.predict(batch))
 
     def act(self, observation: Any, *ignored: Any) -> Any:
-        """Return the action for an observation; what else `evaluate` gives is not looked at."""
+        """Return the action for an observation; further arguments of `evaluate` are ignored."""
         return self(observation)
 
 
-def action_arrays(actions: SpaceFields, prediction: Mapping[str, Any]) -> dict[str, Array]:
-    """Return the actions that a network's predictions mean, by field.
+def single_action(actions: SpaceFields, prediction: Mapping[str, Any]) -> Any:
+    """Return the action that a network's predictions for one sample stand for."""
+    arrays = action_arrays(actions, prediction)
+    return actions.value({name: values[0] for name, values in arrays.items()})
 
-    A box's numbers are cut at its bounds. For a choice among n the network gives n numbers, of
-    which the largest wins, or one number, which is rounded; for `MultiBinary`, numbers that mean
-    yes above 0.5.
+
+def action_arrays(actions: SpaceFields, prediction: Mapping[str, Any]) -> dict[str, Array]:
+    """Return the actions that a network's predictions stand for, by field.
+
+    The values of a box are clipped to its bounds. For a choice among n the network gives n values,
+    of which the largest wins, or one value, which is rounded; for `MultiBinary`, values above 0.5
+    count as 1.
 
     Args:
         actions: The action space.
@@ -95,7 +99,7 @@ def action_arrays(actions: SpaceFields, prediction: Mapping[str, Any]) -> dict[s
         Arrays of shape (samples, *field shape).
 
     Raises:
-        UsageError: The network gives nothing of that name, or another number of values.
+        UsageError: If the network does not predict a field, or predicts a wrong number of values.
     """
     found = {}
     for field, space in zip(actions.fields, actions.leaves, strict=True):
@@ -105,22 +109,22 @@ def action_arrays(actions: SpaceFields, prediction: Mapping[str, Any]) -> dict[s
             values = np.asarray(next(iter(prediction.values())))
         else:
             raise UsageError(
-                f'The network predicts {listed(prediction)}, but the action "{field.name}" is '
-                "wanted: name it in pred_fields."
+                f'The network predicts {listed(prediction)}, but not the action "{field.name}": '
+                "name it in pred_fields."
             )
         flat = values.reshape(len(values), -1)
         try:
-            found[field.name] = _actions_of(space, flat).reshape(len(flat), *(field.shape or ()))
+            found[field.name] = _to_actions(space, flat).reshape(len(flat), *(field.shape or ()))
         except ValueError as error:
             raise UsageError(
-                f'The network gives {flat.shape[1]} numbers for the action "{field.name}" of '
+                f'The network predicts {flat.shape[1]} values for the action "{field.name}" of '
                 f"{space}."
             ) from error
     return found
 
 
-def _actions_of(space: Any, values: Array) -> Array:
-    """Return the elements of a leaf that rows of numbers mean."""
+def _to_actions(space: Any, values: Array) -> Array:
+    """Return the elements of a leaf space that rows of values stand for."""
     if isinstance(space, spaces.Discrete):
         count = int(space.n)
         if values.shape[1] == count > 1:

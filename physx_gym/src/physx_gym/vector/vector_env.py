@@ -20,7 +20,7 @@ from physx_core.config import reference_of
 from physx_core.errors import ActionError, ConfigError, UnknownOptionError, UsageError
 from physx_core.sources import ClientSource
 from physx_core.typing import Array, Batch, Sample
-from physx_gym.bridge.making import make_env
+from physx_gym.bridge.make_env import make_env
 from physx_gym.spaces import SpaceFields
 from physx_gym.vector.infos import InfoLayout
 from physx_gym.vector.rows import ROW, InfoKind, RowLayout, unpack

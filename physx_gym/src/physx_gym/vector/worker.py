@@ -13,7 +13,7 @@ from physx_core.components import Environment
 from physx_core.errors import UsageError
 from physx_core.net import encode
 from physx_core.typing import Array, Sample
-from physx_gym.bridge.making import make_env
+from physx_gym.bridge.make_env import make_env
 from physx_gym.spaces import SpaceFields
 from physx_gym.vector.infos import InfoLayout
 from physx_gym.vector.rows import LENGTH, ROW, InfoKind, RowLayout, put_packed, unpack
@@ -45,7 +45,7 @@ class VectorWorker(Environment):
         """Store the arguments of the environments.
 
         Args:
-            env: See `physx_gym.bridge.making.make_env`.
+            env: See `physx_gym.bridge.make_env.make_env`.
             num_envs: Number of environments of the whole vector environment.
             share: Number of environments of each client; the last one may have fewer.
             make_kwargs: Keyword arguments of each environment.

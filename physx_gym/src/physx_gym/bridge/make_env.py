@@ -1,4 +1,4 @@
-"""Making a Gymnasium environment from its name."""
+"""Creates a Gymnasium environment by name."""
 
 from __future__ import annotations
 
@@ -15,23 +15,25 @@ def make_env(env: str, options: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
     """Return a new environment.
 
     Args:
-        env: Its id, for example ``"CartPole-v1"`` or ``"physx/Ant-v0"``; or where its class is,
-            ``"package.module:Class"`` or ``"script.py:Class"``.
+        env: Its id, for example ``"CartPole-v1"`` or, with a module to import before,
+            ``"physx_gym:physx/Ant-v0"``; or the location of its class, ``"package.module:Class"``
+            or ``"script.py:Class"``.
         options: Its keyword arguments.
 
     Raises:
-        ConfigError: There is none of that name, or what is there is no environment.
+        ConfigError: If there is no environment of that name.
     """
-    if ":" in env:
+    _, colon, name = env.rpartition(":")
+    if colon and name.replace(".", "").isidentifier():
         made = resolve("environment", env)(**options)
         if not isinstance(made, gymnasium.Env):
-            raise ConfigError(f"{env} made {type(made).__name__}, which is no gymnasium.Env.")
+            raise ConfigError(f"{env} returned a {type(made).__name__}, not a gymnasium.Env.")
         return made
     try:
         return gymnasium.make(env, **options)
     except gymnasium.error.UnregisteredEnv as error:
         known = sorted(gymnasium.registry)
         raise ConfigError(
-            f'Gymnasium knows no environment "{env}".{nearest(env, known)} '
-            f"{len(known)} are registered; gymnasium.pprint_registry() lists them. {error}"
+            f'"{env}" is not registered with Gymnasium.{nearest(env, known)} '
+            f"gymnasium.pprint_registry() lists the {len(known)} that are. {error}"
         ) from error
