@@ -119,7 +119,7 @@ def from_rotation_vector(x: float, y: float, z: float) -> Quaternion:
 
 
 def from_rotation_vector_rows(vectors: Vector) -> Vector:
-    """Return the quaternions (..., 4) of rotation vectors (..., 3)."""
+    """Return the quaternions (..., 4) of rotation vectors (..., 3); w may be negative."""
     half = 0.5 * np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.concatenate([0.5 * vectors * np.sinc(half / np.pi), np.cos(half)], axis=-1)
 

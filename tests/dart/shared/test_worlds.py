@@ -122,12 +122,12 @@ def test_settings_of_unknown_joints_are_named(backend, bar):
 @pytest.mark.parametrize(
     ("inside", "words"),
     [
-        ('<geometry><box size="1 1"/></geometry>', "box of size"),
+        ('<geometry><box size="1 1"/></geometry>', 'size="1 1"'),
         ('<geometry><box size="1 1 -1"/></geometry>', "box of size"),
         ('<geometry><sphere radius="nan"/></geometry>', 'radius="nan"'),
-        ('<geometry><cone radius="1"/></geometry>', 'collision shape "cone"'),
-        ("<geometry/>", 'collision shape "none"'),
-        ("", 'collision shape "none"'),
+        ('<geometry><cone radius="1"/></geometry>', 'collision shape .* kind "cone"'),
+        ("<geometry/>", 'collision shape .* kind "none"'),
+        ("", 'collision shape .* kind "none"'),
         ('<origin xyz="0 0"/><geometry><sphere radius="1"/></geometry>', 'xyz="0 0"'),
     ],
 )

@@ -38,6 +38,13 @@ from .sensors import Imu as Imu
 from .sensors import Sensor as Sensor
 from .sensors import Sensors as Sensors
 from .sensors import SensorState as SensorState
+from .urdf import UrdfShape as UrdfShape
+from .urdf import UrdfTree as UrdfTree
+from .urdf import link_of as link_of
+from .urdf import mesh_path as mesh_path
+from .urdf import numbers_of as numbers_of
+from .urdf import origin_of as origin_of
+from .urdf import parse_urdf as parse_urdf
 from .vectors import finite_rows as finite_rows
 from .vectors import finite_vector as finite_vector
 from .vectors import overwrite as overwrite

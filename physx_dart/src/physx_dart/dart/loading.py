@@ -18,7 +18,7 @@ from physx_core.rotations import to_matrix
 from physx_core.simulation import Ground, HeightField, Stairs
 from physx_core.typing import Vector
 from physx_dart.shared.parts import Mover, Static
-from physx_dart.shared.shapes import Shape
+from physx_dart.shared.shapes import CollisionShape
 
 WORLD = "world"
 ROOT = "physx root"
@@ -56,7 +56,7 @@ def link_name(link: str) -> str:
     return ROOT if link == WORLD else link
 
 
-def attach_shapes(skeleton: dynamics.Skeleton, shapes: Sequence[Shape]) -> None:
+def attach_shapes(skeleton: dynamics.Skeleton, shapes: Sequence[CollisionShape]) -> None:
     """Give a skeleton's bodies the shapes that touch things.
 
     Raises:
@@ -80,7 +80,7 @@ def static_skeleton(static: Static) -> dynamics.Skeleton:
     rotation = to_matrix(static.orientation)
     joint.setTransformFromParentBodyNode(_transform(static.position, rotation))
     what = static.what
-    if isinstance(what, Shape):
+    if isinstance(what, CollisionShape):
         _attach(body, _dart_shape(what), what, _transform(what.position, what.rotation))
     elif isinstance(what, HeightField):
         _attach(body, _height_shape(what), what, np.eye(4))
@@ -115,7 +115,7 @@ def _axes_along(normal: Vector) -> Vector:
 def _attach(
     body: dynamics.BodyNode,
     shape: object,
-    material: Shape | Ground | Stairs | HeightField,
+    material: CollisionShape | Ground | Stairs | HeightField,
     place: Vector,
 ) -> None:
     node = body.createShapeNode(shape)
@@ -126,7 +126,7 @@ def _attach(
     aspect.setRestitutionCoeff(float(material.restitution))
 
 
-def _dart_shape(shape: Shape) -> Any:
+def _dart_shape(shape: CollisionShape) -> Any:
     size = list(shape.size)
     if shape.mesh is not None:
         loaded = _loaded_mesh(shape.mesh)

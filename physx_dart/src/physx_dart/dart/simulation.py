@@ -23,7 +23,7 @@ from physx_dart.dart.robot import DartRobot
 from physx_dart.shared import catalog
 from physx_dart.shared.parts import Parts, read_parts
 from physx_dart.shared.robot_simulation import RobotSimulation
-from physx_dart.shared.shapes import Shape
+from physx_dart.shared.shapes import CollisionShape
 
 _DETECTORS = {
     "dart": CollisionDetectorType.DART,
@@ -109,7 +109,7 @@ class DartSimulation(RobotSimulation):
         if any(joint.settings.armature for each in parts.movers for joint in each.model.joints):
             raise FeatureNotSupportedError(self.engine, "armature", features)
         shapes = [shape for each in parts.movers for shape in each.model.shapes]
-        shapes += [each.what for each in parts.statics if isinstance(each.what, Shape)]
+        shapes += [each.what for each in parts.statics if isinstance(each.what, CollisionShape)]
         if detector == "fcl" and any(shape.kind == "capsule" for shape in shapes):
             advice = "Use another detector."
             raise FeatureNotSupportedError(self.engine, "capsules in fcl", features, advice)

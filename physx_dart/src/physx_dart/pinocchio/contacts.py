@@ -19,7 +19,7 @@ from physx_core.errors import FeatureNotSupportedError
 from physx_core.typing import Vector
 from physx_dart.pinocchio.surfaces import Plane, Surface, surfaces_of
 from physx_dart.shared.parts import Mover, Static
-from physx_dart.shared.shapes import Shape
+from physx_dart.shared.shapes import CollisionShape
 
 _MARGIN = 1e-4
 """Distance, in m, at which a point counts as touching."""
@@ -141,8 +141,8 @@ class ContactFinder:
             np.array([0.0, 0.0, 1.0]),
         )
         links = {name: i for i, name in enumerate(mover.model.links)}
-        points: list[tuple[int, Vector, float, int, Shape]] = []
-        rims: list[tuple[int, Vector, float, int, Shape, Vector]] = []
+        points: list[tuple[int, Vector, float, int, CollisionShape]] = []
+        rims: list[tuple[int, Vector, float, int, CollisionShape, Vector]] = []
         for shape in mover.model.shapes if self._surfaces else ():
             if shape.kind == "mesh":
                 advice = 'Use Robot(collisions="boxes") or "capsules".'
@@ -308,7 +308,7 @@ def _joined(found: list[_Near], name: str) -> Any:
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _points(shape: Shape) -> tuple[Vector, float]:
+def _points(shape: CollisionShape) -> tuple[Vector, float]:
     """Return where spheres are in a shape, and their radius; a radius of 0 is a point."""
     if shape.kind == "box":
         return _CORNERS * np.array(shape.size), 0.0

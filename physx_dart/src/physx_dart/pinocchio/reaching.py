@@ -10,7 +10,7 @@ from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
 from physx_dart.shared.meshes import read_vertices
 from physx_dart.shared.parts import Mover
-from physx_dart.shared.shapes import Shape
+from physx_dart.shared.shapes import CollisionShape
 
 
 class Reach:
@@ -25,7 +25,7 @@ class Reach:
         """Return the largest product of a direction with a point of the shapes; -inf: none.
 
         Args:
-            direction: Shape (3,).
+            direction: CollisionShape (3,).
             poses: Of the links, shape (links, 7).
         """
         found = [-math.inf]
@@ -41,7 +41,7 @@ class Reach:
         return max(found)
 
 
-def _corners(shape: Shape) -> Vector | None:
+def _corners(shape: CollisionShape) -> Vector | None:
     """Return the corners of a box or mesh about its center, shape (n, 3)."""
     if shape.mesh is not None:
         return read_vertices(shape.mesh, shape.size)
@@ -51,7 +51,7 @@ def _corners(shape: Shape) -> Vector | None:
     return None
 
 
-def _round(shape: Shape, along: Vector) -> float:
+def _round(shape: CollisionShape, along: Vector) -> float:
     """Return how far a shape with an axis reaches from its center along a local direction."""
     radius, length = shape.size[0], float(np.linalg.norm(along))
     if shape.kind == "sphere":

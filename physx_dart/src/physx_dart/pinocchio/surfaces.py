@@ -14,7 +14,7 @@ from physx_core.rotations import to_matrix
 from physx_core.simulation import Ground, HeightField, Stairs
 from physx_core.typing import Vector
 from physx_dart.shared.parts import Static
-from physx_dart.shared.shapes import Shape
+from physx_dart.shared.shapes import CollisionShape
 
 
 class Surface(ABC):
@@ -47,7 +47,7 @@ class Plane(Surface):
 class Solid(Surface):
     """A shape at a place: center (3,), rotation matrix (3, 3)."""
 
-    shape: Shape
+    shape: CollisionShape
     center: Vector
     rotation: Vector
 
@@ -112,7 +112,7 @@ def surfaces_of(static: Static, engine: str, features: Sequence[str]) -> list[Su
     if isinstance(what, Stairs):
         found: list[Surface] = [Plane(np.array([0.0, 0.0, 1.0]), 0.0)]
         for center, size in what.boxes():
-            box = Shape("box", size, np.zeros(3), np.eye(3), "ground", 1.0, 0.0)
+            box = CollisionShape("box", size, np.zeros(3), np.eye(3), "ground", 1.0, 0.0)
             found.append(Solid(box, np.array(center), np.eye(3)))
         return found
     if what.kind == "mesh":

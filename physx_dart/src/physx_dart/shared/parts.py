@@ -10,7 +10,7 @@ import numpy as np
 
 from physx_core.errors import ModelError
 from physx_core.simulation import Ground, HeightField, Layout, Part, Stairs, World, WorldObject
-from physx_dart.shared.shapes import Shape, moments, shape_of_object
+from physx_dart.shared.shapes import CollisionShape, moments, shape_of_object
 from physx_dart.shared.urdf import Joint, RobotModel, read_robot
 
 _OBJECT = (
@@ -54,7 +54,7 @@ class Static:
     """
 
     name: str
-    what: Shape | Ground | Stairs | HeightField
+    what: CollisionShape | Ground | Stairs | HeightField
     position: tuple[float, ...] = (0.0, 0.0, 0.0)
     orientation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
 

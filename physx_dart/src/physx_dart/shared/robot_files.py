@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib.metadata
 from collections.abc import Mapping
 from pathlib import Path
-from urllib.parse import unquote, urlparse
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
+from physx_core import simulation
 from physx_core.errors import MissingMeshesError, ModelError, nearest
 
 EXAMPLE_DATA = "example-robot-data"
@@ -98,10 +98,8 @@ def example_robot(name: str) -> Path:
     return path
 
 
-def check_meshes(
-    model: Path, root: ElementTree.Element, package_dirs: Mapping[str, str | Path]
-) -> None:
-    """Check that all mesh files of a robot are there, those for drawing and for collisions.
+def check_meshes(model: Path, root: Element, package_dirs: Mapping[str, str | Path]) -> None:
+    """Check that all mesh files of a robot exist, those for drawing and those for collisions.
 
     Args:
         model: Path of the robot's URDF file.
@@ -109,41 +107,24 @@ def check_meshes(
         package_dirs: Folder of each package.
 
     Raises:
-        MissingMeshesError: Some are not; it names all of them.
+        MissingMeshesError: If some do not exist; it names all of them.
     """
-    names = dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh"))
-    missing = [name for name in names if not _exists(model, name, package_dirs)]
+    missing = []
+    for name in dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh")):
+        path = mesh_path(model, name, package_dirs)
+        if path is None or not path.is_file():
+            missing.append(name)
     if missing:
         raise MissingMeshesError(str(model), missing)
 
 
-def _exists(model: Path, name: str, package_dirs: Mapping[str, str | Path]) -> bool:
-    path = mesh_path(model, name, package_dirs)
-    return path is not None and path.is_file()
-
-
 def mesh_path(model: Path, name: str, package_dirs: Mapping[str, str | Path]) -> Path | None:
-    """Return the file that a mesh name stands for, None where its package is not known.
+    """Return the file that a mesh name stands for, None if its package is not found.
 
-    Args:
-        model: Path of the robot's URDF file; relative names begin at its folder.
-        name: The name as the URDF gives it: ``package://...``, ``file://...`` or a path.
-        package_dirs: Folder of each package. Packages that are not in it are looked for among the
-            folders around the URDF file, and ``example-robot-data`` where it is installed.
+    As `physx_core.simulation.mesh_path`, which does not know of ``example-robot-data``.
     """
-    if name.startswith("package://"):
-        package, _, rest = name.removeprefix("package://").partition("/")
-        folder = _package_dir(model, package, package_dirs)
-        return None if folder is None else folder / rest
-    if name.startswith("file://"):
-        return Path(unquote(urlparse(name).path))
-    return model.parent / name
-
-
-def _package_dir(model: Path, package: str, package_dirs: Mapping[str, str | Path]) -> Path | None:
-    if package in package_dirs:
-        return Path(package_dirs[package])
-    above = model.parts[:-1]
-    if package in above:  # the nearest one
-        return model.parents[above[::-1].index(package)]
-    return example_data_dir() if package == EXAMPLE_DATA else None
+    found = simulation.mesh_path(model, name, package_dirs)
+    if found is None and name.startswith(f"package://{EXAMPLE_DATA}/"):
+        folder = example_data_dir()
+        found = folder and folder / name.removeprefix(f"package://{EXAMPLE_DATA}/")
+    return found

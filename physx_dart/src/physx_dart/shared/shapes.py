@@ -5,29 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from physx_core.errors import ModelError, listed, nearest
-from physx_core.rotations import from_roll_pitch_yaw, to_matrix
-from physx_core.simulation import Box, Capsule, Cylinder, Mesh, Robot, Sphere, WorldObject
+from physx_core.simulation import Box, Capsule, Cylinder, Mesh, Robot, Sphere, UrdfTree, WorldObject
 from physx_core.typing import Vector
 from physx_dart.shared.meshes import bounding_box, bounding_capsule, read_vertices
 from physx_dart.shared.robot_files import mesh_path
 
-_OPTIONS: dict[str, tuple[str, ...]] = {
-    "box": ("size",),
-    "sphere": ("radius",),
-    "mesh": ("filename",),
-    "cylinder": ("radius", "length"),
-    "capsule": ("radius", "length"),
-}
-"""What the element of each kind of shape says, as URDF files have it."""
-
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class CollisionShape:
     """One shape of a body.
 
     Attributes:
@@ -52,37 +41,41 @@ class Shape:
     mesh: Path | None = None
 
 
-def shapes_of_robot(robot: Robot, path: Path, links: dict[str, Element]) -> tuple[Shape, ...]:
+def shapes_of_robot(robot: Robot, path: Path, tree: UrdfTree) -> tuple[CollisionShape, ...]:
     """Return the shapes with which a robot touches things.
 
     Args:
         robot: Its description.
         path: Its URDF file.
-        links: Link elements by name.
+        tree: Its links.
 
     Raises:
         ModelError: A shape makes no sense, a mesh cannot be read, or a foot is no link.
     """
-    unknown = [name for name in robot.feet if name not in links]
+    unknown = [name for name in robot.feet if name not in tree.links]
     if unknown:
         raise ModelError(
-            f'feet name "{unknown[0]}", which is no link.{nearest(unknown[0], links)} '
-            f"Links: {listed(links)}"
+            f'feet name "{unknown[0]}", which is not a link.{nearest(unknown[0], tree.links)} '
+            f"Links: {listed(tree.links)}"
         )
-    shapes: list[Shape] = []
-    for name, link in links.items():
+    shapes: list[CollisionShape] = []
+    material = robot.friction, robot.restitution
+    for name in tree.elements:
         if name in robot.feet:
             size, zero = (float(robot.feet[name]),), np.zeros(3)
-            material = robot.friction, robot.restitution
-            shapes.append(Shape("sphere", size, zero, np.eye(3), name, *material))
+            shapes.append(CollisionShape("sphere", size, zero, np.eye(3), name, *material))
         elif robot.collisions != "none":
-            for element in link.findall("collision"):
-                shape = _read(robot, path, name, element)
+            for each in tree.shapes(name, "collision"):
+                if each.kind != "mesh" and not min(each.size) > 0:
+                    raise ModelError(f'link "{name}" has a {each.kind} of size {each.size}')
+                pose = each.pose[:3, 3].copy(), each.pose[:3, :3].copy()
+                mesh = mesh_path(path, each.mesh, robot.package_dirs) if each.mesh else None
+                shape = CollisionShape(each.kind, each.size, *pose, name, *material, mesh)
                 shapes.append(_replaced(shape, robot.collisions))
     return tuple(shapes)
 
 
-def shape_of_object(thing: WorldObject) -> Shape:
+def shape_of_object(thing: WorldObject) -> CollisionShape:
     """Return the shape of an object.
 
     Raises:
@@ -102,10 +95,10 @@ def shape_of_object(thing: WorldObject) -> Shape:
     else:
         raise ModelError(f'Object "{thing.name}" is a {type(thing).__name__}, which is no shape.')
     material = thing.friction, thing.restitution
-    return Shape(kind, size, np.zeros(3), np.eye(3), thing.name, *material, mesh)
+    return CollisionShape(kind, size, np.zeros(3), np.eye(3), thing.name, *material, mesh)
 
 
-def moments(shape: Shape, mass: float) -> Vector:
+def moments(shape: CollisionShape, mass: float) -> Vector:
     """Return the principal moments of inertia of a solid body, shape (3,), in kg m²."""
     if shape.kind == "sphere":
         return np.full(3, 0.4 * mass * shape.size[0] ** 2)
@@ -119,7 +112,7 @@ def moments(shape: Shape, mass: float) -> Vector:
     return mass / 12 * (squares.sum() - squares)
 
 
-def _round_moments(shape: Shape, mass: float) -> tuple[float, float, float]:
+def _round_moments(shape: CollisionShape, mass: float) -> tuple[float, float, float]:
     r, length = shape.size
     body, ends = math.pi * r**2 * length, 4 / 3 * math.pi * r**3
     if shape.kind == "cylinder":
@@ -130,43 +123,7 @@ def _round_moments(shape: Shape, mass: float) -> tuple[float, float, float]:
     return across, across, cylinder * r**2 / 2 + sphere * 0.4 * r**2
 
 
-def _read(robot: Robot, path: Path, link: str, element: Element) -> Shape:
-    geometry = element.find("geometry")
-    shape = None if geometry is None or not len(geometry) else geometry[0]
-    tag = "none" if shape is None else str(shape.tag)
-    if shape is None or tag not in _OPTIONS:
-        raise ModelError(f'link "{link}" has a collision shape "{tag}"; known: {listed(_OPTIONS)}')
-    if tag == "mesh":
-        size = tuple(_floats(link, "scale", shape.get("scale", "1 1 1"), 3))
-        mesh = mesh_path(path, shape.get("filename", ""), robot.package_dirs)
-    else:
-        parts = [_floats(link, name, shape.get(name, ""), None) for name in _OPTIONS[tag]]
-        size, mesh = tuple(number for part in parts for number in part), None
-        wanted = 3 if tag == "box" else len(_OPTIONS[tag])
-        if len(size) != wanted or not min(size) > 0:
-            raise ModelError(f'link "{link}" has a {tag} of size {size}')
-    origin = element.find("origin")
-    xyz, rpy = (
-        _floats(link, name, "0 0 0" if origin is None else origin.get(name, "0 0 0"), 3)
-        for name in ("xyz", "rpy")
-    )
-    material = robot.friction, robot.restitution
-    return Shape(
-        tag, size, np.array(xyz), to_matrix(from_roll_pitch_yaw(*rpy)), link, *material, mesh
-    )
-
-
-def _floats(link: str, name: str, text: str, count: int | None) -> list[float]:
-    try:
-        numbers = [float(part) for part in text.split()]
-    except ValueError:
-        numbers = [math.nan]
-    if not all(map(math.isfinite, numbers)) or (count and len(numbers) != count) or not numbers:
-        raise ModelError(f'link "{link}" has a collision shape with {name}="{text}"')
-    return numbers
-
-
-def _replaced(shape: Shape, collisions: str) -> Shape:
+def _replaced(shape: CollisionShape, collisions: str) -> CollisionShape:
     """Return a mesh's bounding box or capsule, where that is wanted; else the shape itself."""
     if shape.mesh is None:
         return shape

@@ -17,13 +17,19 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from physx_core.errors import ModelError, listed, nearest
-from physx_core.simulation import JointSettings, Robot
+from physx_core.simulation import (
+    JointSettings,
+    Robot,
+    UrdfTree,
+    link_of,
+    numbers_of,
+    parse_urdf,
+)
 from physx_dart.shared.robot_files import check_meshes, find_robot
-from physx_dart.shared.shapes import Shape, shapes_of_robot
+from physx_dart.shared.shapes import CollisionShape, shapes_of_robot
 
 _MOVING = ("revolute", "continuous", "prismatic")
 _UNLIMITED = '<limit lower="-1e9" upper="1e9" effort="1e9" velocity="1e9"/>'
@@ -77,7 +83,7 @@ class RobotModel:
     text: str
     links: tuple[str, ...]
     joints: tuple[Joint, ...]
-    shapes: tuple[Shape, ...] = ()
+    shapes: tuple[CollisionShape, ...] = ()
 
 
 def read_robot(robot: Robot, *, touching: bool = False) -> RobotModel:
@@ -97,14 +103,18 @@ def read_robot(robot: Robot, *, touching: bool = False) -> RobotModel:
     root = parse_urdf(path)
     check_meshes(path, root, robot.package_dirs)
     try:
-        tree = _Tree(root)
+        tree = UrdfTree(root)
         if not robot.fixed_base and tree.links[0] == "world":
             raise ModelError("its root link is the world, which cannot float; use fixed_base=True")
+        for joint in tree.joints:
+            if joint.get("type", "") not in (*_MOVING, "fixed"):
+                name, kind = joint.get("name"), joint.get("type", "")
+                raise ModelError(f'joint "{name}" has the type "{kind}", which is not supported')
         moving = [joint for joint in tree.joints if joint.get("type") in _MOVING]
         joints = tuple(_joint(joint, robot.joints) for joint in moving)
         _check_settings(robot, joints)
         text = _engine_text(tree)
-        shapes = shapes_of_robot(robot, path, tree.elements) if touching else ()
+        shapes = shapes_of_robot(robot, path, tree) if touching else ()
     except (ModelError, ValueError) as error:
         raise ModelError(f'Robot "{robot.name}", {path}: {error}.') from error
     return RobotModel(path, text, tuple(tree.links), joints, shapes)
@@ -118,100 +128,6 @@ def _check_settings(robot: Robot, joints: tuple[Joint, ...]) -> None:
                 f'joints has settings for "{name}", which is no joint that moves.'
                 f"{nearest(name, known)} Joints: {listed(known)}"
             )
-
-
-def parse_urdf(path: Path) -> Element:
-    """Return the root element of a URDF file.
-
-    Raises:
-        ModelError: The file is missing or is no URDF.
-    """
-    try:
-        text = path.read_bytes()
-    except FileNotFoundError:
-        raise ModelError(f"There is no URDF file {path}.") from None
-    except OSError as error:
-        raise ModelError(f"{path} cannot be read as a URDF file: {error}.") from error
-    if b"<!DOCTYPE" in text:
-        raise ModelError(f"{path} has a DOCTYPE; a URDF file has none, and its entities can bomb.")
-    try:
-        root = ElementTree.fromstring(text)  # without DOCTYPE there are no entities
-    except ElementTree.ParseError as error:
-        raise ModelError(f"{path} is not valid XML: {error}.") from error
-    if root.tag != "robot":
-        raise ModelError(f'{path} is no URDF: its root element is "{root.tag}", not "robot".')
-    return root
-
-
-class _Tree:
-    """Links and joint elements of a URDF in the order of the tree.
-
-    Attributes:
-        links: Names of the links, the root first.
-        elements: Link elements by name.
-        joints: Joint elements, in the order of the links that they lead to.
-    """
-
-    def __init__(self, root: Element) -> None:
-        self.elements = _by_name(root, "link")
-        children: dict[str, list[Element]] = {name: [] for name in self.elements}
-        parents: dict[str, str] = {}
-        for name, joint in sorted(_by_name(root, "joint").items()):
-            parent, child = (self._end(name, joint, end) for end in ("parent", "child"))
-            if child in parents:
-                raise ModelError(f'link "{child}" is the child of two joints, no tree')
-            parents[child] = parent
-            children[parent].append(joint)
-        if not self.elements:
-            raise ModelError("it has no link")
-        roots = [name for name in self.elements if name not in parents]
-        if len(roots) != 1:
-            found = f"links {listed(roots)} have no parent" if roots else "its joints form a circle"
-            raise ModelError(f"it needs one root link, but {found}")
-        self.links: list[str] = []
-        self.joints: list[Element] = []
-        self._walk(roots[0], children)
-        if len(self.links) != len(self.elements):
-            cut_off = self.elements.keys() - set(self.links)
-            raise ModelError(f"links {listed(cut_off)} form a circle apart from the root")
-
-    def _end(self, name: str, joint: Element, end: str) -> str:
-        element = joint.find(end)
-        link = "" if element is None else element.get("link", "")
-        if link not in self.elements:
-            raise ModelError(
-                f'joint "{name}" has {end} "{link}", which is no link; '
-                f"links: {listed(self.elements)}"
-            )
-        return link
-
-    def _walk(self, root: str, children: dict[str, list[Element]]) -> None:
-        self.links.append(root)
-        stack = list(reversed(children[root]))
-        while stack:
-            joint = stack.pop()
-            kind = joint.get("type", "")
-            if kind not in (*_MOVING, "fixed"):
-                raise ModelError(f'joint "{joint.get("name")}" has the type "{kind}", unsupported')
-            self.joints.append(joint)
-            self.links.append(link_of(joint, "child"))
-            stack.extend(reversed(children[self.links[-1]]))
-
-
-def link_of(joint: Element, end: str) -> str:
-    """Return the name of the link at one ``end``, ``parent`` or ``child``, of a joint element."""
-    element = joint.find(end)
-    return "" if element is None else element.get("link", "")
-
-
-def _by_name(root: Element, tag: str) -> dict[str, Element]:
-    named: dict[str, Element] = {}
-    for element in root.findall(tag):
-        name = element.get("name", "")
-        if not name or name in named:
-            raise ModelError(f'a {tag} has the name "{name}", which is empty or there twice')
-        named[name] = element
-    return named
 
 
 def _joint(joint: Element, all_settings: Mapping[str, JointSettings]) -> Joint:
@@ -248,7 +164,7 @@ def _number(joint: Element, tag: str, attribute: str) -> float:
     return number
 
 
-def _engine_text(tree: _Tree) -> str:
+def _engine_text(tree: UrdfTree) -> str:
     parts = ['<robot name="robot">']
     for name in tree.links:
         link = _inertial(name, tree.elements[name])
@@ -300,15 +216,9 @@ def _origin(where: str, given: Element) -> str:
 
 
 def _checked(where: str, element: Element, attribute: str, default: str, count: int) -> str:
-    """Return an attribute's text as it is, "0" for one that is zero; it must be finite numbers."""
-    text = element.get(attribute, default)
-    try:
-        numbers = [float(part) for part in text.split()]
-    except ValueError:
-        numbers = [math.nan]
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise ModelError(f'{where} has {attribute}="{text}"')
-    return text if any(numbers) or count > 1 else "0"
+    """Return the text of an attribute that must be finite numbers; "0" for a number that is 0."""
+    numbers = numbers_of(where, element, attribute, default, count)
+    return element.get(attribute, default) if any(numbers) or count > 1 else "0"
 
 
 def _axis(joint: Element) -> str:

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
+from physx_core.rotations import from_matrix_rows, rotate_rows
 from physx_core.typing import Array
 from physx_rerun.drawing import colors
 from physx_rerun.drawing.rows import Rows, Times
-from physx_rerun.drawing.urdf import MESH_TYPES, Shape, quaternion, read
+from physx_rerun.drawing.urdf import MESH_TYPES, VisualShape, read
 
 _SILVER = (0.75, 0.78, 0.81, 1.0)
 
-DrawnShape = tuple[str, Shape]
+DrawnShape = tuple[str, VisualShape]
 """Entity of a shape, and the shape."""
 
 
@@ -51,7 +52,7 @@ def draw_robot(
         frame = world if shape.body is None else frames[shape.body]
         pose = rr.InstancePoses3D(
             translations=[_center(shape)],
-            quaternions=[quaternion(shape.pose[:3, :3])],
+            quaternions=from_matrix_rows(shape.pose[np.newaxis, :3, :3]),
             scales=[shape.size] if shape.kind == "mesh" else None,
         )
         rows.static(path, rr.CoordinateFrame(frame), pose, _geometry(shape))
@@ -94,7 +95,7 @@ _LOOKS: dict[str, tuple[type[Any], str]] = {
 }
 
 
-def corners_of(shapes: Sequence[Shape], poses: Array) -> Array:
+def corners_of(shapes: Sequence[VisualShape], poses: Array) -> Array:
     """Return points that a robot spans: its bodies' origins, and the corners around its shapes.
 
     Args:
@@ -105,9 +106,7 @@ def corners_of(shapes: Sequence[Shape], poses: Array) -> Array:
     for shape in shapes:
         points = _SIGNS * _reach(shape) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
         if shape.body is not None:
-            axis, w = poses[shape.body, 3:6], poses[shape.body, 6]
-            across = 2 * np.cross(axis, points)
-            points = points + w * across + np.cross(axis, across) + poses[shape.body, :3]
+            points = rotate_rows(poses[shape.body, 3:], points) + poses[shape.body, :3]
         found.append(points)
     return np.concatenate(found)
 
@@ -115,30 +114,30 @@ def corners_of(shapes: Sequence[Shape], poses: Array) -> Array:
 _SIGNS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
-def _reach(shape: Shape) -> Array:
+def _reach(shape: VisualShape) -> Array:
     """Return how far a shape reaches from its origin along its axes."""
     if shape.kind == "mesh":
         return np.zeros(3)
     if shape.kind == "box":
         return np.array(shape.size)
-    radius, length = shape.size
+    radius, length = shape.size[0], shape.size[-1]
     ends = {"sphere": radius, "cylinder": 0.5 * length, "capsule": 0.5 * length + radius}
     return np.array([radius, radius, ends[shape.kind]])
 
 
-def _center(shape: Shape) -> Array:
+def _center(shape: VisualShape) -> Array:
     if shape.kind != "capsule":
         return shape.pose[:3, 3]
     return (shape.pose @ np.array([0.0, 0.0, -shape.size[1] / 2, 1.0]))[:3]
 
 
-def _geometry(shape: Shape) -> Any:
+def _geometry(shape: VisualShape) -> Any:
     if shape.mesh is not None:
         media_type = MESH_TYPES[shape.mesh.suffix.lower()]
         return rr.Asset3D(path=shape.mesh, media_type=media_type)
     if shape.kind == "box":
         return rr.Boxes3D(half_sizes=[shape.size], fill_mode="solid")
-    radius, length = shape.size
+    radius, length = shape.size[0], shape.size[-1]
     if shape.kind == "sphere":
         return rr.Ellipsoids3D(half_sizes=[(radius, radius, radius)], fill_mode="solid")
     kind = rr.Cylinders3D if shape.kind == "cylinder" else rr.Capsules3D

@@ -1,16 +1,18 @@
-"""URDF: the visual shapes of a robot and where they sit on its links."""
+"""Visual shapes of a URDF file, and their poses on the robot's bodies."""
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from physx_core.errors import VisualizerError
-from physx_core.typing import Array
+from physx_core.errors import ModelError, VisualizerError
+from physx_core.rotations import from_matrix_rows
+from physx_core.simulation import UrdfTree, link_of, mesh_path, numbers_of, origin_of, parse_urdf
+from physx_core.typing import Vector
 
 MESH_TYPES = {
     ".dae": "model/vnd.collada+xml",
@@ -23,22 +25,23 @@ MESH_TYPES = {
 
 
 @dataclass(frozen=True)
-class Shape:
-    """One visual shape.
+class VisualShape:
+    """A visual shape.
 
     Attributes:
         name: Name that is unique in the robot.
-        body: Body that it sits on, an index into the bodies given; None: it stands in the world.
+        body: Index of the body that it is fixed to; None: the world.
         pose: Its pose in the body's frame, a homogeneous matrix of shape (4, 4).
         kind: ``mesh``, ``box``, ``cylinder``, ``sphere`` or ``capsule``.
-        size: Scale of a mesh, half sizes of a box, or radius and length, in m.
+        size: In m: half edges of a box (3,); radius of a sphere (1,); radius and length (2,). For a
+            mesh the factors of its lengths (3,).
         mesh: File of a mesh.
-        color: Red, green, blue and alpha in [0, 1] that the URDF gives; None: none given.
+        color: Red, green, blue, and alpha in [0, 1] from the URDF; None: it gives none.
     """
 
     name: str
     body: int | None
-    pose: Array
+    pose: Vector
     kind: str
     size: tuple[float, ...]
     mesh: Path | None
@@ -47,7 +50,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Model:
-    """What is drawn of a robot.
+    """The visual shapes of a robot.
 
     Attributes:
         shapes: The visual shapes whose files exist.
@@ -56,9 +59,9 @@ class Model:
             shape (bodies, 7), x, y, z in m and quaternion x, y, z, w.
     """
 
-    shapes: list[Shape]
+    shapes: list[VisualShape]
     missing: list[str]
-    rest: Array
+    rest: Vector
 
 
 def read(urdf: str | Path, bodies: Sequence[str], package_dirs: Mapping[str, str]) -> Model:
@@ -71,144 +74,66 @@ def read(urdf: str | Path, bodies: Sequence[str], package_dirs: Mapping[str, str
         package_dirs: Folder of each package that mesh names begin with.
 
     Raises:
-        VisualizerError: The file cannot be read, or has no link of a body's name.
+        VisualizerError: If the file cannot be read or has no link with a body's name.
     """
-    path = Path(urdf)
+    path = Path(urdf).absolute()
     try:
-        root = ET.fromstring(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, ET.ParseError) as error:
+        return _read(path, UrdfTree(parse_urdf(path)), bodies, package_dirs)
+    except ModelError as error:
         raise VisualizerError(f"The robot {path} cannot be drawn: {error}.") from error
-    links = {link.get("name", ""): link for link in root.findall("link")}
-    unknown = [name for name in bodies if name not in links]
+
+
+def _read(
+    path: Path, tree: UrdfTree, bodies: Sequence[str], package_dirs: Mapping[str, str]
+) -> Model:
+    unknown = [name for name in bodies if name not in tree.elements]
     if unknown:
-        raise VisualizerError(f"{path} has no link {unknown[0]!r}. Links: {', '.join(links)}.")
-    carriers = _carriers(root, links, bodies)
-    rest = np.array([_pose7(_rest(root, name)) for name in bodies]).reshape(-1, 7)
+        raise ModelError(f"it has no link {unknown[0]!r}; links: {', '.join(tree.elements)}")
+    carriers = {name: _carrier(tree, name, bodies) for name in tree.elements}
+    poses = np.array([_carrier(tree, name, ())[1] for name in bodies]).reshape(-1, 4, 4)
+    rest = np.concatenate([poses[:, :3, 3], from_matrix_rows(poses[:, :3, :3])], axis=1)
     materials = {
         material.get("name"): color
-        for material in root.iter("material")
+        for material in tree.root.iter("material")
         if (color := _color(material)) is not None
     }
-    shapes: list[Shape] = []
+    shapes: list[VisualShape] = []
     missing: list[str] = []
-    for name, link in links.items():
+    for name, link in tree.elements.items():
         body, offset = carriers[name]
-        for number, visual in enumerate(link.findall("visual")):
-            kind, size, file = _geometry(visual)
-            mesh = _mesh_path(file, path.parent, package_dirs) if file else None
-            if mesh is not None and not (mesh.is_file() and mesh.suffix.lower() in MESH_TYPES):
-                missing.append(str(file))
-                continue
-            color = _material(visual, materials)
-            pose = offset @ _origin(visual)
-            shapes.append(Shape(f"{name}_{number}", body, pose, kind, size, mesh, color))
+        visuals = zip(tree.shapes(name, "visual"), link.findall("visual"), strict=True)
+        for number, (shape, visual) in enumerate(visuals):
+            mesh = None
+            if shape.kind == "mesh":
+                mesh = mesh_path(path, shape.mesh, package_dirs)
+                if mesh is None or not (mesh.is_file() and mesh.suffix.lower() in MESH_TYPES):
+                    missing.append(shape.mesh)
+                    continue
+            size = tuple(0.5 * edge for edge in shape.size) if shape.kind == "box" else shape.size
+            color, pose = _material(visual, materials), offset @ shape.pose
+            shapes.append(
+                VisualShape(f"{name}_{number}", body, pose, shape.kind, size, mesh, color)
+            )
     return Model(shapes, missing, rest)
 
 
-def _parents(root: ET.Element) -> dict[str, tuple[str, Array]]:
-    found: dict[str, tuple[str, Array]] = {}
-    for joint in root.findall("joint"):
-        parent, child = joint.find("parent"), joint.find("child")
-        if parent is not None and child is not None:
-            found[child.get("link", "")] = (parent.get("link", ""), _origin(joint))
-    return found
+def _carrier(tree: UrdfTree, link: str, bodies: Sequence[str]) -> tuple[int | None, Vector]:
+    """Return the body that a link moves with, None: the root link, and its pose (4, 4) there."""
+    offset = np.eye(4)
+    while link not in bodies and link in tree.parents:
+        joint = tree.parents[link]
+        offset = origin_of(f'joint "{joint.get("name")}"', joint) @ offset
+        link = link_of(joint, "parent")
+    return (bodies.index(link) if link in bodies else None), offset
 
 
-def _carriers(
-    root: ET.Element, links: Mapping[str, ET.Element], bodies: Sequence[str]
-) -> dict[str, tuple[int | None, Array]]:
-    index, parents = {name: number for number, name in enumerate(bodies)}, _parents(root)
-    carriers: dict[str, tuple[int | None, Array]] = {}
-    for name in links:
-        at, offset = name, np.eye(4)
-        while at not in index and at in parents:
-            at, step = parents[at]
-            offset = step @ offset
-        carriers[name] = (index.get(at), offset)
-    return carriers
-
-
-def _rest(root: ET.Element, link: str) -> Array:
-    parents, pose = _parents(root), np.eye(4)
-    while link in parents:
-        link, step = parents[link]
-        pose = step @ pose
-    return pose
-
-
-def _numbers(text: str | None, default: str) -> list[float]:
-    return [float(part) for part in (text or default).split()]
-
-
-def _origin(element: ET.Element) -> Array:
-    origin = element.find("origin")
-    xyz = _numbers(origin.get("xyz") if origin is not None else None, "0 0 0")
-    rpy = _numbers(origin.get("rpy") if origin is not None else None, "0 0 0")
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    pose = np.eye(4)
-    pose[:3, :3] = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    pose[:3, 3] = xyz
-    return pose
-
-
-def quaternion(rotation: Array) -> Array:
-    """Return the unit quaternion x, y, z, w of a rotation matrix of shape (3, 3).
-
-    It is the eigenvector of the largest eigenvalue of a symmetric matrix made of the rotation's
-    entries (I. Y. Bar-Itzhack, Journal of Guidance, Control, and Dynamics 23, 2000).
-    """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    matrix = np.array(
-        [
-            [xx - yy - zz, yx + xy, zx + xz, zy - yz],
-            [yx + xy, yy - xx - zz, zy + yz, xz - zx],
-            [zx + xz, zy + yz, zz - xx - yy, yx - xy],
-            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
-        ]
-    )
-    vector = np.linalg.eigh(matrix)[1][:, -1]
-    return vector if vector[3] >= 0 else -vector
-
-
-def _pose7(matrix: Array) -> Array:
-    return np.concatenate([matrix[:3, 3], quaternion(matrix[:3, :3])])
-
-
-def _geometry(visual: ET.Element) -> tuple[str, tuple[float, ...], str | None]:
-    geometry = visual.find("geometry")
-    shape = geometry[0] if geometry is not None and len(geometry) else None
-    kind = shape.tag if shape is not None else "nothing"
-    if shape is None or kind not in ("mesh", "box", "cylinder", "sphere", "capsule"):
-        raise VisualizerError(f"A URDF visual has the shape <{kind}>, which cannot be drawn.")
-    if kind == "mesh":
-        return kind, tuple(_numbers(shape.get("scale"), "1 1 1")), shape.get("filename", "")
-    if kind == "box":
-        return kind, tuple(side / 2 for side in _numbers(shape.get("size"), "1 1 1")), None
-    radius, length = (float(shape.get(name, "0")) for name in ("radius", "length"))
-    return kind, (radius, length), None
-
-
-def _mesh_path(file: str, folder: Path, package_dirs: Mapping[str, str]) -> Path:
-    if not file.startswith("package://"):
-        return folder / file.removeprefix("file://")
-    package, _, rest = file.removeprefix("package://").partition("/")
-    if package in package_dirs:
-        return Path(package_dirs[package]) / rest
-    near = [parent for parent in folder.resolve().parents if parent.name == package]
-    return (near[0] if near else folder) / rest
-
-
-def _color(material: ET.Element) -> tuple[float, ...] | None:
+def _color(material: Element) -> tuple[float, ...] | None:
     color = material.find("color")
-    return tuple(_numbers(color.get("rgba"), "1 1 1 1")) if color is not None else None
+    return None if color is None else tuple(numbers_of("a color", color, "rgba", "1 1 1 1", 4))
 
 
 def _material(
-    visual: ET.Element, materials: Mapping[str | None, tuple[float, ...]]
+    visual: Element, materials: Mapping[str | None, tuple[float, ...]]
 ) -> tuple[float, ...] | None:
     material = visual.find("material")
     if material is None:
