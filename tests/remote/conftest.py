@@ -16,7 +16,7 @@ import pytest
 
 from physx_core import Field
 from physx_remote import Messages, RLAgent, RLEnvironment, RLEnvWorld, connect, serve
-from physx_remote.godot_gym.messages import ERROR, extension, fill
+from physx_remote.godot_gym.messages import ERROR, fill, read_extension
 
 PATIENCE = 30.0
 
@@ -136,7 +136,7 @@ class Peer:
 
     def error(self, request):
         """Return the error with which a request is answered."""
-        return extension(self.ask(request), ERROR)
+        return read_extension(self.ask(request), ERROR)
 
     def leave(self, how="fin"):
         if how == "rst":

@@ -312,7 +312,7 @@ CONNECTED = [
     ({"timeout": 0}, "timeout is 0"),
     ({"connect_timeout": None}, "connect_timeout is None"),
     ({"max_answer": "1 MB"}, "max_answer is '1 MB'"),
-    ({"action_space": 3}, "no gymnasium.Space"),
+    ({"action_space": 3}, "not a gymnasium.Space"),
     ({"requested_observation": ["state"]}, "must be a dictionary"),
     ({"repeat_action": -1}, "repeat_action is a whole number"),
     ({"time_speed": "fast"}, "time_speed is a number"),

@@ -122,7 +122,7 @@ def test_an_answer_that_does_not_come_in_time():
     ("answer", "said"),
     [
         (struct.pack("<I", 1 << 31), "2147483648 bytes"),
-        (struct.pack("<I", 4) + b"\x0a\xff\xff\xff", "4 bytes is none of the messages"),
+        (struct.pack("<I", 4) + b"\x0a\xff\xff\xff", "4 bytes does not fit the given messages"),
     ],
 )
 def test_an_answer_that_is_too_long_or_nonsense(answer, said):

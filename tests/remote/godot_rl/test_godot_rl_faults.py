@@ -43,20 +43,23 @@ def framed(message):
         (b'{"type": "action", "action": [{"force": [0], "gear": 0}]}', "list of 2 numbers"),
         (b'{"type": "action", "action": [{"force": 0, "gear": 0}]}', "list of 2 numbers"),
         (b'{"type": "action", "action": [{"force": [0, NaN], "gear": 0}]}', '"force"[1] is nan'),
-        (b'{"type": "action", "action": [{"force": [0, 1e999], "gear": 0}]}', "no finite number"),
+        (
+            b'{"type": "action", "action": [{"force": [0, 1e999], "gear": 0}]}',
+            "not a finite number",
+        ),
         (
             b'{"type": "action", "action": [{"force": [0, 1%s], "gear": 0}]}' % (b"0" * 400),
-            "no finite",
+            "not a finite",
         ),
-        (b'{"type": "action", "action": [{"force": [0, "1"], "gear": 0}]}', "no finite number"),
-        (b'{"type": "action", "action": [{"force": [0, true], "gear": 0}]}', "no finite number"),
+        (b'{"type": "action", "action": [{"force": [0, "1"], "gear": 0}]}', "not a finite number"),
+        (b'{"type": "action", "action": [{"force": [0, true], "gear": 0}]}', "not a finite number"),
         (b'{"type": "action", "action": [{"force": [0, 0], "gear": 3}]}', "from 0 to 2"),
         (b'{"type": "action", "action": [{"force": [0, 0], "gear": -1}]}', "from 0 to 2"),
         (b'{"type": "action", "action": [{"force": [0, 0], "gear": 1.5}]}', "from 0 to 2"),
         (b'{"type": "action", "action": [{"force": [0, 0], "gear": true}]}', "from 0 to 2"),
         (b'{"type": "action", "action": [{"force": [0, 0], "gear": NaN}]}', "from 0 to 2"),
         (b'{"type": "action", "action": [{"force": [0, 0], "gear": [1]}]}', "from 0 to 2"),
-        (b'{"type": "reset", "seed": -1}', "whole number"),
+        (b'{"type": "reset", "seed": -1}', "non-negative integer"),
     ],
 )
 def test_a_wrong_message_is_answered_moves_nothing_and_the_next_is_served(

@@ -140,12 +140,16 @@ def test_what_is_no_service(said):
 @pytest.mark.parametrize(
     ("introduction", "answer", "message"),
     [
-        ({**NOTHING, "service": "run"}, b"", "serves no environments"),
+        ({**NOTHING, "service": "run"}, b"", "does not serve environments"),
         ({**NOTHING, "version": 9}, b"", "speaks version 9"),
-        ({**NOTHING, "observation_space": {"kind": "Odd"}}, b"", "described a space"),
+        ({**NOTHING, "observation_space": {"kind": "Odd"}}, b"", "invalid description of a space"),
         (NOTHING, pack_value(Kind.ANSWER, {}, "", 3), "answer to request 3 instead of 1"),
         (NOTHING, pack_value(Kind.SETUP, {}, "", 1), "a message SETUP"),
-        (NOTHING, pack_value(Kind.ANSWER, {"a": np.zeros(2)}, "", 1), "not about worlds"),
+        (
+            NOTHING,
+            pack_value(Kind.ANSWER, {"a": np.zeros(2)}, "", 1),
+            "without the arrays of worlds",
+        ),
         (NOTHING, pack_value(Kind.REFUSAL, {"classes": 1}, "", 1), "describes none"),
         (NOTHING, struct.pack("<IHHQ", 1 << 30, Kind.ANSWER, 0, 1), "no message of physx"),
         (NOTHING, pack(Kind.ANSWER, b"\xff" * 40, 1), "damaged"),

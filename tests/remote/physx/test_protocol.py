@@ -186,7 +186,7 @@ def test_actions_that_are_none(client):
 
 def test_rendering(client):
     client.reset()
-    client.step(client.actions.stacked(np.zeros((3, 2))))
+    client.step(client.actions.stack(np.zeros((3, 2))))
     assert client.render(2).tolist() == np.full((2, 2, 3), 1).tolist()
 
 
@@ -230,7 +230,7 @@ def test_a_subset_of_the_worlds_is_stepped(client):
 
 @pytest.mark.parametrize("worlds", [[3], [-1], [0, 0], []])
 def test_worlds_that_do_not_exist(client, worlds):
-    with pytest.raises(RequestError, match="Worlds are a list"):
+    with pytest.raises(RequestError, match="Worlds must be a list"):
         client.reset(worlds)
     with pytest.raises(RequestError):
         client.step({"action0": np.zeros((len(worlds), 2), np.float32)}, worlds)
@@ -257,7 +257,7 @@ def test_vector_environments_check_what_they_are_given(place):
 
 def test_a_snapshot_of_one_world_goes_on_in_another(client):
     client.reset(seeds=[0, 1, 2])
-    push = client.actions.stacked(np.full((1, 2), 0.25))
+    push = client.actions.stack(np.full((1, 2), 0.25))
     client.step(push, [0])
     number = client.snapshot(0)
     first = [client.step(push, [0]).arrays for _ in range(2)]
@@ -362,14 +362,14 @@ def test_an_observer_that_does_not_read_holds_nobody_up(place):
 
 def test_one_client_acts_and_another_after_it(client):
     client.reset(seeds=[1, 2, 3])
-    client.step(client.actions.stacked(np.zeros((3, 2))))
+    client.step(client.actions.stack(np.zeros((3, 2))))
     with pytest.raises(RemoteError, match="acts here already"):
         connect(client.address, token=TOKEN)
     client.close()
     with pytest.raises(RemoteClosedError, match="closed here"):
         client.reset()
     with PhysxClient(_place(client.address), token=TOKEN) as after:
-        rows = after.step(after.actions.stacked(np.zeros((3, 2))))
+        rows = after.step(after.actions.stack(np.zeros((3, 2))))
         assert rows.arrays["observation0"].tolist() == [2, 2, 2], "the worlds are as they were"
 
 

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 from physx_core.errors import ConfigError, RequestError, UsageError
 from physx_core.net import check_address
 from physx_remote.godot_gym.frames_timer import Signal
-from physx_remote.godot_gym.messages import ERROR, encoded_extension
+from physx_remote.godot_gym.messages import ERROR, encode_extension
 from physx_remote.godot_gym.requests import JsonReader, parse_request
 from physx_remote.serving.connection import Connection
 from physx_remote.serving.framing import MAX_REQUEST, FrameReader, Reader, framed
@@ -222,7 +222,7 @@ class Communication(SocketService):
         if self._errors == "close":
             self.drop(connection, "its request failed")
         elif self._reply == "always":
-            self.put_message(encoded_extension(ERROR, text))
+            self.put_message(encode_extension(ERROR, text))
 
     def _look_for_silence(self) -> None:
         """Close a client that keeps others waiting."""

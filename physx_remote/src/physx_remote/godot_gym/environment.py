@@ -14,7 +14,7 @@ from physx_core.errors import RequestError, UsageError
 from physx_core.simulation import Simulation
 from physx_remote.godot_gym.communication import Communication
 from physx_remote.godot_gym.frames_timer import PhysicsFramesTimer
-from physx_remote.godot_gym.messages import DESCRIPTION, Messages, encoded_extension
+from physx_remote.godot_gym.messages import DESCRIPTION, Messages, encode_extension
 from physx_remote.godot_gym.parts import RLAgent, RLEnvWorld
 from physx_remote.godot_gym.requests import as_count, as_object, as_seed, as_speed
 from physx_remote.serving.spaces import describe_space
@@ -263,7 +263,7 @@ class RLEnvironment:
                 ``environment``, for the description.
         """
         if self.ENVIRONMENT_KEY in observation_request:
-            self.communication.put_message(encoded_extension(DESCRIPTION, self._described()))
+            self.communication.put_message(encode_extension(DESCRIPTION, self._described()))
             return
         message = self._message()
         if self.AGENT_KEY in observation_request:

@@ -10,8 +10,8 @@ from physx_remote.godot_gym.environment import RLEnvironment, Stepping
 from physx_remote.godot_gym.messages import fill
 from physx_remote.godot_gym.parts import RLAgent, RLEnvWorld
 from physx_remote.godot_gym.wire import OUTCOME, gymnasium_messages, observation_fields
-from physx_remote.serving.plain import plain
-from physx_remote.serving.spaces import Space, from_json, leaves
+from physx_remote.serving.json_data import to_json_data
+from physx_remote.serving.spaces import SpaceTree, from_json
 from physx_remote.serving.worlds import Worlds
 
 
@@ -40,12 +40,12 @@ class GymnasiumScene(RLEnvironment):
         self.worlds = worlds
         self.repeat_action = 1
         self.observation_space, self.action_space = worlds.observation_space, worlds.action_space
-        self.messages = gymnasium_messages(worlds.observation_space)
+        self._tree = SpaceTree(worlds.observation_space)
+        self.messages = gymnasium_messages(self._tree)
 
     def _ready(self) -> None:
         """Set the agent and the world."""
-        space = self.worlds.observation_space
-        self.agent, self.world = _GymnasiumAgent(space), _GymnasiumWorld()
+        self.agent, self.world = _GymnasiumAgent(self._tree), _GymnasiumWorld()
 
     def _step(self, action: Any) -> Stepping:
         """Make `repeat_action` steps of the environment."""
@@ -93,22 +93,15 @@ class _GymnasiumAgent(RLAgent):
         observation: The last one; None before the first reset.
     """
 
-    def __init__(self, space: Space) -> None:
+    def __init__(self, tree: SpaceTree) -> None:
         self.observation: Any = None
-        paths = [path for path, _ in leaves(space)]
-        self._places = list(zip(observation_fields(space), paths, strict=True))
+        self._tree, self._names = tree, observation_fields(tree)
 
     def get_data(self, request: Any, storage: Any) -> None:
         """Write the whole observation, whatever names are requested."""
         if self.observation is None:
             raise RequestError("There is no observation yet: reset first.")
-        values = {}
-        for name, path in self._places:
-            value = self.observation
-            for key in path:
-                value = value[key]
-            values[name] = value
-        fill(storage, **values)
+        fill(storage, **dict(zip(self._names, self._tree.split(self.observation), strict=True)))
 
 
 class _GymnasiumWorld(RLEnvWorld):
@@ -125,7 +118,7 @@ class _GymnasiumWorld(RLEnvWorld):
     def set(self, reward: float, terminated: bool, truncated: bool, info: Any) -> None:
         """Keep the outcome of an action."""
         self.is_running = not (terminated or truncated)
-        text = json.dumps(plain(info)) if info else ""
+        text = json.dumps(to_json_data(info)) if info else ""
         self._values = dict(zip(OUTCOME, (reward, terminated, truncated, text), strict=True))
 
     def get_data(self, request: Any, storage: Any) -> None:

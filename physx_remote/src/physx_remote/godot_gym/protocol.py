@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from physx_core.errors import UnknownOptionError, UsageError
+from physx_core.errors import UsageError
 from physx_remote.godot_gym.client import GodotGymEnv
 from physx_remote.godot_gym.communication import Communication
 from physx_remote.godot_gym.environment import RLEnvironment
 from physx_remote.godot_gym.gymnasium_scene import GymnasiumScene
-from physx_remote.serving.protocol import Protocol, Scene, check_options
+from physx_remote.serving.connect_options import ConnectOptions, check_names
+from physx_remote.serving.protocol import Protocol, Scene
 from physx_remote.serving.service import Service
 from physx_remote.serving.worlds import Worlds
 
@@ -27,9 +28,7 @@ class GodotGym(Protocol):
             ConfigError: If `Communication` does not accept a value.
         """
         known = Communication.__init__.__kwdefaults__ or {}
-        if not options.keys() <= known.keys():
-            unknown = options.keys() - known.keys()
-            raise UnknownOptionError(f'The protocol "{self.name}"', unknown, known)
+        check_names(f'The protocol "{self.name}"', options, known)
         Communication(**options)  # checks the values
         self._options = options
 
@@ -64,7 +63,8 @@ class GodotGym(Protocol):
     @classmethod
     def connect(cls, host: str, port: int, **options: Any) -> GodotGymEnv:
         """Return a client; the options are those of `GodotGymEnv`."""
-        check_options("A client of godot-gym", options, GodotGymEnv)
+        own = GodotGymEnv.__init__.__kwdefaults__ or {}
+        check_names("A client of godot-gym", options, [*own, *ConnectOptions.__annotations__])
         return GodotGymEnv((host, port), **options)
 
 

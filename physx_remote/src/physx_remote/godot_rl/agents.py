@@ -1,4 +1,4 @@
-"""Agents: what a trainer of godot-rl may ask of worlds."""
+"""Agents: worlds as a trainer of godot-rl sees them."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import gymnasium
 import numpy as np
 
 from physx_core.errors import ActionError, RequestError, nearest
-from physx_remote.godot_rl.json_spaces import Actions, Observations
-from physx_remote.serving.plain import plain
+from physx_remote.godot_rl.json_spaces import ActionReader, ObservationWriter
+from physx_remote.serving.json_data import to_json_data
 from physx_remote.serving.worlds import Worlds
 
 Answer: TypeAlias = Generator[float, None, dict[str, Any]]
-"""Work that yields now and then how long it wants to be left alone, and returns the answer."""
-_Told: TypeAlias = tuple[dict[str, Any], float, bool, dict[str, Any]]
+"""Work that yields now and then how long to wait before it goes on, in s; returns the answer."""
+_Moved: TypeAlias = tuple[dict[str, Any], float, bool, dict[str, Any]]
 
 _POLICY = "shared_policy"
 _NOT_CALLED = ("close", "reset", "step")
@@ -24,28 +24,28 @@ _NOT_CALLED = ("close", "reset", "step")
 class Agents:
     """Worlds as the agents of a trainer, one agent each.
 
-    An agent whose episode ends begins the next one at once, and its answer holds what it sees then;
-    the last of the episode is in its info as ``terminal_observation``, beside ``terminated``,
-    ``truncated`` and ``TimeLimit.truncated``.
+    An agent whose episode ends begins the next one at once, and its answer holds the first
+    observation of the new episode. The last observation of the old one is in its info as
+    ``terminal_observation``, beside ``terminated``, ``truncated`` and ``TimeLimit.truncated``.
 
     Attributes:
-        requests: Type of a message to what answers it.
+        requests: Type of a message to the method that answers it.
     """
 
     def __init__(self, worlds: Worlds, action_repeat: int, seed: int | None) -> None:
-        """Keep the worlds.
+        """Take the worlds.
 
         Args:
             worlds: One for each agent.
             action_repeat: Steps of the environment in one step of the trainer.
-            seed: Seed of the first episodes, None for none.
+            seed: Seed of the first episodes; None: unseeded.
 
         Raises:
-            PhysxError: godot-rl has nothing for a space of the worlds.
+            PhysxError: If godot-rl has no format for a space of the worlds.
         """
         self._worlds = worlds
-        self._observations = Observations(worlds.observation_space)
-        self._actions = Actions(worlds.action_space)
+        self._observations = ObservationWriter(worlds.observation_space)
+        self._actions = ActionReader(worlds.action_space)
         self._action_repeat = action_repeat
         self._seed = seed
         self._is_begun = False
@@ -61,31 +61,31 @@ class Agents:
         count = self._worlds.num_worlds
         return {
             "type": "env_info",
-            "observation_space": [self._observations.described] * count,
-            "action_space": [self._actions.described] * count,
+            "observation_space": [self._observations.description] * count,
+            "action_space": [self._actions.description] * count,
             "n_agents": count,
             "agent_policy_names": [_POLICY] * count,
         }
 
     def _reset(self, message: dict[str, Any]) -> Answer:
-        """Begin new episodes everywhere; the key ``seed`` is an addition that trainers may use."""
+        """Begin new episodes everywhere; the key ``seed`` is an extension of physx."""
         seed = message.get("seed")
         if seed is not None:
             if type(seed) is not int or seed < 0:
-                raise RequestError(f"The seed is {seed!r} but must be a whole number from 0.")
+                raise RequestError(f"The seed is {seed!r} but must be a non-negative integer.")
             self._seed = seed
         begun = yield from self._begin_episodes()
         return {"type": "reset", "obs": [seen for seen, _ in begun], "info": [i for _, i in begun]}
 
     def _begin_episodes(self) -> Generator[float, None, list[tuple[Any, Any]]]:
-        """Begin new episodes everywhere; return what each agent sees, and its info."""
+        """Begin new episodes everywhere; return each agent's observation and info."""
         self._is_begun = False
         seed, self._seed = self._seed, None
         begun = []
         for world in range(self._worlds.num_worlds):
             begin = self._worlds.reset
-            observation, info = self._named(world, begin, world, _seed_of(seed, world))
-            begun.append((self._observations.plain(observation), plain(info)))
+            observation, info = self._call_in(world, begin, world, _seed_of(seed, world))
+            begun.append((self._observations.write(observation), to_json_data(info)))
             yield 0.0
         self._is_begun = True
         return begun
@@ -94,7 +94,7 @@ class Agents:
         actions = self._read(message.get("action"))
         if not self._is_begun:
             yield from self._begin_episodes()
-        self._is_begun = False  # after a failure, the worlds have not all come as far
+        self._is_begun = False  # after a failure the worlds are no longer in step
         answer: dict[str, Any] = {"type": "step", "obs": [], "reward": [], "done": [], "info": []}
         for world, action in enumerate(actions):
             seen, reward, is_done, told = yield from self._move(world, action)
@@ -105,33 +105,33 @@ class Agents:
         self._is_begun = True
         return answer
 
-    def _move(self, world: int, action: Any) -> Generator[float, None, _Told]:
+    def _move(self, world: int, action: Any) -> Generator[float, None, _Moved]:
         """Repeat one agent's action, and begin its next episode if this one ends."""
         reward, terminated, truncated, left = 0.0, False, False, self._action_repeat
         while left and not (terminated or truncated):
-            moved = self._named(world, self._worlds.step, world, action)
+            moved = self._call_in(world, self._worlds.step, world, action)
             observation, part, terminated, truncated, info = moved
             reward += part
             left -= 1
             yield 0.0
-        told = plain(info) if info else {}
+        told = to_json_data(info) if info else {}
         told.update(terminated=terminated, truncated=truncated)
-        seen = self._observations.plain(observation)
+        seen = self._observations.write(observation)
         is_done = terminated or truncated
         if is_done:
             told["terminal_observation"] = seen
             told["TimeLimit.truncated"] = truncated and not terminated
-            observation, _ = self._named(world, self._worlds.reset, world)
-            seen = self._observations.plain(observation)
+            observation, _ = self._call_in(world, self._worlds.reset, world)
+            seen = self._observations.write(observation)
         return seen, reward, is_done, told
 
     def _read(self, given: Any) -> list[Any]:
-        """Return the agents' actions; nothing has moved if one of them is wrong."""
+        """Return the agents' actions; all are checked before any agent moves."""
         count = self._worlds.num_worlds
         if not isinstance(given, list) or len(given) != count:
             has = len(given) if isinstance(given, list) else type(given).__name__
             raise RequestError(
-                f'"action" takes a list of {count} actions, one per agent, not {has}.'
+                f'"action" must be a list of {count} actions, one per agent, not {has}.'
             )
         actions = []
         for agent, action in enumerate(given):
@@ -144,13 +144,13 @@ class Agents:
     def _call(self, message: dict[str, Any]) -> Answer:
         name = message.get("method")
         if not isinstance(name, str) or not name.isidentifier() or name.startswith("_"):
-            raise RequestError(f'"method" is {name!r}, which is no name of a public method.')
+            raise RequestError(f'"method" is {name!r}, which is not the name of a public method.')
         if name in _NOT_CALLED:
             raise RequestError(f'"{name}" has a message of its own and cannot be called.')
         methods = [self._method(environment, name) for environment in self._worlds.environments]
         returns = []
         for world, method in enumerate(methods):
-            returns.append(plain(self._named(world, method)))
+            returns.append(to_json_data(self._call_in(world, method)))
             yield 0.0
         return {"type": "call", "returns": returns}
 
@@ -163,8 +163,8 @@ class Agents:
         known = [n for n in dir(environment.unwrapped) if not n.startswith("_")]
         raise RequestError(f'{self._worlds.name} has no method "{name}".{nearest(name, known)}')
 
-    def _named(self, world: int, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call the environment's code; an error of it names the agent."""
+    def _call_in(self, world: int, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call the environment's code; its errors name the agent."""
         try:
             return function(*arguments)
         except Exception as error:

@@ -1,11 +1,11 @@
-"""Clients of godot-rl: the trainer's side, for applications that use its plugin, and for physx."""
+"""Clients of godot-rl: the trainer's side, for applications with its plugin and for physx."""
 
 from __future__ import annotations
 
 import json
 import socket
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Unpack
 
 import gymnasium
 import numpy as np
@@ -15,25 +15,32 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
 from physx_core.errors import RemoteError, RemoteProtocolError, RemoteTimeoutError, UsageError
 from physx_core.typing import Array
-from physx_remote.godot_rl.json_spaces import ACTION, IMAGE, OBSERVATION
+from physx_remote.godot_rl.json_spaces import (
+    ACTION,
+    OBSERVATION,
+    action_space_of,
+    observation_space_of,
+    read_observation,
+)
 from physx_remote.serving.client_link import Link
-from physx_remote.serving.framing import MAX_ANSWER, framed
+from physx_remote.serving.connect_options import ConnectOptions
+from physx_remote.serving.framing import framed
 from physx_remote.serving.spaces import Space
 
 VERSION = {"major_version": "0", "minor_version": "7"}
-"""Version of the protocol, as the handshake tells it."""
+"""Version of the protocol in the handshake."""
 
 
 class _Incoming(Link):
-    """The connection of the application that comes to an address."""
+    """The connection of an application that connects to an address."""
 
     def _connected(self, address: tuple[str, int], patience: float) -> socket.socket:
         try:
             listener = socket.create_server(address)
         except (OSError, OverflowError) as error:
             raise RemoteError(
-                f"Nothing can listen at {self.name}: {error}. A trainer that runs already, or "
-                "another program, may have the port."
+                f"Cannot listen at {self.name}: {error}. A running trainer, or another program, "
+                "may have the port."
             ) from error
         with listener:
             listener.settimeout(patience)
@@ -41,52 +48,46 @@ class _Incoming(Link):
                 return listener.accept()[0]
             except TimeoutError as error:
                 raise RemoteTimeoutError(
-                    f"No application came to {self.name} within {patience:g} s. Start it with this "
-                    "port, or give a longer connect_timeout."
+                    f"No application connected to {self.name} within {patience:g} s. Start it with "
+                    "this port, or give a longer connect_timeout."
                 ) from error
 
     def tell(self, body: bytes) -> None:
-        """Send a message that nobody answers."""
+        """Send a message that has no answer."""
         self._socket.sendall(framed(body))
 
 
 class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
-    """The agents of an application that comes to an address: the side of godot-rl that trains.
+    """The agents of an application that connects to an address: the trainer's side of godot-rl.
 
     Observations and actions are dictionaries by the application's keys; a single key ``obs`` or
-    ``action`` is left out. Agents whose episode ends go on with the next one by themselves. Where
-    the application tells them, as services of physx do, terminated and truncated are told apart and
+    ``action`` is left out. Agents whose episode ends go on with the next one by themselves. If the
+    application sends them, as services of physx do, terminated and truncated are distinguished and
     ``final_obs`` is in the infos; otherwise an episode that is done counts as terminated.
     """
 
     def __init__(
         self,
         address: tuple[str, int] = ("127.0.0.1", 11008),
-        *,
-        timeout: float | None = 60.0,
-        connect_timeout: float = 60.0,
-        max_answer: int = MAX_ANSWER,
+        **options: Unpack[ConnectOptions],
     ) -> None:
-        """Wait for the application and ask for its spaces.
+        """Wait for the application and request its spaces.
 
         Args:
             address: Host and port where the application is expected.
-            timeout: How long an answer may take, in s; None: for ever.
-            connect_timeout: How long to wait for the application, in s.
-            max_answer: Longest answer in bytes that is taken.
+            options: See `ConnectOptions`; the default of ``connect_timeout`` is 60 s.
 
         Raises:
-            RemoteError: The port is taken, no application came, or its agents differ.
+            RemoteError: If the port is in use, no application connects, or its agents differ.
         """
-        self._link = _Incoming(
-            address, timeout=timeout, connect_timeout=connect_timeout, max_answer=max_answer
-        )
+        options.setdefault("connect_timeout", 60.0)
+        self._link = _Incoming(address, **options)
         try:
             self._link.tell(json.dumps({"type": "handshake", **VERSION}).encode())
             told = self._ask({"type": "env_info"}, "env_info")
             self.num_envs = _count(told)
-            self._observed = _parts(told, "observation_space", self.num_envs, _observed)
-            self._acted = _parts(told, "action_space", self.num_envs, _acted)
+            self._observed = _spaces(told, "observation_space", self.num_envs, observation_space_of)
+            self._acted = _spaces(told, "action_space", self.num_envs, action_space_of)
         except BaseException:
             self._link.close()
             raise
@@ -103,20 +104,20 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
         """Begin new episodes everywhere.
 
         Args:
-            seed: Seed of the application; services of physx know it, others let it be.
+            seed: Seed of the application; only services of physx use it.
             options: Must be empty.
 
         Raises:
-            UsageError: There are options, or the seed is no number.
-            RemoteError: The application reports an error, is gone, or does not answer in time.
+            UsageError: If there are options, or the seed is not an integer.
+            RemoteError: If the application reports an error, is gone, or does not answer in time.
         """
         if options:
-            raise UsageError(f"godot-rl has no options of a reset: {list(options)}.")
+            raise UsageError(f"godot-rl takes no reset options: {list(options)}.")
         if seed is not None and not isinstance(seed, (int, np.integer)):
-            raise UsageError(f"The seed is one number for all agents, not {seed!r}.")
+            raise UsageError(f"The seed must be one integer for all agents, not {seed!r}.")
         super().reset(seed=None if seed is None else int(seed))
         observations, each = self.reset_each(None if seed is None else int(seed))
-        return self._batched(observations), self._joined(each)
+        return self._batch(observations), self._merge(each)
 
     def reset_each(self, seed: int | None) -> tuple[list[Any], list[dict[str, Any]]]:
         """Begin new episodes everywhere; return each agent's observation and info."""
@@ -128,14 +129,14 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
         """Have all agents act.
 
         Raises:
-            RemoteError: The application reports an error, is gone, or does not answer in time.
+            RemoteError: If the application reports an error, is gone, or does not answer in time.
         """
         by_name = isinstance(self.single_action_space, spaces.Dict)
         entries = actions if by_name else {ACTION: actions}
         columns = self.plain_actions(entries)
         acted = [{n: column[i] for n, column in columns.items()} for i in range(self.num_envs)]
         observations, rewards, terminated, truncated, each = self.step_each(acted)
-        return self._batched(observations), rewards, terminated, truncated, self._joined(each)
+        return self._batch(observations), rewards, terminated, truncated, self._merge(each)
 
     def plain_actions(self, entries: Mapping[str, Any]) -> dict[str, Any]:
         """Return actions by the application's keys as numbers and lists of numbers."""
@@ -166,9 +167,9 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
         return observations, rewards, done & ~truncated, truncated, infos
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call a method of all agents that takes nothing, and return what they answer."""
+        """Call a method without arguments of all agents, and return their answers."""
         if args or kwargs:
-            raise UsageError("godot-rl calls methods without arguments only.")
+            raise UsageError("godot-rl can only call methods without arguments.")
         return tuple(self._ask({"type": "call", "method": name}, "call")["returns"])
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -176,7 +177,7 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
         try:
             self._link.tell(b'{"type": "close"}')
         except OSError:
-            pass  # it is gone already
+            pass  # already gone
         finally:
             self._link.close()
 
@@ -187,54 +188,57 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
         try:
             told = json.loads(body)
         except (ValueError, RecursionError) as error:
-            raise RemoteProtocolError(f"{self._link.name} answered no JSON: {error}.") from error
+            raise RemoteProtocolError(
+                f"{self._link.name} did not answer with JSON: {error}."
+            ) from error
         if isinstance(told, dict) and told.get("type") == kind:
             return told
         if isinstance(told, dict) and told.get("type") == "error":
             raise RemoteError(f"{self._link.name}: {told.get('error')}: {told.get('message')}")
-        raise RemoteProtocolError(f"{self._link.name} answered {body[:100]!r}, not a {kind}.")
+        raise RemoteProtocolError(f"{self._link.name} answered {body[:100]!r} instead of a {kind}.")
 
     def _infos(self, told: Mapping[str, Any]) -> list[dict[str, Any]]:
-        """Return each agent's info; older applications tell none."""
+        """Return each agent's info; older applications do not send any."""
         if "info" not in told:
             return [{} for _ in range(self.num_envs)]
         return [dict(info) for info in _each(told, "info", self.num_envs)]
 
-    def _joined(self, each: list[dict[str, Any]]) -> dict[str, Any]:
+    def _merge(self, each: list[dict[str, Any]]) -> dict[str, Any]:
         infos: dict[str, Any] = {}
         for agent, info in enumerate(each):
             infos = self._add_info(infos, info, agent)
         return infos
 
-    def _batched(self, observations: list[Any]) -> Any:
+    def _batch(self, observations: list[Any]) -> Any:
         space = self.single_observation_space
         batch: Any = create_empty_array(space, self.num_envs)
         return concatenate(space, observations, batch)
 
     def _observation(self, told: Any) -> Any:
-        """Return what one agent sees."""
+        """Return one agent's observation."""
         try:
-            values = {n: _value(n, part, told[n]) for n, part in self._observed.items()}
+            values = {n: read_observation(n, part, told[n]) for n, part in self._observed.items()}
         except (KeyError, TypeError, ValueError) as error:
             raise RemoteProtocolError(
-                f"The application told the observation {told!r:.100}, which does not fit its "
+                f"The application sent the observation {told!r:.100}, which does not fit its "
                 f"description {self._observed}: {error!r}."
             ) from error
-        return (
-            values
-            if isinstance(self.single_observation_space, spaces.Dict)
-            else values[OBSERVATION]
-        )
+        is_dict = isinstance(self.single_observation_space, spaces.Dict)
+        return values if is_dict else values[OBSERVATION]
 
 
 class GodotRLEnv(gymnasium.Env[Any, Any]):
-    """The one agent of an application that comes to an address: see `GodotRLVectorEnv`.
+    """The one agent of an application that connects to an address: see `GodotRLVectorEnv`.
 
     Attributes:
-        agents: The vector environment that has it.
+        agents: The vector environment that holds it.
     """
 
-    def __init__(self, address: tuple[str, int] = ("127.0.0.1", 11008), **options: Any) -> None:
+    def __init__(
+        self,
+        address: tuple[str, int] = ("127.0.0.1", 11008),
+        **options: Unpack[ConnectOptions],
+    ) -> None:
         """Wait for the application.
 
         Args:
@@ -242,7 +246,7 @@ class GodotRLEnv(gymnasium.Env[Any, Any]):
             options: Those of `GodotRLVectorEnv`.
 
         Raises:
-            RemoteError: See `GodotRLVectorEnv`; or it has several agents.
+            RemoteError: As for `GodotRLVectorEnv`, or if the application has several agents.
         """
         self.agents = GodotRLVectorEnv(address, **options)
         if self.agents.num_envs != 1:
@@ -259,12 +263,12 @@ class GodotRLEnv(gymnasium.Env[Any, Any]):
         """Begin an episode: see `GodotRLVectorEnv.reset`."""
         super().reset(seed=seed)
         if options:
-            raise UsageError(f"godot-rl has no options of a reset: {list(options)}.")
+            raise UsageError(f"godot-rl takes no reset options: {list(options)}.")
         observations, infos = self.agents.reset_each(seed)
         return observations[0], infos[0]
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Act: see `GodotRLVectorEnv.step`; at the end of an episode its last observation."""
+        """Act; at the end of an episode the observation is its last one."""
         entries = action if isinstance(self.action_space, spaces.Dict) else {ACTION: action}
         told = self.agents.step_each([self.agents.plain_actions(entries)])
         observations, rewards, terminated, truncated, infos = told
@@ -277,66 +281,37 @@ class GodotRLEnv(gymnasium.Env[Any, Any]):
 
 
 def _each(told: Mapping[str, Any], key: str, count: int, kind: Any = dict) -> list[Any]:
-    """Return what an answer tells of each agent, values of a kind."""
+    """Return an answer's values of all agents, checked to be of a type."""
     values = told.get(key)
     is_list = isinstance(values, list) and len(values) == count
     if not is_list or not all(isinstance(value, kind) for value in values or ()):
         raise RemoteProtocolError(
-            f'The application told "{key}" as {values!r:.100}, which is no list of {count}.'
+            f'The application sent {values!r:.100} as "{key}" instead of a list of {count}.'
         )
     return list(values or ())
 
 
 def _count(told: Mapping[str, Any]) -> int:
     count: Any = told.get("n_agents")
-    if type(count) in (int, float) and 1 <= count < 1 << 20:  # Godot tells whole numbers as 2.0
+    if type(count) in (int, float) and 1 <= count < 1 << 20:  # Godot sends integers as 2.0
         return int(count)
-    raise RemoteProtocolError(f"The application told {count!r} agents.")
+    raise RemoteProtocolError(f"The application reported {count!r} agents.")
 
 
-def _parts(told: Mapping[str, Any], key: str, count: int, make: Any) -> dict[str, Space]:
-    """Return the spaces of the entries of each agent, which are the same for all."""
+def _spaces(told: Mapping[str, Any], key: str, count: int, make: Any) -> dict[str, Space]:
+    """Return the spaces of an agent's entries, which must be the same for all agents."""
     given: Any = told.get(key)
     each = given if isinstance(given, list) else [given] * count
     if len(each) != count or any(one != each[0] for one in each):
         raise RemoteError(
-            f"The application's agents do not all have the same {key}, and only those that do can "
-            f"be driven together: {given!r:.200}"
+            f"The application's agents do not all have the same {key}, so they cannot be driven "
+            f"together: {given!r:.200}"
         )
     try:
         return {name: make(name, entry) for name, entry in each[0].items()}
     except (AttributeError, KeyError, TypeError, ValueError, AssertionError) as error:
-        raise RemoteProtocolError(f"The {key} {each[0]!r:.200} is none: {error!r}.") from error
-
-
-def _observed(name: str, entry: Mapping[str, Any]) -> Space:
-    if entry["space"] == "discrete":
-        return spaces.Discrete(int(entry["size"]))
-    if entry["space"] != "box":
-        raise ValueError(f"there is no space {entry['space']!r}")
-    shape = tuple(int(size) for size in entry["size"])
-    if IMAGE in name:
-        return spaces.Box(0, 255, shape, np.uint8)
-    low, high = entry.get("low", -np.inf), entry.get("high", np.inf)
-    return spaces.Box(float(low), float(high), shape, np.float64)
-
-
-def _acted(name: str, entry: Mapping[str, Any]) -> Space:
-    size = int(entry["size"])
-    if entry["action_type"] == "discrete":
-        return spaces.Discrete(size)
-    if entry["action_type"] != "continuous":
-        raise ValueError(f"there is no action_type {entry['action_type']!r}")
-    return spaces.Box(-1.0, 1.0, (size,), np.float32)
+        raise RemoteProtocolError(f"The {key} {each[0]!r:.200} is not valid: {error!r}.") from error
 
 
 def _whole(parts: dict[str, Space], alone: str) -> Space:
     return parts[alone] if parts.keys() == {alone} else spaces.Dict(parts)
-
-
-def _value(name: str, space: Space, told: Any) -> Any:
-    if isinstance(space, spaces.Discrete):
-        return np.int64(told)
-    if IMAGE in name:
-        return np.frombuffer(bytes.fromhex(told), np.uint8).reshape(space.shape or ())
-    return np.array(told, np.float64).reshape(space.shape or ())

@@ -1,90 +1,91 @@
-"""Spaces, observations and actions as godot-rl writes them in JSON."""
+"""Spaces, observations and actions in godot-rl's JSON, for both sides of the connection."""
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
 from physx_core.errors import ActionError, ConfigError, listed
-from physx_remote.serving.spaces import Leaf, Space, join, leaves
+from physx_remote.serving.spaces import Leaf, Path, Space, SpaceTree
 
 IMAGE = "2d"
-"""What the key of an image contains: its value is the hexadecimal text of bytes."""
+"""Mark of an image's key; the value is bytes in hexadecimal."""
 
 OBSERVATION, ACTION = "obs", "action"
-"""Keys of what is no part of anything."""
+"""Keys of the values of spaces without parts."""
 
 _PICTURE = "camera_2d"
 _LARGEST = sys.float_info.max
 
 
-def _named_leaves(space: Space, root: str) -> Iterator[tuple[str, tuple[Any, ...], Leaf]]:
-    """Yield name, path and space of each part; the names of a path are joined with dots."""
-    for path, leaf in leaves(space):
-        name = ""
-        for step in path:
-            if isinstance(step, int):
-                name = f"{name or root}_{step}"
-            else:
-                name = f"{name}.{step}" if name else str(step)
-        yield name or root, path, leaf
+def _key(path: Path, root: str) -> str:
+    """Return the key of a part: names joined by dots, numbers by underscores."""
+    key = ""
+    for step in path:
+        if isinstance(step, int):
+            key = f"{key or root}_{step}"
+        else:
+            key = f"{key}.{step}" if key else str(step)
+    return key or root
 
 
-class Observations:
-    """Writes observations of a space.
+# Services ---------------------------------------------------------------------------------------
+
+
+class ObservationWriter:
+    """Converts observations of a space to data for JSON.
 
     Vectors become lists of numbers; images, which are arrays of uint8 with three axes, become
-    hexadecimal text, and their keys get the ending ``_2d`` where they do not contain ``2d``. The
-    parts of nested spaces become entries of their own. One space without parts is the entry
-    ``obs``, or ``camera_2d`` if it is an image.
+    hexadecimal text, with ``_2d`` appended to keys that do not contain ``2d``. The parts of nested
+    spaces become separate entries. A space without parts is the entry ``obs``, or ``camera_2d`` if
+    it is an image.
 
     Attributes:
-        described: What ``env_info`` tells of the entries.
+        description: The entries in ``env_info``.
     """
 
     def __init__(self, space: Space) -> None:
-        """Choose how to write each part.
+        """Choose the format of each part.
 
         Raises:
-            ConfigError: Two parts would get the same name, or one a name that godot-rl misreads.
-            UsageError: godot-rl has nothing for a part of the space.
+            ConfigError: If two parts would get the same key, or one a key that godot-rl misreads.
+            UsageError: If godot-rl has no format for a part of the space.
         """
-        self.described: dict[str, dict[str, Any]] = {}
-        self._writers: list[tuple[str, tuple[Any, ...], Callable[[Any], Any]]] = []
-        for part, path, leaf in _named_leaves(space, OBSERVATION):
-            name, described, write = _observed(part, leaf)
-            if name in self.described:
+        self.description: dict[str, dict[str, Any]] = {}
+        self._tree = SpaceTree(space)
+        self._writers: list[Callable[[Any], Any]] = []
+        for path, leaf in zip(self._tree.paths, self._tree.leaves, strict=True):
+            name, entry, write = _describe_observation(_key(path, OBSERVATION), leaf)
+            if name in self.description:
                 raise ConfigError(f'Two parts of the observation would both be called "{name}".')
-            self.described[name] = described
-            self._writers.append((name, path, write))
+            self.description[name] = entry
+            self._writers.append(write)
 
-    def plain(self, observation: Any) -> dict[str, Any]:
+    def write(self, observation: Any) -> dict[str, Any]:
         """Return an observation as data for JSON."""
-        told = {}
-        for name, path, write in self._writers:
-            value = observation
-            for step in path:
-                value = value[step]
-            told[name] = write(value)
-        return told
+        values = self._tree.split(observation)
+        parts = zip(self.description, self._writers, values, strict=True)
+        return {name: write(value) for name, write, value in parts}
 
 
-def _observed(name: str, space: Leaf) -> tuple[str, dict[str, Any], Callable[[Any], Any]]:
-    """Return an entry's key, its description, and what writes its value."""
+def _describe_observation(
+    name: str, space: Leaf
+) -> tuple[str, dict[str, Any], Callable[[Any], Any]]:
+    """Return an entry's key, its description, and the function that converts its value."""
     if isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(space.shape) == 3:
         if IMAGE not in name:
             name = _PICTURE if name == OBSERVATION else f"{name}_{IMAGE}"
-        described = {"space": "box", "size": list(space.shape), "low": 0, "high": 255}
-        return name, described, lambda value: np.ascontiguousarray(value, np.uint8).tobytes().hex()
+        entry = {"space": "box", "size": list(space.shape), "low": 0, "high": 255}
+        return name, entry, lambda value: np.ascontiguousarray(value, np.uint8).tobytes().hex()
     if IMAGE in name:
         raise ConfigError(
-            f'The observation\'s part "{name}" has a name with "{IMAGE}", by which godot-rl knows '
-            "images, but it is no array of uint8 with three axes. Give it another name."
+            f'The part "{name}" of the observation is not an image (uint8 with three axes), but '
+            f'godot-rl takes every name with "{IMAGE}" for one. Give it another name.'
         )
     if isinstance(space, spaces.Discrete):
         start = int(space.start)
@@ -94,7 +95,7 @@ def _observed(name: str, space: Leaf) -> tuple[str, dict[str, Any], Callable[[An
 
 
 def _bounds(space: Any) -> dict[str, float]:
-    """Return the bounds of all components, if there are any."""
+    """Return the common bounds of all components; empty if there are none."""
     if isinstance(space, spaces.Box):
         if not math.prod(space.shape):
             return {}
@@ -118,63 +119,63 @@ def _numbers(shape: tuple[int, ...]) -> Callable[[Any], Any]:
     return write
 
 
-class Actions:
-    """Reads actions of a space.
+class ActionReader:
+    """Converts actions from JSON to values of a space.
 
-    Continuous actions travel between -1 and 1. They are cut to that, and brought to the bounds of
-    the space; where a bound is infinite the number itself is the action. Discrete actions travel
-    as numbers from 0. Spaces of several discrete numbers become entries ``NAME_0``, ``NAME_1`` and
-    so on; the parts of nested spaces become entries of their own. One space without parts is the
-    entry ``action``.
+    Continuous actions are between -1 and 1. They are clipped to that range and scaled to the bounds
+    of the space; if a bound is infinite, the number itself is the action. Discrete actions are
+    numbers from 0. Spaces of several discrete numbers become entries ``NAME_0``, ``NAME_1`` and so
+    on; the parts of nested spaces become separate entries. A space without parts is the entry
+    ``action``.
 
     Attributes:
-        described: What ``env_info`` tells of the entries.
+        description: The entries in ``env_info``.
     """
 
     def __init__(self, space: Space) -> None:
-        """Choose how to read each part.
+        """Choose the format of each part.
 
         Raises:
-            ConfigError: Two parts would get the same name.
-            UsageError: godot-rl has nothing for a part of the space.
+            ConfigError: If two parts would get the same key.
+            UsageError: If godot-rl has no format for a part of the space.
         """
-        self.described: dict[str, dict[str, Any]] = {}
-        self._space = space
+        self.description: dict[str, dict[str, Any]] = {}
+        self._tree = SpaceTree(space)
         self._readers: list[Callable[[Mapping[str, Any]], Any]] = []
-        for name, _, leaf in _named_leaves(space, ACTION):
-            described, read = _acted(name, leaf)
-            twice = described.keys() & self.described.keys()
+        for path, leaf in zip(self._tree.paths, self._tree.leaves, strict=True):
+            entries, read = _describe_action(_key(path, ACTION), leaf)
+            twice = entries.keys() & self.description.keys()
             if twice:
                 raise ConfigError(f"Two parts of the action would both be called {listed(twice)}.")
-            self.described.update(described)
+            self.description.update(entries)
             self._readers.append(read)
 
     def read(self, given: Any) -> Any:
-        """Return one agent's action as its environment takes it.
+        """Return one agent's action as a value of the space.
 
         Args:
-            given: Entry to number or list of numbers, as JSON gave them.
+            given: Entry to number or list of numbers, from JSON.
 
         Raises:
-            ActionError: An entry is missing, unknown, or not what its description says.
+            ActionError: If an entry is missing, unknown, or does not fit its description.
         """
-        if not isinstance(given, dict) or given.keys() != self.described.keys():
+        if not isinstance(given, dict) or given.keys() != self.description.keys():
             has = listed(given) if isinstance(given, dict) else type(given).__name__
-            raise ActionError(
-                f"an action has the entries {listed(self.described)}, and this one: {has}."
-            )
-        return join(self._space, (read(given) for read in self._readers))
+            raise ActionError(f"an action needs the entries {listed(self.description)}, not {has}.")
+        return self._tree.join(read(given) for read in self._readers)
 
 
-def _acted(name: str, space: Leaf) -> tuple[dict[str, Any], Callable[[Mapping[str, Any]], Any]]:
-    """Return the descriptions of a part's entries, and what reads them."""
+def _describe_action(
+    name: str, space: Leaf
+) -> tuple[dict[str, Any], Callable[[Mapping[str, Any]], Any]]:
+    """Return the descriptions of a part's entries, and the function that reads them."""
     if isinstance(space, spaces.Box):
-        described = {name: {"size": math.prod(space.shape), "action_type": "continuous"}}
-        return described, _continuous(name, space)
+        entries = {name: {"size": math.prod(space.shape), "action_type": "continuous"}}
+        return entries, _continuous(name, space)
     if isinstance(space, spaces.Discrete):
         count, start = int(space.n), int(space.start)
-        described = {name: {"size": count, "action_type": "discrete"}}
-        return described, lambda given: start + _index(name, given[name], count)
+        entries = {name: {"size": count, "action_type": "discrete"}}
+        return entries, lambda given: start + _index(name, given[name], count)
     return _several_discrete(name, space)
 
 
@@ -194,7 +195,7 @@ def _continuous(name: str, space: spaces.Box) -> Callable[[Mapping[str, Any]], A
             raise ActionError(f'"{name}" takes a list of {count} numbers, not {has}.')
         for index, number in enumerate(numbers):
             if type(number) not in (float, int) or not -_LARGEST <= number <= _LARGEST:
-                raise ActionError(f'"{name}"[{index}] is {number!r}, which is no finite number.')
+                raise ActionError(f'"{name}"[{index}] is {number!r}, which is not a finite number.')
         unit = np.array(numbers, np.float64).reshape(space.shape)
         value = np.clip(np.clip(unit, -ends, ends) * half + middle, low, high)
         return np.asarray(np.rint(value) if whole else value, space.dtype)
@@ -215,8 +216,7 @@ def _several_discrete(
         chosen = [_index(entry, given[entry], count) for entry, count in sizes.items()]
         return (np.array(chosen, np.int64).reshape(counts.shape) + starts).astype(space.dtype)
 
-    described = {e: {"size": n, "action_type": "discrete"} for e, n in sizes.items()}
-    return described, read
+    return {e: {"size": n, "action_type": "discrete"} for e, n in sizes.items()}, read
 
 
 def _index(name: str, number: Any, count: int) -> int:
@@ -224,3 +224,46 @@ def _index(name: str, number: Any, count: int) -> int:
     if type(whole) is int and 0 <= whole < count:
         return whole
     raise ActionError(f'"{name}" takes a number from 0 to {count - 1}, not {number!r}.')
+
+
+# Clients ----------------------------------------------------------------------------------------
+
+
+def observation_space_of(name: str, entry: Mapping[str, Any]) -> Space:
+    """Return the space of an entry of the observations.
+
+    Raises:
+        KeyError, TypeError, ValueError or AssertionError: If the description is not valid.
+    """
+    if entry["space"] == "discrete":
+        return spaces.Discrete(int(entry["size"]))
+    if entry["space"] != "box":
+        raise ValueError(f"unknown space {entry['space']!r}")
+    shape = tuple(int(size) for size in entry["size"])
+    if IMAGE in name:
+        return spaces.Box(0, 255, shape, np.uint8)
+    low, high = entry.get("low", -np.inf), entry.get("high", np.inf)
+    return spaces.Box(float(low), float(high), shape, np.float64)
+
+
+def action_space_of(name: str, entry: Mapping[str, Any]) -> Space:
+    """Return the space of an entry of the actions; raises as `observation_space_of` does."""
+    size = int(entry["size"])
+    if entry["action_type"] == "discrete":
+        return spaces.Discrete(size)
+    if entry["action_type"] != "continuous":
+        raise ValueError(f"unknown action_type {entry['action_type']!r}")
+    return spaces.Box(-1.0, 1.0, (size,), np.float32)
+
+
+def read_observation(name: str, space: Space, given: Any) -> Any:
+    """Return an entry of an observation as a value of its space.
+
+    Raises:
+        TypeError or ValueError: If it does not fit the space.
+    """
+    if isinstance(space, spaces.Discrete):
+        return np.int64(given)
+    if IMAGE in name:
+        return np.frombuffer(bytes.fromhex(given), np.uint8).reshape(space.shape or ())
+    return np.array(given, np.float64).reshape(space.shape or ())

@@ -12,9 +12,6 @@ import socket
 import time
 from typing import Any, ClassVar
 
-import gymnasium
-from gymnasium.vector import VectorEnv
-
 from physx_core.errors import (
     ActionError,
     ConfigError,
@@ -24,9 +21,11 @@ from physx_core.errors import (
     listed,
 )
 from physx_remote.godot_rl.agents import Agents, Answer
+from physx_remote.godot_rl.client import GodotRLEnv, GodotRLVectorEnv
+from physx_remote.serving.connect_options import ConnectOptions, check_names
 from physx_remote.serving.connection import Connection
 from physx_remote.serving.framing import MAX_REQUEST, FrameReader, framed
-from physx_remote.serving.protocol import Protocol, Scene, check_options
+from physx_remote.serving.protocol import Protocol, Scene
 from physx_remote.serving.service import LOG, Service
 from physx_remote.serving.socket_service import SocketService, Work
 from physx_remote.serving.worlds import Worlds
@@ -111,19 +110,15 @@ class GodotRL(Protocol):
             raise RemoteError(f"The trainer at {address} left at once: {error}.") from error
 
     @classmethod
-    def connect(cls, host: str, port: int, **options: Any) -> gymnasium.Env[Any, Any]:
+    def connect(cls, host: str, port: int, **options: Any) -> GodotRLEnv:
         """Wait for an application with one agent: see `GodotRLEnv`."""
-        from physx_remote.godot_rl.client import GodotRLEnv, GodotRLVectorEnv
-
-        check_options("A client of godot-rl", options, GodotRLVectorEnv)
+        check_names("A client of godot-rl", options, ConnectOptions.__annotations__)
         return GodotRLEnv((host, port or PORT), **options)
 
     @classmethod
-    def connect_vector(cls, host: str, port: int, **options: Any) -> VectorEnv[Any, Any, Any]:
+    def connect_vector(cls, host: str, port: int, **options: Any) -> GodotRLVectorEnv:
         """Wait for an application with any number of agents: see `GodotRLVectorEnv`."""
-        from physx_remote.godot_rl.client import GodotRLVectorEnv
-
-        check_options("A client of godot-rl", options, GodotRLVectorEnv)
+        check_names("A client of godot-rl", options, ConnectOptions.__annotations__)
         return GodotRLVectorEnv((host, port or PORT), **options)
 
 

@@ -1,10 +1,10 @@
-"""Clients of the protocol physx: all that a service offers, and one of its worlds as a gym.Env."""
+"""PhysxClient drives the worlds of a service; PhysxEnv is one of them as a gymnasium.Env."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import gymnasium
 import numpy as np
@@ -14,26 +14,26 @@ from physx_core.errors import ConfigError, RemoteProtocolError
 from physx_core.net import Kind, pack_value
 from physx_core.typing import Array
 from physx_remote.physx.link import PhysxLink
+from physx_remote.physx.space_arrays import SpaceArrays
 from physx_remote.physx.wire import (
     ACT,
     REWARD,
     TERMINATED,
     TRUNCATED,
     WORLDS,
-    Leaves,
-    infos_of,
+    split_infos,
 )
-from physx_remote.serving.framing import MAX_ANSWER
+from physx_remote.serving.connect_options import TokenOptions
 from physx_remote.serving.spaces import build_space
 
 LOG = logging.getLogger("physx.remote")
 
 
-class Rows(NamedTuple):
-    """What became of some worlds; the arrays have a leading axis of them and are the caller's own.
+class Outcomes(NamedTuple):
+    """Outcomes of a request in some worlds; the caller owns the arrays.
 
     Attributes:
-        arrays: All arrays by their names on the wire.
+        arrays: The arrays by their names on the wire, each with a leading axis of these worlds.
         infos: Info of each world.
     """
 
@@ -47,41 +47,28 @@ class PhysxClient(Closeable):
     Attributes:
         name: What is served.
         num_worlds: How many worlds there are.
-        has_snapshots: Whether worlds can be put back to where they were.
-        render_mode: How the worlds are rendered, None for not at all.
-        metadata: What Gymnasium's environments say about themselves.
-        observations: Space of one world's observations, and its arrays.
-        actions: Space of one world's actions, and its arrays.
+        has_snapshots: Whether the state of a world can be kept and restored.
+        render_mode: How the worlds are rendered; None: not at all.
+        metadata: Metadata of a Gymnasium environment.
+        observations: Space of one world's observations, as arrays.
+        actions: Space of one world's actions, as arrays.
     """
 
-    def __init__(
-        self,
-        address: tuple[str, int],
-        *,
-        token: str | None = None,
-        token_file: str | None = None,
-        timeout: float | None = 60.0,
-        connect_timeout: float = 10.0,
-        max_answer: int = MAX_ANSWER,
-    ) -> None:
-        """Connect; the arguments are those of `PhysxLink`.
+    def __init__(self, address: tuple[str, int], **options: Unpack[TokenOptions]) -> None:
+        """Connect.
+
+        Args:
+            address: Host and port.
+            options: See `TokenOptions`.
 
         Raises:
-            ConfigError: There is no token.
-            RemoteError: Nothing answers, another client acts already, or the tokens differ.
+            ConfigError: If no token is given.
+            RemoteError: If nothing answers, another client acts already, or the tokens differ.
         """
-        self._link = PhysxLink(
-            address,
-            ACT,
-            token=token,
-            token_file=token_file,
-            timeout=timeout,
-            connect_timeout=connect_timeout,
-            max_answer=max_answer,
-        )
+        self._link = PhysxLink(address, ACT, **options)
         try:
             told = self._link.introduction
-            self.observations, self.actions = introduced_leaves(told)
+            self.observations, self.actions = read_spaces(told)
             self.name = str(told["name"])
             self.num_worlds = int(told["num_worlds"])
             self.has_snapshots = bool(told["snapshot"])
@@ -98,7 +85,7 @@ class PhysxClient(Closeable):
 
     @property
     def timeout(self) -> float | None:
-        """How long an answer may take from now on, in s; None: for ever."""
+        """How long an answer may take from now on, in s; None: forever."""
         return self._link.timeout
 
     @timeout.setter
@@ -113,7 +100,7 @@ class PhysxClient(Closeable):
         *,
         seeds: Sequence[int | None] | None = None,
         options: Mapping[str, Any] | None = None,
-    ) -> Rows:
+    ) -> Outcomes:
         """Begin new episodes.
 
         Args:
@@ -122,55 +109,55 @@ class PhysxClient(Closeable):
             options: Options of each reset, plain values.
 
         Raises:
-            PhysxError: A world raised, or the service is gone or too late.
+            PhysxError: If a world raises, or the service is gone or does not answer in time.
         """
         self.ask_reset(worlds, seeds, options)
-        return self.rows(len(worlds) if worlds is not None else self.num_worlds)
+        return self.outcomes(len(worlds) if worlds is not None else self.num_worlds)
 
-    def step(self, actions: dict[str, Array], worlds: Sequence[int] | None = None) -> Rows:
-        """Step worlds. If one raises, those before it are stepped and those after it are not.
+    def step(self, actions: dict[str, Array], worlds: Sequence[int] | None = None) -> Outcomes:
+        """Step worlds in order. If one raises, the worlds after it are not stepped.
 
         Args:
-            actions: Arrays as ``client.actions.stacked(...)`` makes them.
+            actions: Arrays as ``client.actions.stack(...)`` returns them.
             worlds: Numbers of the worlds; None: all.
 
         Raises:
-            PhysxError: A world raised, or the service is gone or too late.
+            PhysxError: If a world raises, or the service is gone or does not answer in time.
         """
         self.ask_step(actions, None if worlds is None else np.array(worlds, np.int64))
-        return self.rows(len(worlds) if worlds is not None else self.num_worlds)
+        return self.outcomes(len(worlds) if worlds is not None else self.num_worlds)
 
     def snapshot(self, world: int = 0) -> int:
-        """Keep a world's state at the service; return the snapshot's number.
+        """Keep a world's state at the service and return the number of the snapshot.
 
         It is kept until it is forgotten or this client leaves.
 
         Raises:
-            PhysxError: The environment has no snapshots, or too many are kept.
+            PhysxError: If the environment has no snapshots, or too many are kept.
         """
         return int(self.ask({"do": "snapshot", "world": world}))
 
-    def restore(self, snapshot: int, world: int = 0) -> Rows:
-        """Put a world into the state of a snapshot, of itself or of another world.
+    def restore(self, snapshot: int, world: int = 0) -> Outcomes:
+        """Restore a snapshot, of any world, into a world.
 
         Returns:
-            What the world answered last when the snapshot was taken.
+            The outcome that was the last one when the snapshot was taken.
 
         Raises:
-            PhysxError: There is no such snapshot.
+            PhysxError: If the snapshot does not exist.
         """
         self._request({"do": "restore", "world": world, "snapshot": snapshot})
-        return self.rows(1)
+        return self.outcomes(1)
 
     def forget(self, snapshot: int) -> bool:
-        """Forget a snapshot; return whether there was one of this number."""
+        """Forget a snapshot; return whether it existed."""
         return bool(self.ask({"do": "forget", "snapshot": snapshot}))
 
     def render(self, world: int = 0) -> Any:
         """Return what a world renders.
 
         Raises:
-            PhysxError: It raised, or renders what cannot travel.
+            PhysxError: If it raises, or what it renders cannot be sent.
         """
         return self.ask({"do": "render", "world": world})
 
@@ -178,7 +165,7 @@ class PhysxClient(Closeable):
         """End the connection; calling it again does nothing."""
         self._link.close()
 
-    # Requests and their answers apart, for several at a time ---------------------------------
+    # Requests and answers apart, for several requests at a time ------------------------------
 
     def ask_reset(
         self,
@@ -186,7 +173,7 @@ class PhysxClient(Closeable):
         seeds: Sequence[int | None] | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        """Send what `reset` sends; `rows` returns the answer."""
+        """Send the request of `reset`; `outcomes` returns the answer."""
         request: dict[str, Any] = {"do": "reset"}
         if worlds is not None:
             request["worlds"] = [int(world) for world in worlds]
@@ -197,42 +184,42 @@ class PhysxClient(Closeable):
         self._request(request)
 
     def ask_step(self, actions: dict[str, Array], worlds: Array | None) -> None:
-        """Send what `step` sends; `rows` returns the answer."""
+        """Send the request of `step`; `outcomes` returns the answer."""
         if worlds is not None:
             actions = {WORLDS: worlds, **actions}
         self._number += 1
         self._link.send(pack_value(Kind.ACTIONS, actions, "actions", self._number))
 
-    def rows(self, count: int, back: int = 0) -> Rows:
-        """Return the answer to a request that was sent.
+    def outcomes(self, count: int, back: int = 0) -> Outcomes:
+        """Return the answer to a request.
 
         Args:
-            count: Of how many worlds.
-            back: How many requests were sent after it.
+            count: Number of worlds in the request.
+            back: Number of requests sent after it.
 
         Raises:
-            PhysxError: The request failed.
+            PhysxError: If the request failed.
         """
         notes, arrays = self._answer(self._number - back)
         if not isinstance(arrays, dict) or arrays.keys() != self._names:
-            raise self._nonsense("an answer that is not about worlds")
+            raise self._nonsense("an answer without the arrays of worlds")
         if any(np.shape(array)[:1] != (count,) for array in arrays.values()):
-            raise self._nonsense("an answer that is not about the worlds that were asked for")
+            raise self._nonsense("an answer about other worlds than requested")
         if notes is None:
-            return Rows(arrays, [{} for _ in range(count)])
-        infos, left_out = infos_of(notes, count)
+            return Outcomes(arrays, [{} for _ in range(count)])
+        infos, left_out = split_infos(notes, count)
         new = set(left_out) - self._left_out
         if new:
             self._left_out |= new
             LOG.warning(
-                "Infos of these names are left out, for they hold more than plain values and "
+                "Infos of these names are left out because they hold more than plain values and "
                 "arrays: %s.",
                 ", ".join(sorted(new)),
             )
-        return Rows(arrays, infos)
+        return Outcomes(arrays, infos)
 
     def ask(self, request: dict[str, Any]) -> Any:
-        """Send a request that is answered with a plain value, and return it."""
+        """Send a request and return its answer, a plain value."""
         self._request(request)
         return self._answer(self._number)[1]
 
@@ -241,17 +228,17 @@ class PhysxClient(Closeable):
         self._link.send(pack_value(Kind.REQUEST, request, "request", self._number))
 
     def _answer(self, number: int) -> tuple[Any, Any]:
-        """Return what came with an answer, None for nothing, and the answer."""
+        """Return the notes that came with an answer, None without any, and the answer."""
         notes = None
         while True:
             frame = self._link.receive()
             if frame.number != number:
                 raise self._nonsense(f"an answer to request {frame.number} instead of {number}")
             if frame.kind in (Kind.ANSWER, Kind.REFUSAL):
-                return notes, self._link.decoded(frame)
+                return notes, self._link.decode(frame)
             if frame.kind is not Kind.NOTES:
                 raise self._nonsense(f"a message {frame.kind.name}")
-            notes = self._link.decoded(frame)
+            notes = self._link.decode(frame)
 
     def _nonsense(self, what: str) -> PhysxError:
         self._link.close(f"it sent {what}")
@@ -274,7 +261,7 @@ class PhysxEnv(gymnasium.Env[Any, Any]):
             world: Number of the world.
 
         Raises:
-            ConfigError: There is no such world.
+            ConfigError: If the world does not exist.
         """
         if not 0 <= world < client.num_worlds:
             raise ConfigError(f"There is no world {world}: there are 0 to {client.num_worlds - 1}.")
@@ -299,19 +286,19 @@ class PhysxEnv(gymnasium.Env[Any, Any]):
             PhysxError: The world raised, or the service is gone or too late.
         """
         super().reset(seed=seed)
-        rows = self.client.reset(self._worlds, seeds=[seed], options=options)
-        return self.client.observations.row(rows.arrays, 0), rows.infos[0]
+        outcomes = self.client.reset(self._worlds, seeds=[seed], options=options)
+        return self.client.observations.row(outcomes.arrays, 0), outcomes.infos[0]
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Act.
 
         Raises:
-            ActionError: The action has another shape than the space.
+            ActionError: If the action does not have the structure, shapes or types of the space.
             PhysxError: The world raised, or the service is gone or too late.
         """
         client = self.client
-        client.ask_step(client.actions.stacked(action, one=True), self._number)
-        arrays, infos = client.rows(1)
+        client.ask_step(client.actions.stack(action, one=True), self._number)
+        arrays, infos = client.outcomes(1)
         return (
             client.observations.row(arrays, 0),
             float(arrays[REWARD][0]),
@@ -329,18 +316,18 @@ class PhysxEnv(gymnasium.Env[Any, Any]):
         return self.client.snapshot(self.world)
 
     def restore(self, state: int) -> Any:
-        """Put the world back to a snapshot; return the observation of that moment."""
-        rows = self.client.restore(state, self.world)
-        return self.client.observations.row(rows.arrays, 0)
+        """Restore a snapshot; return the observation of that moment."""
+        outcomes = self.client.restore(state, self.world)
+        return self.client.observations.row(outcomes.arrays, 0)
 
     def close(self) -> None:
         """End the connection; calling it again does nothing."""
         self.client.close()
 
 
-def introduced_leaves(told: Mapping[str, Any]) -> tuple[Leaves, Leaves]:
-    """Return what a service says about observations and actions."""
+def read_spaces(told: Mapping[str, Any]) -> tuple[SpaceArrays, SpaceArrays]:
+    """Return the spaces of observations and actions in a service's introduction."""
     return (
-        Leaves(build_space(told["observation_space"]), "observation"),
-        Leaves(build_space(told["action_space"]), "action"),
+        SpaceArrays(build_space(told["observation_space"]), "observation"),
+        SpaceArrays(build_space(told["action_space"]), "action"),
     )

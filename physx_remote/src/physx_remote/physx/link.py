@@ -1,4 +1,4 @@
-"""PhysxLink: a client's authenticated connection; every wait has an end."""
+"""PhysxLink: a client's authenticated connection; all waits are bounded."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ _BACKLOG = 1 << 16
 class PhysxLink(Connection):
     """A connection to a service of the protocol physx.
 
-    After any failure it is closed: a late answer must not be taken for that of another request.
+    After any failure it is closed, so that a late answer is not taken for that of another request.
 
     Attributes:
         name: The service as ``host:port``.
-        timeout: How long an answer may take, in s; None: for ever.
-        introduction: What the service says about itself.
+        timeout: How long an answer may take, in s; None: forever.
+        introduction: The service's description of itself.
     """
 
     _server: ClassVar[str] = "service"
@@ -58,21 +58,20 @@ class PhysxLink(Connection):
         connect_timeout: float = 10.0,
         max_answer: int = MAX_ANSWER,
     ) -> None:
-        """Connect; as long as nobody listens it is tried again.
+        """Connect; retry while nothing listens.
 
         Args:
             address: Host and port.
-            role: Whether to act or to look on.
-            token: What the service must be known by; None: what is in `token_file`, and without
-                that in the environment variable ``PHYSX_TOKEN``.
-            token_file: File that holds the token; readable by you alone.
-            timeout: How long an answer may take, in s; None: for ever.
-            connect_timeout: How long to try to connect, in s.
-            max_answer: Longest answer in bytes that is taken.
+            role: `ACT` or `OBSERVE`.
+            token: See `TokenOptions`, also for the options below.
+            token_file: File that holds the token.
+            timeout: How long an answer may take, in s; None: forever.
+            connect_timeout: How long to keep trying to connect, in s.
+            max_answer: Size of the longest accepted answer in bytes.
 
         Raises:
-            ConfigError: There is no token.
-            RemoteError: Nothing answers, or it does not take this client.
+            ConfigError: If no token is given.
+            RemoteError: If nothing answers, or the service does not accept this client.
         """
         super().__init__(address)
         self.timeout = timeout
@@ -83,48 +82,50 @@ class PhysxLink(Connection):
                 "give token_file=, the file that holds it, or token=."
             )
         until = time.monotonic() + connect_timeout
-        self._socket = self._reached(lambda left: _opened(address, role, left), connect_timeout)
+        self._socket = self._reached(
+            lambda left: _open_socket(address, role, left), connect_timeout
+        )
         try:
-            self._reader = self._introduced(found, role, max(until - time.monotonic(), 1.0))
+            self._reader = self._handshake(found, role, max(until - time.monotonic(), 1.0))
             self._reader.limit = max_answer
             self._poll = select.poll()
             self._poll.register(self._socket, select.POLLIN)
             self._socket.setblocking(False)
-            self.introduction = self._welcome(connect_timeout)
+            self.introduction = self._receive_introduction(connect_timeout)
         except BaseException:
             self._socket.close()
             raise
 
-    def _introduced(self, token: str, role: int, patience: float) -> FrameReader:
-        """Prove that both sides know the token."""
+    def _handshake(self, token: str, role: int, patience: float) -> FrameReader:
+        """Authenticate both sides by the token."""
         self._socket.settimeout(patience)
         try:
             return introduce(self._socket, token, role)
         except UnansweredError as error:
             raise RemoteClosedError(
-                f"{self.name} did not answer as a service of physx does: {error} It may have "
-                "closed because it knows another token, because too many are connected, or "
-                "because it speaks another protocol."
+                f"{self.name} did not answer like a service of physx: {error} It may have "
+                "closed the connection because it has another token, because too many clients are "
+                "connected, or because it speaks another protocol."
             ) from error
         except ConnectionRefusedByPeerError as error:
             raise RemoteError(
-                f"{self.name} cannot be trusted: it does not know this client's token, or is no "
-                "service of this version of physx. Give the token of the service: "
+                f"{self.name} cannot be trusted: it does not know this client's token, or is not "
+                "a service of this version of physx. Give the token of the service: "
                 f"{TOKEN_VARIABLE}, token_file= or token=."
             ) from error
 
-    def _welcome(self, patience: float) -> dict[str, Any]:
-        """Return what the service says about itself."""
+    def _receive_introduction(self, patience: float) -> dict[str, Any]:
+        """Return the service's description of itself."""
         frame = self.receive(patience)
         if frame.kind is Kind.ERROR:
             error = decode_error(frame.payload)
             self.close(str(error))
             raise error
-        told = self.decoded(frame) if frame.kind is Kind.SETUP else None
+        told = self.decode(frame) if frame.kind is Kind.SETUP else None
         if not isinstance(told, dict) or told.get("service") != SERVICE:
             raise RemoteError(
-                f"What listens at {self.name} serves no environments; it may be the server of a "
-                "run, for physx client."
+                f"{self.name} does not serve environments; it may be the server of a run, for "
+                "physx client."
             )
         if told.get("version") != VERSION:
             raise RemoteError(
@@ -138,15 +139,15 @@ class PhysxLink(Connection):
 
     @property
     def is_closed(self) -> bool:
-        """Whether nothing can be sent and received any more."""
+        """Whether the connection is closed."""
         return bool(self._why_closed)
 
     def send(self, message: bytes) -> None:
         """Send a message.
 
         Raises:
-            RemoteTimeoutError: The service does not take it in time.
-            RemoteClosedError: The connection has ended, or is closed already.
+            RemoteTimeoutError: If the service does not read it in time.
+            RemoteClosedError: If the connection has ended.
         """
         self._check_open()
         try:
@@ -173,12 +174,12 @@ class PhysxLink(Connection):
         """Return the next message.
 
         Args:
-            patience: How long to wait at most, in s; None: as long as an answer may take.
+            patience: How long to wait, in s; None: as long as an answer may take.
 
         Raises:
-            RemoteTimeoutError: There is none in time.
-            RemoteClosedError: The connection has ended, or is closed already.
-            RemoteProtocolError: It is none, or too long.
+            RemoteTimeoutError: If there is none in time.
+            RemoteClosedError: If the connection has ended.
+            RemoteProtocolError: If the message is not valid or too long.
         """
         frame = self.look(self.timeout if patience is None else patience)
         if frame is None:
@@ -189,11 +190,11 @@ class PhysxLink(Connection):
         """Return the next message, or None if there is none in time.
 
         Args:
-            patience: How long to wait, in s; None: for ever.
+            patience: How long to wait, in s; None: forever.
 
         Raises:
-            RemoteClosedError: The connection has ended, or is closed already.
-            RemoteProtocolError: It is none, or too long.
+            RemoteClosedError: If the connection has ended.
+            RemoteProtocolError: If the message is not valid or too long.
         """
         self._check_open()
         until, left = None, patience
@@ -218,12 +219,12 @@ class PhysxLink(Connection):
             self.close(f"{type(error).__name__} {error}".rstrip())
             raise
 
-    def decoded(self, frame: Frame) -> Any:
+    def decode(self, frame: Frame) -> Any:
         """Return the value in a message.
 
         Raises:
-            RemoteProtocolError: It is damaged; the connection is closed.
-            PhysxError: It is an error of the service, which is raised here.
+            RemoteProtocolError: If the message is damaged; the connection is closed.
+            PhysxError: If the message is an error of the service.
         """
         try:
             if frame.kind is not Kind.REFUSAL:
@@ -246,20 +247,20 @@ class PhysxLink(Connection):
         return RemoteClosedError(f"{self.name} ended the connection: {error}.")
 
 
-def _opened(address: tuple[str, int], role: int, patience: float) -> socket.socket:
-    """Return a connection; one that looks on keeps little of what was not read."""
+def _open_socket(address: tuple[str, int], role: int, patience: float) -> socket.socket:
+    """Return a connected socket; that of an observer buffers little unread data."""
     error: OSError = OSError("the host has no address")
     for family, kind, proto, _, place in socket.getaddrinfo(*address, type=socket.SOCK_STREAM):
-        opened = socket.socket(family, kind, proto)
+        connected = socket.socket(family, kind, proto)
         try:
             if role == OBSERVE:
-                opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BACKLOG)
-            opened.settimeout(patience)
-            opened.connect(place)
-            opened.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            return opened
+                connected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BACKLOG)
+            connected.settimeout(patience)
+            connected.connect(place)
+            connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return connected
         except OSError as failed:
-            opened.close()
+            connected.close()
             error = failed
     raise error
 

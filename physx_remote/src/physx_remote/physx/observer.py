@@ -1,10 +1,10 @@
-"""PhysxObserver: looks on while another client drives the worlds of a service."""
+"""PhysxObserver: observes the worlds of a service while another client drives them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from physx_core import Closeable
 from physx_core.errors import RemoteProtocolError
 from physx_core.net import Frame, Kind, pack_value, parse_address
 from physx_core.typing import Array
-from physx_remote.physx.client import introduced_leaves
+from physx_remote.physx.client import read_spaces
 from physx_remote.physx.link import PhysxLink
 from physx_remote.physx.wire import (
     COUNT,
@@ -22,23 +22,25 @@ from physx_remote.physx.wire import (
     TERMINATED,
     TRUNCATED,
     WORLDS,
-    infos_of,
+    split_infos,
 )
+from physx_remote.serving.connect_options import TokenOptions
+from physx_remote.serving.protocol import parse_address
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What became of some worlds. The arrays have a leading axis of these worlds.
+    """A change of some worlds. The arrays have a leading axis of these worlds.
 
     Attributes:
-        number: How many requests changed worlds until then; some may have been skipped.
+        number: How many requests have changed worlds so far, including skipped ones.
         worlds: Numbers of the worlds.
-        is_reset: Whether their episodes began just then.
-        observation: Value of the batched space of observations.
-        action: Likewise of the actions that were taken; None where it is not told.
+        is_reset: Whether their episodes began with this change.
+        observation: Value of the batched observation space.
+        action: Value of the batched action space; None after a reset, and in `PhysxObserver.last`.
         reward: Rewards.
-        terminated: Whether the episodes are terminated.
-        truncated: Whether they are truncated.
+        terminated: Whether each episode is terminated.
+        truncated: Whether each episode is truncated.
         infos: Info of each world.
     """
 
@@ -54,9 +56,9 @@ class Seen:
 
 
 class PhysxObserver(Closeable):
-    """Gets what the acting client's requests give. A context manager.
+    """Receives the outcomes of the acting client's requests. A context manager.
 
-    Who does not keep up loses what came in between and goes on with the present state of all
+    An observer that does not keep up skips outcomes and goes on with the latest state of all
     worlds.
 
     Attributes:
@@ -65,21 +67,20 @@ class PhysxObserver(Closeable):
         action_space: Space of one world's actions.
     """
 
-    def __init__(self, address: tuple[str, int] | str, **options: Any) -> None:
+    def __init__(self, address: tuple[str, int] | str, **options: Unpack[TokenOptions]) -> None:
         """Connect.
 
         Args:
             address: Host and port, or ``"host:port"``.
-            options: Those of `PhysxLink`: ``token``, ``token_file``, ``timeout``,
-                ``connect_timeout``, ``max_answer``.
+            options: See `TokenOptions`.
 
         Raises:
-            ConfigError: There is no token.
-            RemoteError: Nothing answers, or the tokens differ.
+            ConfigError: If no token is given.
+            RemoteError: If nothing answers, or the tokens differ.
         """
         place = parse_address(address) if isinstance(address, str) else address
         self._link = PhysxLink(place, OBSERVE, **options)
-        self._observations, self._actions = introduced_leaves(self._link.introduction)
+        self._observations, self._actions = read_spaces(self._link.introduction)
         self.observation_space = self._observations.space
         self.action_space = self._actions.space
         self.num_worlds = int(self._link.introduction["num_worlds"])
@@ -87,16 +88,16 @@ class PhysxObserver(Closeable):
         self._asked = 0
 
     def next(self, timeout: float | None = None) -> Seen | None:
-        """Wait for what happens next.
+        """Wait for the next change.
 
         Args:
-            timeout: How long to wait, in s; None: for ever.
+            timeout: How long to wait, in s; None: forever.
 
         Returns:
-            What happened, or None if nothing did in time.
+            The change, or None if there was none in time.
 
         Raises:
-            RemoteClosedError: The service has ended.
+            RemoteClosedError: If the service has ended.
         """
         while True:
             frame = self._link.look(timeout)
@@ -109,10 +110,10 @@ class PhysxObserver(Closeable):
             self._notes = frame
 
     def last(self) -> Seen:
-        """Return what is known of all worlds that have begun; what happened before is skipped.
+        """Return the latest state of all worlds that have begun; earlier changes are skipped.
 
         Raises:
-            RemoteError: The service has ended, or does not answer in time.
+            RemoteError: If the service has ended, or does not answer in time.
         """
         self._asked += 1
         self._link.send(pack_value(Kind.REQUEST, {"do": "last"}, "request", self._asked))
@@ -127,13 +128,13 @@ class PhysxObserver(Closeable):
         self._link.close()
 
     def _seen(self, frame: Frame) -> Seen:
-        arrays: Mapping[str, Any] = self._link.decoded(frame)
+        arrays: Mapping[str, Any] = self._link.decode(frame)
         notes, self._notes = self._notes, None
         try:
             worlds = arrays[WORLDS]
             infos: list[dict[str, Any]] = [{} for _ in worlds]
             if notes is not None and notes.number == frame.number:
-                infos, _ = infos_of(self._link.decoded(notes), len(worlds))
+                infos, _ = split_infos(self._link.decode(notes), len(worlds))
             names = self._actions.names
             has_actions = bool(names) and names[0] in arrays
             return Seen(
@@ -153,5 +154,5 @@ class PhysxObserver(Closeable):
     def _nonsense(self, frame: Frame) -> RemoteProtocolError:
         self.close()
         return RemoteProtocolError(
-            f"{self._link.name} sent a message {frame.kind.name} that says nothing to who looks on."
+            f"{self._link.name} sent a message {frame.kind.name} that is not for observers."
         )

@@ -1,27 +1,26 @@
-"""physx: authenticated, arrays as they are, several worlds on one connection, and onlookers."""
+"""Physx: authenticated, sends arrays unchanged, several worlds on one connection, observers."""
 
 from __future__ import annotations
 
 import secrets
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from physx_core.errors import ConfigError, UsageError
 from physx_core.net import MAX_PAYLOAD, checked_token, given_token
+from physx_remote.physx.client import PhysxClient, PhysxEnv
 from physx_remote.physx.service import PhysxService
+from physx_remote.physx.vector_env import PhysxVectorEnv
+from physx_remote.serving.connect_options import TokenOptions, check_names
 from physx_remote.serving.framing import MAX_REQUEST
 from physx_remote.serving.protocol import Protocol, Scene
 from physx_remote.serving.worlds import Worlds
 
-if TYPE_CHECKING:
-    from physx_remote.physx.client import PhysxEnv
-    from physx_remote.physx.vector_env import PhysxVectorEnv
-
 
 class Physx(Protocol):
-    """Serves worlds to one client that acts, and to any number that look on.
+    """Serves worlds to one client that acts, and to any number of observers.
 
-    Both sides prove that they know a token. What a client asks for is answered with the result, or
-    with the error and its traceback; the worlds live on, and stay as they are when a client leaves.
+    Both sides prove that they know a token. A request is answered with its result, or with the
+    error and its traceback; the worlds go on, and keep their state when a client leaves.
     """
 
     name: ClassVar[str] = "physx"
@@ -40,24 +39,23 @@ class Physx(Protocol):
         """Keep the options.
 
         Args:
-            token: What clients must know, at least 16 characters. None: what is in `token_file`;
-                without that what is in the environment variable ``PHYSX_TOKEN``; without that a
-                random one, `PhysxService.token`.
-            token_file: File that holds the token; readable by you alone.
+            token: Secret that clients must know, at least 16 characters. None: the content of
+                `token_file`, without that of the environment variable ``PHYSX_TOKEN``, and without
+                that a random one, `PhysxService.token`.
+            token_file: File that holds the token, readable by its owner alone.
             handshake_timeout: How long a client may take to prove that it knows the token, in s.
-            max_request: Longest request in bytes; who sends a longer one is closed.
-            max_clients: How many clients are connected at most; who comes then is closed at once.
+            max_request: Longest request in bytes; a client that sends a longer one is closed.
+            max_clients: How many clients may be connected; further ones are closed at once.
             max_snapshots: How many snapshots are kept at most.
-            options: None that are known.
+            options: Must be empty.
 
         Raises:
-            ConfigError: A value cannot be, or the file cannot be used.
+            ConfigError: If a value is out of range, or the file cannot be used.
+            UnknownOptionError: If the protocol does not have an option.
         """
         super().__init__(**options)
         if not handshake_timeout > 0:
-            raise ConfigError(
-                f"handshake_timeout is {handshake_timeout} but must be more than 0 s."
-            )
+            raise ConfigError(f"handshake_timeout is {handshake_timeout} but must be positive.")
         if not 1 <= max_request <= MAX_PAYLOAD:
             raise ConfigError(f"max_request is {max_request} but must be in 1 .. {MAX_PAYLOAD}.")
         for option, value in (("max_clients", max_clients), ("max_snapshots", max_snapshots)):
@@ -73,15 +71,15 @@ class Physx(Protocol):
         }
 
     def service(self, worlds: Worlds | Scene, *, address: str, port: int) -> PhysxService:
-        """Return a service that listens; see `Protocol.service`.
+        """Return a listening service; see `Protocol.service`.
 
         Raises:
-            UsageError: It is an `RLEnvironment`, or a space has no fixed layout.
-            RemoteError: It cannot listen there.
+            UsageError: If it is an `RLEnvironment`, or a space has no fixed layout.
+            RemoteError: If it cannot listen there.
         """
         if not isinstance(worlds, Worlds):
             raise UsageError(
-                f"{type(worlds).__name__} is an RLEnvironment, which has no spaces of its own: "
+                f"{type(worlds).__name__} is an RLEnvironment, which need not define spaces: "
                 'serve it with the protocol "godot-gym".'
             )
         service = PhysxService(worlds, self.token, **self._options)
@@ -100,11 +98,9 @@ class Physx(Protocol):
             host: Host of the service.
             port: Its port.
             world: Number of the world.
-            options: Those of `PhysxClient`.
+            options: See `TokenOptions`.
         """
-        from physx_remote.physx.client import PhysxClient, PhysxEnv
-
-        client = PhysxClient((host, port), **options)
+        client = cls._client(host, port, options, "world")
         try:
             return PhysxEnv(client, world)
         except BaseException:
@@ -121,14 +117,16 @@ class Physx(Protocol):
             host: Host of the service.
             port: Its port.
             autoreset_mode: What happens after the end of an episode: see `PhysxVectorEnv`.
-            options: Those of `PhysxClient`.
+            options: See `TokenOptions`.
         """
-        from physx_remote.physx.client import PhysxClient
-        from physx_remote.physx.vector_env import PhysxVectorEnv
-
-        client = PhysxClient((host, port), **options)
+        client = cls._client(host, port, options, "autoreset_mode")
         try:
             return PhysxVectorEnv(client, autoreset_mode=autoreset_mode)
         except BaseException:
             client.close()
             raise
+
+    @staticmethod
+    def _client(host: str, port: int, options: dict[str, Any], *own: str) -> PhysxClient:
+        check_names("A client of physx", options, [*own, *TokenOptions.__annotations__])
+        return PhysxClient((host, port), **options)

@@ -32,9 +32,9 @@ from physx_remote.physx.wire import (
     VERSION,
     WORLDS,
     PhysxReader,
-    encoded_infos,
+    encode_infos,
 )
-from physx_remote.physx.world_requests import Outcome, Requests, reported
+from physx_remote.physx.world_requests import Change, WorldRequests, wrap_error
 from physx_remote.serving.connection import Connection
 from physx_remote.serving.framing import Reader
 from physx_remote.serving.service import LOG
@@ -72,7 +72,7 @@ class PhysxService(SocketService):
         super().__init__(max_clients=max_clients)
         self.token = token
         self._worlds = worlds
-        self._requests = Requests(worlds, max_snapshots)
+        self._requests = WorldRequests(worlds, max_snapshots)
         self._introduction = self._introduced()
         self._timeout, self._max_request = handshake_timeout, max_request
         self._strangers: dict[Connection, ServerHandshake] = {}
@@ -231,27 +231,27 @@ class PhysxService(SocketService):
             return self._done(connection, number, self._requests.resets(request))
         if what == "restore":
             world = self._requests.restore(request)
-            self._tell(connection, number, Outcome([world], is_reset=True))
+            self._tell(connection, number, Change([world], is_reset=True))
             return None
         answer = self._requests.answer(what, request)
         self.send(connection, pack_value(Kind.ANSWER, answer, f'The answer to "{what}"', number))
         return None
 
-    def _done(self, connection: Connection, number: int, outcome: Outcome) -> Work:
+    def _done(self, connection: Connection, number: int, change: Change) -> Work:
         """Carry out what changes worlds, and answer."""
         try:
-            for wait in outcome.work:
+            for wait in change.work:
                 yield wait
                 if connection.closed:
                     LOG.info("%s left in the middle of a request", connection.name)
                     return
-            self._tell(connection, number, outcome)
+            self._tell(connection, number, change)
         except Exception as error:
             self._refuse(connection, number, error)
 
     def _refuse(self, connection: Connection, number: int, error: Exception) -> None:
         """Say what went wrong, here and to the client."""
-        told = error if isinstance(error, PhysxError) else reported(error)
+        told = error if isinstance(error, PhysxError) else wrap_error(error)
         is_own_fault = not isinstance(error, RequestError)
         LOG.error(
             "A request of %s failed: %s", connection.name, told,
@@ -261,21 +261,21 @@ class PhysxService(SocketService):
 
     # Answers --------------------------------------------------------------------------------
 
-    def _tell(self, connection: Connection, number: int, outcome: Outcome) -> None:
+    def _tell(self, connection: Connection, number: int, change: Change) -> None:
         """Answer with what became of worlds, and show it to those who look on."""
-        board = self._requests.board
-        rows = board.rows(outcome.worlds)
-        infos = [board.infos[world] for world in outcome.worlds]
-        notes = encoded_infos(infos) if any(infos) else b""
+        latest = self._requests.latest
+        rows = latest.rows(change.worlds)
+        infos = [latest.infos[world] for world in change.worlds]
+        notes = encode_infos(infos) if any(infos) else b""
         self.send(connection, *_message(Kind.ANSWER, number, notes, rows))
         self._seen += 1
         if not self._observers:
             return
         shown: dict[str, Array | np.generic] = {
-            WORLDS: np.array(outcome.worlds, np.int64),
-            IS_RESET: np.bool_(outcome.is_reset),
+            WORLDS: np.array(change.worlds, np.int64),
+            IS_RESET: np.bool_(change.is_reset),
             **rows,
-            **outcome.actions,
+            **change.actions,
         }
         message = b"".join(_message(Kind.SEEN, self._seen, notes, shown))
         for observer in [*self._observers]:
@@ -286,11 +286,11 @@ class PhysxService(SocketService):
 
     def _present(self, kind: Kind, number: int) -> bytes:
         """Return a message with what is known of all worlds."""
-        board = self._requests.board
-        worlds = np.flatnonzero(board.known)
-        rows = board.rows(worlds.tolist())
-        infos = [board.infos[world] for world in worlds]
-        notes = encoded_infos(infos) if any(infos) else b""
+        latest = self._requests.latest
+        worlds = np.flatnonzero(latest.known)
+        rows = latest.rows(worlds.tolist())
+        infos = [latest.infos[world] for world in worlds]
+        notes = encode_infos(infos) if any(infos) else b""
         shown: dict[str, Array | np.generic] = {
             WORLDS: worlds.astype(np.int64),
             IS_RESET: np.bool_(False),

@@ -33,13 +33,13 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any]):
                 ``"SameStep"`` or ``"Disabled"``, as in Gymnasium.
 
         Raises:
-            ConfigError: There is no such mode.
+            ConfigError: If the mode is unknown.
         """
         try:
             self._mode = AutoresetMode(autoreset_mode)
         except ValueError:
             known = ", ".join(f'"{mode.value}"' for mode in AutoresetMode)
-            raise ConfigError(f"autoreset_mode is {autoreset_mode!r}; there are {known}.") from None
+            raise ConfigError(f"autoreset_mode is {autoreset_mode!r}; known: {known}.") from None
         self.client = client
         self.num_envs = count = client.num_worlds
         self.single_observation_space = client.observations.space
@@ -62,12 +62,12 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any]):
 
         Args:
             seed: World i gets ``seed + i``; or a seed for each.
-            options: Handed to each world's `reset`, except for ``reset_mask``, shape (num_envs,):
-                which worlds are reset.
+            options: Passed to each world's `reset`, except for ``reset_mask``, shape (num_envs,):
+                which worlds to reset.
 
         Raises:
-            ConfigError: The number of seeds, or the mask, does not fit.
-            PhysxError: A world raised, or the service is gone or too late.
+            ConfigError: If the number of seeds or the mask does not fit the worlds.
+            PhysxError: If a world raises, or the service is gone or does not answer in time.
         """
         count = self.num_envs
         seeds = [seed + i for i in range(count)] if isinstance(seed, int) else seed
@@ -77,24 +77,24 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any]):
         if len(seeds) != count or mask.shape != (count,) or mask.dtype != np.bool_:
             raise ConfigError(
                 f"reset() of {count} worlds got {len(seeds)} seeds, and a mask of shape "
-                f"{mask.shape} and type {mask.dtype}: give one seed and one bool for each."
+                f"{mask.shape} and type {mask.dtype}: give one seed and one bool per world."
             )
         if not mask.any():
             raise ConfigError("reset_mask resets no world.")
         worlds = np.flatnonzero(mask).tolist()
         chosen = None if len(worlds) == count else worlds
-        rows = self.client.reset(
+        begun = self.client.reset(
             chosen, seeds=[seeds[world] for world in worlds], options=options or None
         )
         if chosen is None:
-            self._last = rows.arrays
+            self._last = begun.arrays
         elif not self._last:
-            raise ConfigError("The first reset() is of all worlds: give no reset_mask.")
+            raise ConfigError("The first reset() must be of all worlds: do not give a reset_mask.")
         else:
             self._last = {name: array.copy() for name, array in self._last.items()}
-            self._take(worlds, rows.arrays)
+            self._take(worlds, begun.arrays)
         self._over[worlds] = False
-        return self._observation(), self._infos(dict(zip(worlds, rows.infos, strict=True)))
+        return self._observation(), self._infos(dict(zip(worlds, begun.infos, strict=True)))
 
     def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Step all worlds.
@@ -104,19 +104,19 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any]):
 
         Returns:
             Observations, rewards, terminations, truncations, each with a leading axis of worlds,
-            and infos. The arrays are the caller's own.
+            and infos. The caller owns the arrays.
 
         Raises:
-            ActionError: The actions are not of the space's shape.
-            EpisodeError: An episode is over, and the mode is ``"Disabled"``.
-            PhysxError: A world raised, or the service is gone or too late.
+            ActionError: If the actions do not have the shapes or types of the space.
+            EpisodeError: If an episode is over and the mode is ``"Disabled"``.
+            PhysxError: If a world raises, or the service is gone or does not answer in time.
         """
-        arrays = self._arrays(actions)
+        arrays = self._stack(actions)
         if self._over.any():
             infos = self._step_some(arrays)
         else:
             self.client.ask_step(arrays, None)
-            self._last, found = self.client.rows(self.num_envs)
+            self._last, found = self.client.outcomes(self.num_envs)
             infos = dict(enumerate(found))
         self._over = self._last[TERMINATED] | self._last[TRUNCATED]
         outcome = self._last[REWARD], self._last[TERMINATED], self._last[TRUNCATED]
@@ -124,12 +124,12 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any]):
             self._reset_at_once(infos)
         return self._observation(), *outcome, self._infos(infos)
 
-    def _arrays(self, actions: Any) -> dict[str, Array]:
-        arrays = self.client.actions.stacked(actions)
+    def _stack(self, actions: Any) -> dict[str, Array]:
+        arrays = self.client.actions.stack(actions)
         for array in arrays.values():
             if len(array) != self.num_envs:
                 raise ActionError(
-                    f"There are {len(array)} actions for {self.num_envs} worlds: one for each."
+                    f"Got {len(array)} actions for {self.num_envs} worlds: give one per world."
                 )
         return arrays
 
@@ -147,18 +147,18 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any]):
         if len(others):
             part = {name: array[others] for name, array in arrays.items()}
             client.ask_step(part, others.astype(np.int64))
-        begun = client.rows(len(over), back=int(len(others) > 0))
+        begun = client.outcomes(len(over), back=int(len(others) > 0))
         self._last = {name: array.copy() for name, array in self._last.items()}
         self._take(over, begun.arrays)
         infos = dict(zip(over.tolist(), begun.infos, strict=True))
         if len(others):
-            stepped = client.rows(len(others))
+            stepped = client.outcomes(len(others))
             self._take(others, stepped.arrays)
             infos.update(zip(others.tolist(), stepped.infos, strict=True))
         return infos
 
     def _reset_at_once(self, infos: dict[int, dict[str, Any]]) -> None:
-        """Begin new episodes where they are over; the infos keep how they ended."""
+        """Begin new episodes where they are over; the infos keep the final transition."""
         over = np.flatnonzero(self._over).tolist()
         observations = self.client.observations
         before = self._last

@@ -1,4 +1,4 @@
-"""What a client of the protocol physx may have the worlds do."""
+"""WorldRequests: checks and carries out what a client of the protocol physx asks of the worlds."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ import numpy as np
 from physx_core import PhysxError
 from physx_core.errors import RequestError
 from physx_core.typing import Array
-from physx_remote.physx.board import Board
-from physx_remote.physx.wire import WORLDS, Leaves
+from physx_remote.physx.latest_state import LatestState
+from physx_remote.physx.space_arrays import SpaceArrays
+from physx_remote.physx.wire import WORLDS
 from physx_remote.serving.worlds import Worlds
 
 _SLICE = 0.02
 
 
 @dataclass
-class Outcome:
-    """Something that changes worlds; what became of them is on the board once it is done.
+class Change:
+    """A change of some worlds; `WorldRequests.latest` holds the result once the work is done.
 
     Attributes:
-        worlds: Which ones.
-        is_reset: Whether they begin anew.
-        work: Does it; yields, after a while, how long to leave it alone, in s.
-        actions: What they were given, as stacked arrays.
+        worlds: Numbers of the worlds.
+        is_reset: Whether their episodes begin.
+        work: Makes the change; yields now and then how long to wait before it goes on, in s.
+        actions: The actions of the worlds, as stacked arrays.
     """
 
     worlds: Sequence[int]
@@ -38,48 +39,51 @@ class Outcome:
     actions: Mapping[str, Array] = field(default_factory=dict)
 
 
-class Requests:
-    """Carries out requests, each checked before anything is done.
+class WorldRequests:
+    """Carries out requests, each checked before anything is changed.
 
     Attributes:
-        board: What became last of each world.
+        latest: The last transition of each world.
     """
 
     def __init__(self, worlds: Worlds, max_snapshots: int) -> None:
-        """Keep the worlds.
+        """Take the worlds.
 
         Raises:
-            UsageError: A space has no fixed layout.
+            UsageError: If a space has no fixed layout.
         """
         self._worlds = worlds
-        self._actions = Leaves(worlds.action_space, "action")
-        self.board = Board(Leaves(worlds.observation_space, "observation"), worlds.num_worlds)
+        self._actions = SpaceArrays(worlds.action_space, "action")
+        observations = SpaceArrays(worlds.observation_space, "observation")
+        self.latest = LatestState(observations, worlds.num_worlds)
         self._all = list(range(worlds.num_worlds))
         self._snapshots: dict[int, tuple[Any, dict[str, Array]]] = {}
         self._max_snapshots = max_snapshots
         self._numbers = itertools.count(1)
 
-    # Worlds that go on ------------------------------------------------------------------------
+    # Steps and resets -------------------------------------------------------------------------
 
-    def steps(self, arrays: dict[str, Any]) -> Outcome:
+    def steps(self, arrays: dict[str, Any]) -> Change:
         """Prepare a step of some worlds.
 
         Args:
-            arrays: The actions, and ``worlds`` with the worlds' numbers; without it all of them.
+            arrays: The actions, and ``worlds`` with the worlds' numbers; all worlds without it.
 
         Raises:
-            RequestError: There is no such world, or an action is not of the space.
+            RequestError: If a world does not exist, or an action is not in the space.
         """
         chosen = arrays.pop(WORLDS, None)
         worlds = self._all if chosen is None else self._chosen(chosen)
         if arrays.keys() != set(self._actions.names):
-            raise RequestError(f"Actions need the arrays {self._actions.names}, not {[*arrays]}.")
+            raise RequestError(
+                f"Actions must be the arrays {self._actions.names}, not {[*arrays]}."
+            )
         self._actions.check(arrays, len(worlds))
         rows = self._actions.rows(arrays, len(worlds))
-        return Outcome(worlds, False, self._stepped(worlds, rows), arrays)
+        return Change(worlds, False, self._step(worlds, rows), arrays)
 
-    def _stepped(self, worlds: Sequence[int], actions: Iterable[Any]) -> Iterator[float]:
-        step, put, begin = self._worlds.step, self.board.put, time.monotonic()
+    def _step(self, worlds: Sequence[int], actions: Iterable[Any]) -> Iterator[float]:
+        step, put, begin = self._worlds.step, self.latest.put, time.monotonic()
         with _Place("step") as place:
             for world, action in zip(worlds, actions, strict=True):
                 place.world = world
@@ -88,31 +92,31 @@ class Requests:
                     yield 0.0
                     begin = time.monotonic()
 
-    def resets(self, request: Mapping[str, Any]) -> Outcome:
+    def resets(self, request: Mapping[str, Any]) -> Change:
         """Prepare a new episode of some worlds.
 
         Args:
-            request: Any of ``worlds``, a list, ``seeds``, one for each of them or None, and
+            request: Any of ``worlds``, a list, ``seeds``, one or None for each of them, and
                 ``options``.
 
         Raises:
-            RequestError: There is no such world, or a value is none.
+            RequestError: If a world does not exist, or a value is not valid.
         """
         chosen = request.get("worlds")
         worlds = self._all if chosen is None else self._chosen(chosen)
         seeds = request.get("seeds")
         seeds = [None] * len(worlds) if seeds is None else seeds
         if not isinstance(seeds, list) or len(seeds) != len(worlds):
-            raise RequestError(f"{len(worlds)} worlds need as many seeds, and not {seeds!r:.100}.")
+            raise RequestError(f"{len(worlds)} worlds need as many seeds, not {seeds!r:.100}.")
         for seed in seeds:
             if seed is not None and (type(seed) is not int or seed < 0):
-                raise RequestError(f"A seed is a whole number of at least 0, not {seed!r:.60}.")
+                raise RequestError(f"A seed must be a non-negative integer, not {seed!r:.60}.")
         options = request.get("options")
         if options is not None and not isinstance(options, dict):
-            raise RequestError(f"Options of a reset are a dictionary, not {options!r:.60}.")
-        return Outcome(worlds, True, self._begun(worlds, seeds, options))
+            raise RequestError(f"Reset options must be a dictionary, not {options!r:.60}.")
+        return Change(worlds, True, self._reset(worlds, seeds, options))
 
-    def _begun(
+    def _reset(
         self, worlds: Sequence[int], seeds: Sequence[int | None], options: dict[str, Any] | None
     ) -> Iterator[float]:
         begin = time.monotonic()
@@ -120,7 +124,7 @@ class Requests:
             for world, seed in zip(worlds, seeds, strict=True):
                 place.world = world
                 observation, info = self._worlds.reset(world, seed, options)
-                self.board.put(world, (observation, 0.0, False, False, info))
+                self.latest.put(world, (observation, 0.0, False, False, info))
                 if time.monotonic() - begin > _SLICE:
                     yield 0.0
                     begin = time.monotonic()
@@ -128,21 +132,21 @@ class Requests:
     # Snapshots --------------------------------------------------------------------------------
 
     def restore(self, request: Mapping[str, Any]) -> int:
-        """Put a world back to a snapshot, of itself or of another world; return its number.
+        """Restore a snapshot, of any world, into a world; return the world's number.
 
         Raises:
-            RequestError: There is no such world or snapshot.
+            RequestError: If the world or the snapshot does not exist.
         """
         world, number = self._world(request), request.get("snapshot")
         if not isinstance(number, int) or number not in self._snapshots:
             raise RequestError(
-                f"There is no snapshot {number!r:.40}: snapshots are kept until they are "
-                "forgotten, or the client that took them leaves."
+                f"There is no snapshot {number!r:.40}: a snapshot is kept until it is forgotten or "
+                "the client that took it leaves."
             )
         state, rows = self._snapshots[number]
         with _Place("restore", world):
             self._worlds.restore(world, state)
-        self.board.paste(world, rows)
+        self.latest.paste(world, rows)
         return world
 
     def forget_snapshots(self) -> None:
@@ -150,10 +154,10 @@ class Requests:
         self._snapshots.clear()
 
     def answer(self, what: Any, request: Mapping[str, Any]) -> Any:
-        """Do what changes no world, and return the answer.
+        """Carry out a request that changes no world, and return the answer.
 
         Raises:
-            RequestError: There is no such request, or it cannot be carried out.
+            RequestError: If the request is unknown or cannot be carried out.
         """
         if what == "snapshot":
             return self._snapshot(self._world(request))
@@ -164,22 +168,21 @@ class Requests:
             with _Place("render", world):
                 return self._worlds.environments[world].render()
         raise RequestError(
-            f'There is no request "{what}". There are: reset, last, snapshot, restore, forget and '
-            "render."
+            f'Unknown request "{what}". Known: reset, last, snapshot, restore, forget, render.'
         )
 
     def _snapshot(self, world: int) -> int:
         if len(self._snapshots) >= self._max_snapshots:
             raise RequestError(
                 f"{self._max_snapshots} snapshots are kept already: forget some, or serve with a "
-                "greater max_snapshots."
+                "larger max_snapshots."
             )
-        if not self.board.known[world]:
-            raise RequestError(f"World {world} has not begun yet: reset it first.")
+        if not self.latest.known[world]:
+            raise RequestError(f"World {world} has not begun: reset it first.")
         with _Place("snapshot", world):
             state = self._worlds.snapshot(world)
         number = next(self._numbers)
-        self._snapshots[number] = (state, self.board.copy(world))
+        self._snapshots[number] = (state, self.latest.copy(world))
         return number
 
     # ------------------------------------------------------------------------------------------
@@ -188,36 +191,36 @@ class Requests:
         return self._chosen([request.get("world", 0)])[0]
 
     def _chosen(self, given: Any) -> list[int]:
-        """Return the numbers of worlds.
+        """Return numbers of worlds as a list.
 
         Raises:
-            RequestError: There is none, one does not exist, or one is named twice.
+            RequestError: If there is none, one does not exist, or one is named twice.
         """
         if isinstance(given, np.ndarray) and given.ndim == 1 and given.dtype.kind in "iu":
             given = given.tolist()
         count = len(self._all)
         is_list = isinstance(given, list) and len(given) > 0
-        if not is_list or not all(type(n) is int and 0 <= n < count for n in given):
-            is_list = False
-        if not is_list or len(set(given)) < len(given):
+        is_known = is_list and all(type(n) is int and 0 <= n < count for n in given)
+        if not is_known or len(set(given)) < len(given):
             raise RequestError(
-                f"Worlds are a list of different numbers from 0 to {count - 1}, not {given!r:.100}."
+                f"Worlds must be a list of distinct numbers from 0 to {count - 1}, not "
+                f"{given!r:.100}."
             )
         return list(given)
 
 
-def reported(error: Exception, place: str = "") -> RequestError:
-    """Return an error of somebody's code as one that clients know; the traceback stays with it."""
+def wrap_error(error: Exception, place: str = "") -> RequestError:
+    """Return an error of the environment's code as one that clients know, with its traceback."""
     told = RequestError(f"{place}{type(error).__name__}: {error}")
     told.__cause__ = error
     return told
 
 
 class _Place:
-    """A context in which errors say in which world they were.
+    """A context that adds the world to errors.
 
     Attributes:
-        world: Number of the world at work.
+        world: Number of the current world.
     """
 
     def __init__(self, what: str, world: int = 0) -> None:
@@ -234,6 +237,6 @@ class _Place:
         trace: TracebackType | None,
     ) -> None:
         if isinstance(error, PhysxError):
-            error.add_note(f"This was world {self.world} of the service, in {self._what}().")
+            error.add_note(f"World {self.world} of the service, in {self._what}().")
         elif isinstance(error, Exception):
-            raise reported(error, f"World {self.world} failed in {self._what}(): ") from error
+            raise wrap_error(error, f"World {self.world} failed in {self._what}(): ") from error

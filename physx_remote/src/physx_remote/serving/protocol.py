@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import typing
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib import import_module
-from inspect import Parameter, isabstract, signature
+from inspect import isabstract
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from physx_core.errors import ConfigError, RemoteError, UnknownOptionError, listed, nearest
@@ -115,19 +115,3 @@ def find_protocol(reference: str | type[Protocol]) -> type[Protocol]:
             "implements service()."
         )
     return found
-
-
-def check_options(owner: str, options: Mapping[str, Any], maker: Callable[..., Any]) -> None:
-    """Check that all options are keyword-only arguments of a function or class.
-
-    Raises:
-        UnknownOptionError: If one is not.
-    """
-    known = [
-        each.name
-        for each in signature(maker).parameters.values()
-        if each.kind is Parameter.KEYWORD_ONLY
-    ]
-    unknown = [name for name in options if name not in known]
-    if unknown:
-        raise UnknownOptionError(owner, unknown, known)

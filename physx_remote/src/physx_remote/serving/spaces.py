@@ -1,9 +1,11 @@
-"""Spaces of Gymnasium as plain data, and the values of nested spaces as lists of arrays."""
+"""Gymnasium spaces: their leaves, and spaces and values as plain data for JSON."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from functools import reduce
+from operator import getitem
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -14,15 +16,97 @@ from physx_core.typing import Array
 
 Space: TypeAlias = spaces.Space[Any]
 Leaf: TypeAlias = spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete
+Path: TypeAlias = tuple[Any, ...]
 
 KINDS = "Box, Discrete, MultiBinary, MultiDiscrete, Dict and Tuple"
+
+
+class SpaceTree:
+    """A space as a sequence of leaves: of the parts that have no parts themselves.
+
+    Attributes:
+        space: The space.
+        paths: The keys that lead to each leaf; ``()`` for a space without parts.
+        leaves: The leaves, in the order of the space.
+    """
+
+    def __init__(self, space: Space) -> None:
+        """Find the leaves.
+
+        Raises:
+            UsageError: If the values of a part have no fixed shape.
+        """
+        found = list(_leaves(space))
+        self.space = space
+        self.paths: list[Path] = [path for path, _ in found]
+        self.leaves: list[Leaf] = [leaf for _, leaf in found]
+
+    def split(self, value: Any) -> list[Any]:
+        """Return the leaves' values in a value of the space.
+
+        Raises:
+            LookupError or TypeError: If the value has another structure.
+        """
+        return [reduce(getitem, path, value) for path in self.paths]
+
+    def join(self, values: Iterable[Any]) -> Any:
+        """Return the value of the space whose leaves have these values."""
+        return _join(self.space, iter(values))
+
+
+def _leaves(space: Space) -> Iterator[tuple[Path, Leaf]]:
+    parts: Iterator[tuple[Any, Space]] | None = None
+    if isinstance(space, spaces.Dict):
+        parts = iter(space.items())
+    elif isinstance(space, spaces.Tuple):
+        parts = enumerate(space)
+    if parts is not None:
+        for key, part in parts:
+            for path, leaf in _leaves(part):
+                yield (key, *path), leaf
+    elif isinstance(space, Leaf):
+        yield (), space
+    else:
+        raise _no_layout(space)
+
+
+def _join(space: Space, values: Iterator[Any]) -> Any:
+    if isinstance(space, spaces.Dict):
+        return {name: _join(part, values) for name, part in space.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(_join(part, values) for part in space)
+    return next(values)
+
+
+def _no_layout(space: Space) -> UsageError:
+    return UsageError(f"{space} has no fixed layout: only {KINDS} can be served.")
+
+
+def cast_exactly(value: Any, dtype: np.dtype[Any]) -> Array:
+    """Return numbers as an array of a type; some programs send whole numbers as 1.0.
+
+    Raises:
+        ValueError: If these are not numbers, or the type cannot hold one of them.
+    """
+    array = np.asarray(value)
+    if array.dtype == dtype:
+        return array
+    if array.dtype.kind not in "biuf":
+        raise ValueError("these are not numbers")
+    typed = array.astype(dtype)
+    if dtype.kind in "biu" and not (typed == array).all():
+        raise ValueError(f"{dtype} cannot hold these numbers")
+    return typed
+
+
+# Plain data for JSON ---------------------------------------------------------------------------
 
 
 def describe_space(space: Space) -> dict[str, Any]:
     """Return a space as plain data for JSON.
 
     Raises:
-        UsageError: It is a space whose values have no fixed shape.
+        UsageError: If its values have no fixed shape.
     """
     kind = type(space).__name__
     match space:
@@ -42,24 +126,24 @@ def describe_space(space: Space) -> dict[str, Any]:
             return {"kind": kind, "spaces": {k: describe_space(s) for k, s in space.items()}}
         case spaces.Tuple():
             return {"kind": kind, "spaces": [describe_space(part) for part in space]}
-    raise UsageError(f"{space} has no fixed layout: only {KINDS} can be driven from elsewhere.")
+    raise _no_layout(space)
 
 
 def build_space(plain: Mapping[str, Any]) -> Space:
-    """Return the space that `describe_space` described.
+    """Return the space that a description of `describe_space` stands for.
 
     Raises:
-        RemoteProtocolError: It is no such description.
+        RemoteProtocolError: If the description is not valid.
     """
     try:
-        return _built(plain)
+        return _build(plain)
     except (KeyError, TypeError, ValueError, AssertionError, AttributeError) as error:
         raise RemoteProtocolError(
-            f"The other side described a space as {plain!r:.200}, which is none: {error!r}."
+            f"The other side sent an invalid description of a space, {plain!r:.200}: {error!r}."
         ) from error
 
 
-def _built(plain: Mapping[str, Any]) -> Space:
+def _build(plain: Mapping[str, Any]) -> Space:
     match plain["kind"]:
         case "Box":
             shape, dtype = tuple(plain["shape"]), np.dtype(plain["dtype"])
@@ -73,15 +157,15 @@ def _built(plain: Mapping[str, Any]) -> Space:
             dtype = np.dtype(plain["dtype"]).type
             return spaces.MultiDiscrete(plain["nvec"], dtype=dtype, start=plain["start"])
         case "Dict":
-            parts = [(name, _built(part)) for name, part in plain["spaces"].items()]
+            parts = [(name, _build(part)) for name, part in plain["spaces"].items()]
             return spaces.Dict(parts)  # a dictionary would be sorted
         case "Tuple":
-            return spaces.Tuple([_built(part) for part in plain["spaces"]])
-    raise ValueError(f"there is no kind {plain['kind']!r}")
+            return spaces.Tuple([_build(part) for part in plain["spaces"]])
+    raise ValueError(f"unknown kind {plain['kind']!r}")
 
 
 def _bounds(array: Array) -> Any:
-    """Return bounds as one number where all are the same, infinite ones as texts."""
+    """Return bounds as one number if all are the same; infinite ones become strings."""
     flat = array.ravel()
     if flat.size and (flat == flat[0]).all():
         return _number(flat[0].item())
@@ -98,39 +182,8 @@ def _limits(plain: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
     return np.array(values, dtype).reshape(shape)
 
 
-def leaves(space: Space) -> Iterator[tuple[tuple[Any, ...], Leaf]]:
-    """Yield the parts of a space that have none themselves, with the keys that lead to them.
-
-    Raises:
-        UsageError: A part is a space whose values have no fixed shape.
-    """
-    parts: Iterator[tuple[Any, Space]] | None = None
-    if isinstance(space, spaces.Dict):
-        parts = iter(space.items())
-    elif isinstance(space, spaces.Tuple):
-        parts = enumerate(space)
-    if parts is not None:
-        for key, part in parts:
-            for path, leaf in leaves(part):
-                yield (key, *path), leaf
-        return
-    plain = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
-    if not isinstance(space, plain):
-        raise UsageError(f"{space} has no fixed layout: only {KINDS} can be driven from elsewhere.")
-    yield (), space
-
-
-def join(space: Space, values: Iterator[Any]) -> Any:
-    """Return a value of a space, made from the values of its leaves in their order."""
-    if isinstance(space, spaces.Dict):
-        return {name: join(part, values) for name, part in space.items()}
-    if isinstance(space, spaces.Tuple):
-        return tuple(join(part, values) for part in space)
-    return next(values)
-
-
 def to_json(space: Space, value: Any) -> Any:
-    """Return a value of a space as plain data for JSON, without loss."""
+    """Return a value of any space as plain data for JSON, without loss."""
     if isinstance(space, spaces.Dict):
         return {name: to_json(part, value[name]) for name, part in space.items()}
     if isinstance(space, spaces.Tuple):
@@ -139,10 +192,10 @@ def to_json(space: Space, value: Any) -> Any:
 
 
 def from_json(space: Space, plain: Any, place: str = "The action") -> Any:
-    """Return the value of a space that plain data of JSON stand for.
+    """Return the value of a space that JSON data stand for.
 
     Raises:
-        RequestError: They have another structure or shape.
+        RequestError: If they do not have the structure, shape or type of the space.
     """
     try:
         if isinstance(space, spaces.Dict):
@@ -150,22 +203,9 @@ def from_json(space: Space, plain: Any, place: str = "The action") -> Any:
         if isinstance(space, spaces.Tuple):
             parts = zip(space, plain, strict=True)
             return tuple(from_json(s, p, f"{place}[{i}]") for i, (s, p) in enumerate(parts))
-        value = _numbers(plain, np.dtype(space.dtype))
+        value = cast_exactly(plain, np.dtype(space.dtype))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise RequestError(f"{place} is of {space}, not {plain!r:.100}: {error!r}.") from None
+        raise RequestError(f"{place} must be in {space}, not {plain!r:.100}: {error!r}.") from None
     if value.shape != (space.shape or ()):
-        raise RequestError(
-            f"{place} has the shape {value.shape}, and {space} has the shape {space.shape}."
-        )
+        raise RequestError(f"{place} has shape {value.shape}, but {space} has shape {space.shape}.")
     return value.dtype.type(value) if isinstance(space, spaces.Discrete) else value
-
-
-def _numbers(plain: Any, dtype: np.dtype[Any]) -> Array:
-    """Return numbers in the type of a space; some programs send whole numbers as 1.0."""
-    given = np.array(plain)
-    if given.dtype.kind not in "biuf" and given.size:
-        raise ValueError("these are no numbers")
-    value = given.astype(dtype)
-    if dtype.kind in "iu" and given.dtype.kind == "f" and not (given == value).all():
-        raise ValueError("these are no whole numbers")
-    return value

@@ -1,4 +1,4 @@
-"""Board: what became last of each world, as arrays that can be sent as they are."""
+"""LatestState: the last transition of each world, as arrays that can be sent as they are."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ import numpy as np
 
 from physx_core.errors import RemoteError
 from physx_core.typing import Array
-from physx_remote.physx.wire import REWARD, TERMINATED, TRUNCATED, Leaves
+from physx_remote.physx.space_arrays import SpaceArrays
+from physx_remote.physx.wire import REWARD, TERMINATED, TRUNCATED
 from physx_remote.serving.worlds import Transition
 
 
-class Board:
-    """The last observation, reward and end of each world.
+class LatestState:
+    """The last observation, reward, end and info of each world.
 
     Attributes:
         arrays: The arrays by name, each with a leading axis of worlds.
-        known: Which worlds have an observation yet, shape (worlds,).
+        known: Which worlds have an observation, shape (worlds,).
         infos: The last info of each world.
     """
 
-    def __init__(self, observations: Leaves, count: int) -> None:
-        """Make room for so many worlds."""
+    def __init__(self, observations: SpaceArrays, count: int) -> None:
+        """Allocate the arrays of `count` worlds."""
         self._observations = observations
         self._reward = np.zeros(count)
         self._terminated, self._truncated = np.zeros((2, count), np.bool_)
@@ -39,17 +40,17 @@ class Board:
         self.infos: list[dict[str, Any]] = [{} for _ in range(count)]
 
     def put(self, world: int, transition: Transition) -> None:
-        """Note what became of a world.
+        """Keep the transition of a world.
 
         Raises:
-            RemoteError: The observation is none of the environment's own space.
+            RemoteError: If the observation is not in the environment's own space.
         """
         observation, reward, terminated, truncated, info = transition
         try:
             self._observations.put(self._parts, world, observation)
         except (ValueError, TypeError, LookupError) as error:
             raise RemoteError(
-                f"The observation {observation!r:.200} is none of the environment's own space "
+                f"The observation {observation!r:.200} is not in the environment's own space "
                 f"{self._observations.space}: {error}."
             ) from error
         self._reward[world] = reward
@@ -58,7 +59,7 @@ class Board:
         self.known[world] = True
 
     def rows(self, worlds: Sequence[int]) -> dict[str, Array]:
-        """Return the arrays' rows of some worlds, where it is all of them the arrays themselves."""
+        """Return the rows of some worlds; the arrays themselves if it is all of them."""
         if len(worlds) == len(self.known) and worlds == [*range(len(worlds))]:
             return self.arrays
         if len(worlds) == 1:
@@ -72,7 +73,7 @@ class Board:
         return {name: array[world].copy() for name, array in self.arrays.items()}
 
     def paste(self, world: int, rows: dict[str, Array]) -> None:
-        """Put back what `copy` returned."""
+        """Set a world's rows to those that `copy` returned."""
         for name, value in rows.items():
             self.arrays[name][world] = value
         self.known[world], self.infos[world] = True, {}

@@ -1,4 +1,4 @@
-"""Plain data: what of a value JSON can hold."""
+"""Conversion of any value to data for JSON."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ _KINDS = "biuf"
 _DEEPEST = 32
 
 
-def plain(value: Any, depth: int = 0) -> Any:
-    """Return a value as data for JSON.
+def to_json_data(value: Any, depth: int = 0) -> Any:
+    """Return the part of a value that JSON can hold.
 
-    Arrays become lists. What JSON has nothing for is left out of dictionaries, and is None anywhere
-    else. Numbers that are not finite stay as they are.
+    Arrays become lists. Other values are left out of dictionaries, and are None anywhere else.
+    Numbers that are not finite stay as they are.
     """
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
@@ -23,8 +23,8 @@ def plain(value: Any, depth: int = 0) -> Any:
     if depth >= _DEEPEST:
         return None
     if isinstance(value, dict):
-        items = ((str(key), item, plain(item, depth + 1)) for key, item in value.items())
+        items = ((str(key), item, to_json_data(item, depth + 1)) for key, item in value.items())
         return {key: data for key, item, data in items if data is not None or item is None}
     if isinstance(value, (list, tuple)):
-        return [plain(item, depth + 1) for item in value]
+        return [to_json_data(item, depth + 1) for item in value]
     return None

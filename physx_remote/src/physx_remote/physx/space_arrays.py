@@ -1,0 +1,111 @@
+"""SpaceArrays: the values that several worlds have in a space, as one array for each leaf."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from physx_core.errors import ActionError, RequestError
+from physx_core.typing import Array
+from physx_remote.serving.spaces import Space, SpaceTree, cast_exactly
+
+
+class SpaceArrays(SpaceTree):
+    """A space whose leaves are arrays, each with a leading axis of worlds.
+
+    Attributes:
+        names: Names of the arrays.
+    """
+
+    def __init__(self, space: Space, prefix: str) -> None:
+        """Find the leaves.
+
+        Args:
+            space: Space of one world's values.
+            prefix: What the arrays' names begin with.
+
+        Raises:
+            UsageError: If the values of a part have no fixed shape.
+        """
+        super().__init__(space)
+        self.names = [f"{prefix}{number}" for number in range(len(self.leaves))]
+        self._dtypes = [np.dtype(leaf.dtype) for leaf in self.leaves]
+        self._shapes = [tuple(leaf.shape or ()) for leaf in self.leaves]
+        self._is_discrete = [isinstance(leaf, spaces.Discrete) for leaf in self.leaves]
+        self._has_one_array = self.paths == [()] and (self._shapes[0] != () or self._is_discrete[0])
+
+    def zeros(self, count: int) -> dict[str, Array]:
+        """Return arrays of zeros for `count` worlds."""
+        parts = zip(self.names, self._shapes, self._dtypes, strict=True)
+        return {name: np.zeros((count, *shape), dtype) for name, shape, dtype in parts}
+
+    def put(self, arrays: Sequence[Array], row: int, value: Any) -> None:
+        """Write one world's value into a row of the arrays; shapes are not broadcast.
+
+        Raises:
+            ValueError, LookupError or TypeError: If the value is not in the space.
+        """
+        for array, part in zip(arrays, self.split(value), strict=True):
+            if np.shape(part) != array.shape[1:]:
+                raise ValueError(f"it has shape {np.shape(part)}, not {array.shape[1:]}")
+            array[row] = part
+
+    def check(self, arrays: Mapping[str, Any], count: int) -> None:
+        """Check received arrays of `count` worlds.
+
+        Raises:
+            RequestError: If one is missing, or has another type or shape.
+        """
+        for name, shape, dtype in zip(self.names, self._shapes, self._dtypes, strict=True):
+            array = arrays.get(name)
+            if not isinstance(array, np.ndarray):
+                raise RequestError(f"The actions lack the array {name} of {self.space}.")
+            if array.dtype != dtype or array.shape != (count, *shape):
+                raise RequestError(
+                    f"The array {name} has type {array.dtype} and shape {array.shape}, not {dtype} "
+                    f"and {(count, *shape)}: {count} worlds with actions in {self.space}."
+                )
+
+    def rows(self, arrays: Mapping[str, Array], count: int) -> list[Any]:
+        """Return the value of each of `count` worlds: views of the arrays."""
+        if self._has_one_array:
+            return list(arrays[self.names[0]])
+        return [self.row(arrays, row) for row in range(count)]
+
+    def batch(self, arrays: Mapping[str, Array]) -> Any:
+        """Return the worlds' values as one value of Gymnasium's batched space."""
+        return self.join(arrays[name] for name in self.names)
+
+    def row(self, arrays: Mapping[str, Array], row: int) -> Any:
+        """Return one world's value: views of the arrays."""
+        parts = zip(self.names, self._is_discrete, strict=True)
+        return self.join(arrays[n][row] if scalar else arrays[n][row, ...] for n, scalar in parts)
+
+    def stack(self, value: Any, *, one: bool = False) -> dict[str, Array]:
+        """Return the arrays of a batch of values, or of one value.
+
+        Args:
+            value: Value of Gymnasium's batched space, or of the space itself.
+            one: Whether it is the value of one world.
+
+        Raises:
+            ActionError: If it does not have the structure, shapes or types of the space.
+        """
+        try:
+            pairs = zip(self.split(value), self._dtypes, strict=True)
+            parts = [cast_exactly(part, dtype) for part, dtype in pairs]
+        except (TypeError, ValueError, LookupError, OverflowError) as error:
+            raise ActionError(f"{value!r:.200} is not in {self.space}: {error!r}.") from error
+        arrays = {}
+        for name, array, leaf, shape in zip(
+            self.names, parts, self.leaves, self._shapes, strict=True
+        ):
+            arrays[name] = array[None] if one else array
+            if arrays[name].shape[1:] != shape:
+                raise ActionError(
+                    f"An action has shape {arrays[name].shape[1:]}, but {leaf} has shape {shape}."
+                )
+        return arrays
