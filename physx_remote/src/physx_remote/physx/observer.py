@@ -25,7 +25,6 @@ from physx_remote.physx.wire import (
     split_infos,
 )
 from physx_remote.serving.connect_options import TokenOptions
-from physx_remote.serving.protocol import parse_address
 
 
 @dataclass(frozen=True)
