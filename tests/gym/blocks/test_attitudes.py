@@ -1,4 +1,4 @@
-"""Attitudes: the filter's mathematics against turns that are known exactly."""
+"""The filter's mathematics, compared with rotations that are known exactly."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def angle(a, b):
     return 2 * np.arccos(np.minimum(dot, 1.0))
 
 
-def test_one_and_many_agree():
+def test_the_scalar_and_the_array_form_agree():
     rng = np.random.default_rng(1)
     states = np.concatenate([quaternions(5), rng.normal(size=(5, 9))], axis=1)
     measured = np.concatenate([rng.normal(size=(5, 3)), 6 * rng.normal(size=(5, 3))], axis=1)
@@ -36,26 +36,26 @@ def test_one_and_many_agree():
     measured[4, 3:] = 0.0  # weightless
     for _ in range(20):
         alone = [
-            mahony.advanced(row.tolist(), seen.tolist(), mahony.Gains.of(1.3, 0.2, DT, 9.81))
+            mahony.advance(row.tolist(), seen.tolist(), mahony.Gains.of(1.3, 0.2, DT, 9.81))
             for row, seen in zip(states, measured, strict=True)
         ]
-        states = mahony.advanced_rows(states, measured, mahony.Gains.of(1.3, 0.2, DT, 9.81))
+        states = mahony.advance_rows(states, measured, mahony.Gains.of(1.3, 0.2, DT, 9.81))
         np.testing.assert_allclose(states, alone, rtol=0, atol=1e-13)
 
 
-def test_follows_a_turn_exactly_without_gains():
+def test_follows_a_rotation_exactly_without_gains():
     rate = np.array([0.7, -1.1, 0.4])
     begin = quaternions(1)[0]
     state = [*begin, *rate, 0, 0, 0, *rate]
     for _ in range(400):
-        state = mahony.advanced(state, [*rate, 0, 0, 0], mahony.Gains.of(0.0, 0.0, DT, 9.81))
+        state = mahony.advance(state, [*rate, 0, 0, 0], mahony.Gains.of(0.0, 0.0, DT, 9.81))
     end = multiply_rows(begin, from_rotation_vector_rows(400 * DT * rate))
     assert angle(end, np.array(state[:4])) < 1e-7
 
 
-def test_fast_turns_are_exact_too():
+def test_fast_rotations_are_exact_too():
     rate = np.array([150.0, -200.0, 90.0])
-    state = mahony.advanced(
+    state = mahony.advance(
         [0, 0, 0, 1.0, *rate, 0, 0, 0, *rate], [*rate, 0, 0, 0], mahony.Gains.of(0, 0, DT, 9.81)
     )
     assert angle(from_rotation_vector_rows(DT * rate), np.array(state[:4])) < 1e-7
@@ -67,7 +67,7 @@ def test_finds_up_and_bias_from_acceleration():
     bias = np.array([0.02, -0.01, 0.03])
     state = [0.0, 0.0, 0.0, 1.0, *bias, 0, 0, 0, *bias]
     for _ in range(int(120 / DT)):
-        state = mahony.advanced(state, [*bias, *seen], mahony.Gains.of(1.0, 0.1, DT, 9.81))
+        state = mahony.advance(state, [*bias, *seen], mahony.Gains.of(1.0, 0.1, DT, 9.81))
     found = rotate_back_rows(np.array(state[:4]), UP)
     np.testing.assert_allclose(found, seen / 9.81, atol=1e-3)
     across = bias - np.dot(bias, found) * found  # a bias about the vertical cannot be seen
@@ -76,29 +76,29 @@ def test_finds_up_and_bias_from_acceleration():
 
 
 @pytest.mark.parametrize(("size", "share"), [(1.0, 1.0), (1.1, 0.58), (0.9, 0.62), (1.3, 0.0)])
-def test_accelerations_count_as_far_as_they_have_the_size_of_gravity(size, share):
+def test_accelerations_are_weighted_by_how_close_to_gravity_they_are(size, share):
     still = [0.0, 0.0, 0.0, 1.0, *[0.0] * 9]
     seen = 9.81 * np.array([0.1, 0.0, 0.99**0.5])
-    moved = mahony.advanced(still, [0, 0, 0, *(size * seen)], mahony.Gains.of(1.0, 0, DT, 9.81))
-    full = mahony.advanced(still, [0, 0, 0, *seen], mahony.Gains.of(1.0, 0, DT, 9.81))
+    moved = mahony.advance(still, [0, 0, 0, *(size * seen)], mahony.Gains.of(1.0, 0, DT, 9.81))
+    full = mahony.advance(still, [0, 0, 0, *seen], mahony.Gains.of(1.0, 0, DT, 9.81))
     assert abs(moved[1] / full[1] - share) < 1e-3
     np.testing.assert_allclose(full[1], -0.5 * DT * 0.1, rtol=1e-3)
 
 
-def test_upright_has_no_twist():
+def test_the_attitude_from_gravity_has_no_twist():
     for truth in quaternions(20):
-        found = np.array(mahony.upright(*(9.81 * rotate_back_rows(truth, UP))))
+        found = np.array(mahony.attitude_from_gravity(*(9.81 * rotate_back_rows(truth, UP))))
         np.testing.assert_allclose(
             rotate_back_rows(found, UP), rotate_back_rows(truth, UP), atol=1e-12
         )
         assert found[2] == 0.0
-    assert mahony.upright(0.0, 0.0, -9.81) == (1.0, 0.0, 0.0, 0.0)
-    assert mahony.upright(0.0, 0.0, 0.0) == (0.0, 0.0, 0.0, 1.0)
+    assert mahony.attitude_from_gravity(0.0, 0.0, -9.81) == (1.0, 0.0, 0.0, 0.0)
+    assert mahony.attitude_from_gravity(0.0, 0.0, 0.0) == (0.0, 0.0, 0.0, 1.0)
 
 
-def test_without_twist_keeps_up_where_it_was():
+def test_removing_the_twist_keeps_up():
     for truth in quaternions(20):
-        found = np.array(mahony.without_twist(*truth))
+        found = np.array(mahony.remove_twist(*truth))
         np.testing.assert_allclose(np.linalg.norm(found), 1.0)
         np.testing.assert_allclose(
             rotate_back_rows(found, UP), rotate_back_rows(truth, UP), atol=1e-12

@@ -1,4 +1,4 @@
-"""Controllers: targets, torques, safety; alone and on running robots."""
+"""Controllers: targets, torques and safety, alone and on running robots."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_targets_are_consistent_and_within_limits(backend):
     np.testing.assert_allclose(pd.lower, pd.joints.lower + 0.05)
 
 
-def test_torque_is_that_of_the_formula_and_cut():
+def test_torques_follow_the_formula_and_are_clipped():
     env = with_pd(RobotEnv(simulator(), DT), kp=800.0, kd=0.01)
     rng = np.random.default_rng(1)
     cut = free = 0
@@ -122,13 +122,13 @@ def test_standing_comes_to_rest(backend):
     assert env.robot_state.q[2] > 0.2
 
 
-def test_default_acceleration_turns_the_highest_velocity_around_in_a_step():
+def test_the_default_acceleration_reverses_the_highest_velocity_in_a_step():
     env = RobotEnv(simulator(), 0.02)
     pd = PDController("pd", env, kp=1.0, kd=0.0)
     np.testing.assert_allclose(pd.action_space.high, 2 * 20.0 / 0.02)
 
 
-def test_what_a_pd_controller_needs():
+def test_requirements_of_a_pd_controller():
     env = RobotEnv(simulator(), 0.02)
     with pytest.raises(ConfigError, match="kp is -1"):
         PDController("pd", env, kp=-1.0, kd=0.0)
@@ -147,7 +147,7 @@ def test_what_a_pd_controller_needs():
     world = World([Robot("double_pendulum")])
     motors = [Motor(joint="shoulder", max_torque=1.0)]
     endless = RobotEnv(Simulator(world, motors=motors), 0.02)
-    with pytest.raises(ConfigError, match="have no limit"):
+    with pytest.raises(ConfigError, match="are not limited"):
         PDController("pd", endless, kp=1.0, kd=0.0)
 
 
@@ -178,7 +178,7 @@ def test_targets_go_to_positions(instantaneous):
 
 
 @pytest.mark.parametrize("instantaneous", [False, True])
-def test_targets_take_up_velocities(instantaneous):
+def test_targets_reach_velocities(instantaneous):
     env = adapted(1, is_instantaneous=instantaneous)
     env.reset(seed=0)
     targets = env.env.controller.targets
@@ -211,7 +211,7 @@ def test_deadband():
 
 def test_an_adapter_goes_on_a_pd_controller():
     env = RobotEnv(simulator(), 0.02)
-    with pytest.raises(ConfigError, match="right on a ControlledEnv with a PDController"):
+    with pytest.raises(ConfigError, match="directly on a ControlledEnv with a PDController"):
         PDAdapter("adapter", env)
     with pytest.raises(ConfigError, match="order is 2"):
         PDAdapter("adapter", with_pd(env), order=2)
@@ -220,7 +220,7 @@ def test_an_adapter_goes_on_a_pd_controller():
 # Safety --------------------------------------------------------------------------------------
 
 
-def test_safety_keeps_soft_limits():
+def test_the_safety_limit_keeps_joints_within_soft_limits():
     env = RobotEnv(simulator(control_period=1e-3), 0.01)
     safety = MotorSafetyLimit(
         "safety", env, kp=10.0, kd=4.0, soft_position_margin=0.1, soft_velocity_max=6.0
@@ -247,7 +247,7 @@ def test_safety_keeps_soft_limits():
 
 @pytest.mark.parametrize("fastest", [np.inf, 3.0])
 @pytest.mark.parametrize("ratio", [1.0, -4.0])
-def test_safety_is_that_of_the_formula(fastest, ratio):
+def test_the_safety_limit_follows_the_formula(fastest, ratio):
     joints = simulator().layout.joints
     motors = [Motor(joint=name, reduction=ratio) for name in joints]
     env = RobotEnv(simulator(motors=motors), DT)

@@ -1,4 +1,4 @@
-"""Observers on running robots, against what the simulation knows."""
+"""Observers on running robots, compared with the true state of the simulation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TILTED = (0.1, -0.2, 0.3, 0.927361849549570)
 
 
 class Standing(RobotEnv):
-    """The A1 on its feet, turned about the vertical."""
+    """The A1 on its feet, rotated about the vertical."""
 
     def _neutral(self):
         found = np.array(super()._neutral())
@@ -108,7 +108,7 @@ def test_links_between_encoders():
         np.testing.assert_allclose(seen["angular_velocity"].T, rates, atol=0.05)
 
 
-def test_each_link_takes_the_nearest_of_several_imus():
+def test_each_link_uses_the_nearest_of_several_imus():
     imus = [
         Imu(name="trunk", body="base", rotation=TILTED),
         Imu(name="calf", body="FL_calf", rotation=TILTED),
@@ -123,7 +123,7 @@ def test_each_link_takes_the_nearest_of_several_imus():
         assert turn_between(seen[1], truth[1]) < 3e-2  # a calf is shaken by its foot
 
 
-def test_several_imus_are_filtered_as_one():
+def test_several_imus_are_filtered_like_one():
     one = walker(sensors=[*encoders(), Imu(name="a", body="base")])
     two = walker(sensors=[*encoders(), Imu(name="a", body="base"), Imu(name="b", body="base")])
     for first, second in zip(swaying(one, 10, 1.0), swaying(two, 10, 1.0), strict=True):
@@ -147,7 +147,7 @@ def test_begin_without_orientation_and_without_twist():
     )
 
 
-def test_bias_of_the_gyroscope_is_found():
+def test_the_bias_of_the_gyroscope_is_estimated():
     imu = Imu(name="trunk", body="base", bias={"angular_velocity": [0.05, 0.0, 0.0]})
     env = walker(sensors=[*encoders(), imu], filtered={"kp": 2.0, "ki": 1.0})
     observed, _ = env.reset(seed=0)
@@ -175,7 +175,7 @@ def test_quantities_as_features():
         )
 
 
-def test_what_observers_need():
+def test_requirements_of_observers():
     layout = Simulator.build("ant").layout
     base = RobotEnv(Simulator.build("ant", ground=None), 0.02)
     with pytest.raises(ConfigError, match="has no Imu"):
@@ -184,7 +184,7 @@ def test_what_observers_need():
         MahonyFilter("mahony", base, kp=-1.0)
     with pytest.raises(ConfigError, match="needs a MahonyFilter"):
         BodyObserver("bodies", base)
-    with pytest.raises(ConfigError, match="is no Quantity"):
+    with pytest.raises(ConfigError, match="is not a Quantity"):
         QuantityObserver("height", base, quantity="BaseHeight")
     root = layout.bodies[0]
     bare = RobotEnv(Simulator.build("ant", sensors=[Imu(name="imu", body=root)]), 0.02)

@@ -46,7 +46,7 @@ def test_fuzz_of_100_s_stays_within_all_bounds():
     assert (np.abs(q - upper).min(0) < most * DT**2).all()  # it was there
 
 
-def test_accelerations_out_of_bounds_never_carry_it_out():
+def test_excessive_accelerations_never_lead_out_of_bounds():
     made, lower, upper, fastest, most = targets(8, seed=5)
     rng = np.random.default_rng(5)
     for _ in range(2000):
@@ -55,7 +55,7 @@ def test_accelerations_out_of_bounds_never_carry_it_out():
         assert (np.abs(made.velocities) <= fastest + 1e-9).all()
 
 
-def test_targets_can_stop_from_everywhere_they_get():
+def test_targets_can_always_stop():
     n = 32
     made, lower, upper, _, most = targets(n, seed=1)
     rng = np.random.default_rng(1)
@@ -81,7 +81,7 @@ def test_rest_is_close_to_the_bound():
     assert (gap <= most * DT**2 / 8 + 1e-9).all()
 
 
-def test_without_bounds_in_reach_the_acceleration_is_kept():
+def test_far_from_bounds_the_acceleration_is_followed():
     inf = np.full(2, np.inf)
     made = Targets(-inf, inf, inf, np.array([3.0, 5.0]))
     made.set_period(0.01)
@@ -92,7 +92,7 @@ def test_without_bounds_in_reach_the_acceleration_is_kept():
     np.testing.assert_allclose(made.positions, [1 + 1.01, -1 + 2.525], rtol=1e-12)
 
 
-def test_begin_is_brought_within_the_bounds():
+def test_the_start_is_clipped_to_the_bounds():
     made, lower, upper, _, _ = targets(4)
     made.start(upper + 1.0, np.full(4, 100.0))
     np.testing.assert_array_equal(made.positions, upper)
@@ -101,7 +101,7 @@ def test_begin_is_brought_within_the_bounds():
     np.testing.assert_array_equal(made.positions, lower)
 
 
-def test_pickled_targets_go_on_alike():
+def test_pickled_targets_continue_identically():
     made, _, _, _, most = targets()
     made.step(most)
     other = pickle.loads(pickle.dumps(made))  # noqa: S301
@@ -113,7 +113,11 @@ def test_pickled_targets_go_on_alike():
 
 @pytest.mark.parametrize(
     ("lower", "most", "message"),
-    [(2.0, 1.0, "above the upper"), (-1.0, np.inf, "finite bounds"), (-1.0, 0.0, "finite bounds")],
+    [
+        (2.0, 1.0, "above the upper"),
+        (-1.0, np.inf, "finite positive bounds"),
+        (-1.0, 0.0, "finite positive bounds"),
+    ],
 )
 def test_impossible_bounds(lower, most, message):
     one = np.ones(1)

@@ -67,7 +67,7 @@ class Counting(ObserverBlock):
 
     def connect(self):
         self.times = []
-        self._observe_in(spaces.Box(0.0, np.inf, (), np.float64))
+        self._set_observation_space(spaces.Box(0.0, np.inf, (), np.float64))
 
     def refresh_observation(self, measurement):
         self.times.append(round(float(measurement["t"]), 9))

@@ -1,4 +1,4 @@
-"""Blocks of pipelines: observers and controllers with periods of their own."""
+"""Blocks of pipelines: observers and controllers, each with its own period."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Blocks: what observes or controls inside the physics loop, each at its own period."""
+"""Base classes of blocks, which observe or control inside the physics loop at their own period."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -13,56 +13,56 @@ from physx_core.errors import ConfigError, SimulationError
 from physx_core.typing import Vector
 from physx_gym.env.pipeline_env import PipelineEnv
 from physx_gym.shared_arrays import SharedArrays
-from physx_gym.spaces import neutral
+from physx_gym.spaces import copy_tree, neutral
 
 
 class Block(SharedArrays, ABC):
-    """A part of a pipeline with a period of its own; a layer puts it on an environment.
+    """A part of a pipeline with its own period; a layer puts it on an environment.
 
-    Subclasses make spaces and buffers in `connect`, prepare in `setup` what depends on the periods,
-    and begin an episode in `begin`. What they remember from one call to the next are attributes
-    named in `memory`: arrays, which are kept and updated in place, or plain numbers and lists.
+    Subclasses create spaces and buffers in `connect`, compute in `setup` what depends on the
+    periods, and begin an episode in `begin`. Attributes that hold state from one call to the next
+    are named in `memory`: arrays, which are kept and updated in place, or plain numbers and lists.
 
     Attributes:
         name: Name within the pipeline.
         env: The environment that the block is put on.
-        update_ratio: Period in periods of the environment below; -1: a step of the environment.
+        update_ratio: Period in periods of the environment below; -1: one step of the environment.
         every: Period in physics steps; 0 before the first reset.
         period: The same in s.
-        connected_to: Which of the simulator's builds it is connected to; -1: none yet.
+        connected_to: Number of the simulator's build that it is connected to; -1: none yet.
         memory: Names of the attributes that `snapshot` keeps.
     """
 
     memory: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, name: str, env: PipelineEnv, *, update_ratio: int = 1) -> None:
-        """Make the block for an environment.
+        """Create the block for an environment.
 
         Raises:
-            ConfigError: The name or the ratio cannot be.
+            ConfigError: If the name or the ratio is invalid.
         """
         if not isinstance(env, PipelineEnv):
             raise ConfigError(
-                f"{type(self).__name__} is for a RobotEnv or a layer of one, not for {env!r}."
+                f"{type(self).__name__} needs a RobotEnv or a layer of one, not {env!r}."
             )
         if not isinstance(name, str) or not name or "." in name:
-            raise ConfigError(f"The name of a block is {name!r} but must be a text without dots.")
+            raise ConfigError(f"The name of a block is {name!r} but must be a string without dots.")
         is_number = isinstance(update_ratio, (int, np.integer)) and not isinstance(
             update_ratio, bool
         )
         if not is_number or (update_ratio < 1 and update_ratio != -1):
             raise ConfigError(
                 f'Block "{name}": update_ratio is {update_ratio!r} but must be a whole number of '
-                "periods of the layer below, or -1 for a step of the environment."
+                "periods of the layer below, or -1 for one step of the environment."
             )
         self.name, self.env, self.update_ratio = name, env, int(update_ratio)
         self.every, self.period = 0, 0.0
         self.connected_to = -1
 
     def refresh_connection(self) -> None:
-        """Call `connect`, unless the simulator is as it was the last time.
+        """Call `connect` if the simulator has been rebuilt since the last time.
 
-        Layers do so when they are made and at every reset; a constructor may, so that spaces are
+        Layers do so when they are created and at every reset; a constructor may, so that spaces are
         known before there is a layer.
         """
         builds = self.env.simulator.builds
@@ -72,20 +72,20 @@ class Block(SharedArrays, ABC):
 
     @abstractmethod
     def connect(self) -> None:
-        """Make spaces and buffers that fit the environment.
+        """Create spaces and buffers that fit the environment.
 
         Called when a layer puts the block on its environment, and at a reset that changed the
-        simulator's options, so limits and sensors may be others then.
+        simulator's options, so limits and sensors may differ then.
 
         Raises:
-            ConfigError: The environment lacks what the block needs.
+            ConfigError: If the environment lacks what the block needs.
         """
 
     def setup(self) -> None:
-        """Take up the periods; called at every reset, before `begin`.
+        """Compute the periods; called at every reset, before `begin`.
 
         Raises:
-            ConfigError: The block's period does not divide a step of the environment.
+            ConfigError: If the block's period does not divide a step of the environment.
         """
         physics = self.env.simulator.period
         step = round(self.env.step_dt / physics)
@@ -104,38 +104,38 @@ class Block(SharedArrays, ABC):
         """Return the period of the environment below, in s."""
 
     def begin(self) -> None:
-        """Begin an episode: the simulation has its first state, and sensors have measured it."""
+        """Begin an episode; the simulation has its first state, and sensors have measured it."""
 
     @property
     def state_space(self) -> gymnasium.Space[Any] | None:
-        """Space of `get_state`; None: the block has no state to observe."""
+        """Space of `get_state`; None: the block does not have a state to observe."""
         return None
 
     def get_state(self) -> Any:
-        """Return the state that observations show: an array, updated in place; None: none."""
+        """Return the state that is part of observations: an array, updated in place; or None."""
         return None
 
     @property
     def state_fieldnames(self) -> Any:
-        """Names of the numbers of `get_state`, nested like it; None: numbered."""
+        """Names of the numbers of `get_state`, nested like it; None: they are numbered."""
         return None
 
     def snapshot(self) -> Any:
-        """Return everything that `restore` needs to go on exactly from here; plain data."""
-        return {name: _copied(getattr(self, name)) for name in self.memory}
+        """Return everything that `restore` needs to continue exactly from here, as plain data."""
+        return {name: copy_tree(getattr(self, name)) for name in self.memory}
 
     def restore(self, state: Any) -> None:
-        """Go back to a snapshot of a block that is built alike.
+        """Return to a snapshot of an identical block.
 
         Raises:
-            SimulationError: It is of another block.
+            SimulationError: If the snapshot is of a different block.
         """
         if not isinstance(state, Mapping) or set(state) != set(self.memory):
             raise SimulationError(f'The snapshot is not of the block "{self.name}".')
         for name in self.memory:
             own, given = getattr(self, name), state[name]
             if not isinstance(own, np.ndarray):
-                setattr(self, name, _copied(given))
+                setattr(self, name, copy_tree(given))
             elif np.shape(given) == own.shape:
                 own[...] = given
             else:
@@ -156,8 +156,8 @@ class ObserverBlock(Block):
     observation_space: gymnasium.Space[Any]
     observation: Any
 
-    def _observe_in(self, space: gymnasium.Space[Any]) -> None:
-        """Set the space of the features, and make their buffer."""
+    def _set_observation_space(self, space: gymnasium.Space[Any]) -> None:
+        """Set the space of the features, and create their buffer."""
         self.observation_space, self.observation = space, neutral(space)
 
     def _period_below(self) -> float:
@@ -165,15 +165,15 @@ class ObserverBlock(Block):
 
     @property
     def fieldnames(self) -> Any:
-        """Names of the features' numbers, nested like `observation`; None: numbered."""
+        """Names of the features' numbers, nested like `observation`; None: they are numbered."""
         return None
 
     @abstractmethod
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Bring `observation` to the present, in place; called once every period.
+        """Update `observation` in place; called once every period.
 
         Args:
-            measurement: What was measured: ``t``, ``states``, ``measurements``.
+            measurement: The latest measurement: ``t``, ``states``, ``measurements``.
         """
 
 
@@ -191,7 +191,7 @@ class ControllerBlock(Block):
 
     @property
     def fieldnames(self) -> Any:
-        """Names of the action's numbers, nested like it; None: numbered."""
+        """Names of the action's numbers, nested like it; None: they are numbered."""
         return None
 
     @abstractmethod
@@ -199,10 +199,6 @@ class ControllerBlock(Block):
         """Write the action of the environment below in place; called once every period.
 
         Args:
-            action: What the block shall do, within `action_space`.
+            action: The block's own action, within `action_space`.
             command: Action of the environment below.
         """
-
-
-def _copied(value: Any) -> Any:
-    return cast(Any, value).copy() if isinstance(value, (np.ndarray, list)) else value

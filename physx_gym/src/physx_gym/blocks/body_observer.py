@@ -1,31 +1,29 @@
-"""How links are turned, from the attitudes of IMUs and the angles of joints."""
+"""Estimates the orientations of links from the attitudes of IMUs and the angles of joints."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from gymnasium import spaces
-
 from physx_core.errors import ConfigError
 from physx_core.rotations import invert, multiply, rotate_back, to_roll_pitch_yaw
 from physx_core.simulation import Imu
+from physx_gym.blocks.attitude_features import attitude_fieldnames, attitude_space
 from physx_gym.blocks.block import ObserverBlock
 from physx_gym.blocks.mahony_filter import MahonyFilter
 from physx_gym.blocks.motor_joints import JointEncoders
-from physx_gym.blocks.turning import Turning
+from physx_gym.blocks.relative_orientation import RelativeOrientation
 
 if TYPE_CHECKING:
-    from physx_gym.env.layers.layer import PipelineEnv
+    from physx_gym.env.pipeline_env import PipelineEnv
 
 
 class BodyObserver(ObserverBlock):
-    """Estimates how links are turned, from a `MahonyFilter` below and the encoders of joints.
+    """Estimates the orientations of links from a `MahonyFilter` below and encoders of joints.
 
-    Each link takes the IMU with the fewest joints between them; these joints need encoders. Its
-    features, each with a column for each link: ``orientation``, quaternions x, y, z, w in the
-    world; ``angular_velocity`` in rad/s along the link's own axes; with `compute_rpy` also
+    For each link it uses the IMU with the fewest joints in between; these joints need encoders. Its
+    features have a column for each link: ``orientation``, quaternions x, y, z, w in the world;
+    ``angular_velocity``, in rad/s along the link's own axes; with `compute_rpy` also
     ``roll_pitch_yaw``, in rad.
 
     Attributes:
@@ -52,8 +50,8 @@ class BodyObserver(ObserverBlock):
             compute_rpy: See above.
 
         Raises:
-            ConfigError: There is no `MahonyFilter`, or a joint has no encoder.
-            SimulationError: There is no link of a name.
+            ConfigError: If there is no `MahonyFilter` below, or a joint does not have an encoder.
+            SimulationError: If there is no link of that name.
         """
         super().__init__(name, env, update_ratio=update_ratio)
         self._wanted = None if bodies is None else tuple(bodies)
@@ -72,40 +70,26 @@ class BodyObserver(ObserverBlock):
         imus = [each for each in simulator.sensors if type(each) is Imu]
         self.bodies = self._wanted or tuple(dict.fromkeys(imu.body for imu in imus))
         self._offsets = [invert(imu.rotation) for imu in imus]
-        self._ways: list[tuple[int, Turning, list[int]]] = []
+        self._paths: list[tuple[int, RelativeOrientation, list[int]]] = []
         joints: dict[str, int] = {}
         for body in self.bodies:
-            ways = [Turning(simulator.simulation, imu.body, body) for imu in imus]
-            place = min(range(len(ways)), key=lambda i: len(ways[i].joints))
-            for name in ways[place].joints:
+            paths = [RelativeOrientation(simulator.simulation, imu.body, body) for imu in imus]
+            place = min(range(len(paths)), key=lambda i: len(paths[i].joints))
+            for name in paths[place].joints:
                 joints.setdefault(name, len(joints))
-            columns = [joints[name] for name in ways[place].joints]
-            self._ways.append((place, ways[place], columns))
+            columns = [joints[name] for name in paths[place].joints]
+            self._paths.append((place, paths[place], columns))
         self._encoders = JointEncoders(self.env, list(joints), where) if joints else None
-        self._make_buffers(len(self.bodies))
-
-    def _make_buffers(self, count: int) -> None:
-        boxes: dict[str, spaces.Space[Any]] = {
-            "orientation": spaces.Box(-1.01, 1.01, (4, count), np.float64),
-            "angular_velocity": spaces.Box(-np.inf, np.inf, (3, count), np.float64),
-        }
-        if self.compute_rpy:
-            boxes["roll_pitch_yaw"] = spaces.Box(-np.inf, np.inf, (3, count), np.float64)
-        self._observe_in(spaces.Dict(boxes))
+        self._set_observation_space(attitude_space(len(self.bodies), has_rpy=self.compute_rpy))
         self.observation["orientation"][3] = 1.0
 
     @property
     def fieldnames(self) -> dict[str, list[list[str]]]:
         """Names of the features' numbers."""
-        axes = {"orientation": "xyzw", "angular_velocity": "xyz"}
-        names = {key: [[f"{key}.{b}.{a}" for b in self.bodies] for a in axes[key]] for key in axes}
-        if self.compute_rpy:
-            angles = ("roll", "pitch", "yaw")
-            names["roll_pitch_yaw"] = [[f"{a}.{b}" for b in self.bodies] for a in angles]
-        return names
+        return attitude_fieldnames(self.bodies, has_rpy=self.compute_rpy)
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Bring the links' attitudes to the present."""
+        """Update the orientations of the links."""
         angles: list[float] = []
         rates: list[float] = []
         if self._encoders is not None:
@@ -113,13 +97,13 @@ class BodyObserver(ObserverBlock):
             angles, rates = self._encoders.values.tolist()
         seen = self._filter.observation
         attitudes = seen["orientation"].T.tolist()
-        turns = seen["angular_velocity"].T.tolist()
+        velocities = seen["angular_velocity"].T.tolist()
         found = []
-        for place, way, columns in self._ways:
+        for place, path, columns in self._paths:
             offset = self._offsets[place]
-            body, rate = way.carry(
+            body, rate = path.transfer(
                 multiply(attitudes[place], offset),
-                rotate_back(offset, *turns[place]),
+                rotate_back(offset, *velocities[place]),
                 [angles[column] for column in columns],
                 [rates[column] for column in columns],
             )

@@ -1,4 +1,4 @@
-"""Attitudes from rates and accelerations: the explicit complementary filter.
+"""Attitude from angular velocity and acceleration: the explicit complementary filter.
 
 R. Mahony, T. Hamel, J.-M. Pflimlin: "Nonlinear Complementary Filters on the Special Orthogonal
 Group", IEEE Transactions on Automatic Control 53 (5), 2008. An acceleration whose size is not that
@@ -34,11 +34,11 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 class Gains(NamedTuple):
-    """Numbers of the filter, worked out once.
+    """Coefficients of the filter, computed once.
 
     Attributes:
-        turn: Half the turn in a period for an acceleration across from up, in rad.
-        bias: Change of the bias in a period, likewise, in rad/s.
+        turn: Half the rotation in a period for an acceleration perpendicular to up, in rad.
+        bias: Change of the bias in a period for such an acceleration, in rad/s.
         half: Half the period, in s.
         gravity: Square of gravity, in m²/s⁴.
     """
@@ -50,7 +50,7 @@ class Gains(NamedTuple):
 
     @classmethod
     def of(cls, kp: float, ki: float, dt: float, g: float) -> Self:
-        """Return the numbers of a filter.
+        """Return the coefficients of a filter.
 
         Args:
             kp: How fast the attitude follows the acceleration, in rad/s.
@@ -61,19 +61,19 @@ class Gains(NamedTuple):
         return cls(0.5 * dt * kp, dt * ki, 0.5 * dt, g * g)
 
 
-def advanced(state: Sequence[float], measured: Sequence[float], gains: Gains) -> tuple[float, ...]:
+def advance(state: Sequence[float], measured: Sequence[float], gains: Gains) -> tuple[float, ...]:
     """Return the state of one filter a period later, in plain numbers.
 
     Args:
-        state: Quaternion, rates less their bias, bias, and rates measured last, in rad/s: 13
+        state: Quaternion, rates without their bias, bias, and last measured rates, in rad/s: 13
             numbers.
         measured: Rates in rad/s and accelerations in m/s², 6 numbers.
-        gains: Numbers of the filter.
+        gains: Coefficients of the filter.
     """
     x, y, z, w, _, _, _, bx, by, bz, px, py, pz = state
     gx, gy, gz, ax, ay, az = measured
     turn, learn, half, gravity = gains
-    middle = 0.5 * half  # rates are the mean of now and last time
+    middle = 0.5 * half  # the rates are the mean of now and last time
     ox = middle * (px + gx) - half * bx
     oy = middle * (py + gy) - half * by
     oz = middle * (pz + gz) - half * bz
@@ -87,7 +87,7 @@ def advanced(state: Sequence[float], measured: Sequence[float], gains: Gains) ->
         ox, oy, oz = ox + gain * ex, oy + gain * ey, oz + gain * ez
         gain = learn * weight
         bx, by, bz = bx - gain * ex, by - gain * ey, bz - gain * ez
-    # The turn by twice o, as (tan(|o|) o / |o|, 1): its length does not matter.
+    # The rotation by twice o, as (tan(|o|) o / |o|, 1): its length does not matter.
     square = ox * ox + oy * oy + oz * oz
     if square < _SMALL:
         ratio = 1 + square * (1 / 3 + square * (2 / 15))
@@ -104,13 +104,13 @@ def advanced(state: Sequence[float], measured: Sequence[float], gains: Gains) ->
     return qx, qy, qz, qw, gx - bx, gy - by, gz - bz, bx, by, bz, gx, gy, gz
 
 
-def advanced_rows(states: Vector, measured: Vector, gains: Gains) -> Vector:
-    """Return the states of many filters a period later, as `advanced`.
+def advance_rows(states: Vector, measured: Vector, gains: Gains) -> Vector:
+    """Return the states of many filters a period later, as `advance`.
 
     Args:
         states: Shape (n, 13).
         measured: Shape (n, 6).
-        gains: See `advanced`.
+        gains: See `advance`.
     """
     attitudes, biases, last = states[:, :4], states[:, 7:10], states[:, 10:]
     rates, accelerations = measured[:, :3], measured[:, 3:]
@@ -127,30 +127,26 @@ def advanced_rows(states: Vector, measured: Vector, gains: Gains) -> Vector:
     return np.concatenate([attitudes, rates - biases, biases, rates], axis=1)
 
 
-def unit(x: float, y: float, z: float, w: float) -> Quaternion:
-    """Return a quaternion with the length 1."""
-    scale = 1.0 / math.sqrt(x * x + y * y + z * z + w * w)
-    return x * scale, y * scale, z * scale, w * scale
-
-
-def upright(ax: float, ay: float, az: float) -> Quaternion:
-    """Return the attitude without twist at which an acceleration at rest points up."""
+def attitude_from_gravity(ax: float, ay: float, az: float) -> Quaternion:
+    """Return the attitude without twist for which the acceleration (ax, ay, az) points up."""
     length = math.sqrt(ax * ax + ay * ay + az * az)
     if length <= _WEIGHTLESS:
         return IDENTITY
     ax, ay, az = ax / length, ay / length, az / length
     if az < -1 + 1e-9:
         return 1.0, 0.0, 0.0, 0.0
-    return unit(ay, -ax, 0.0, 1 + az)
+    w = 1 + az
+    scale = 1.0 / math.sqrt(ax * ax + ay * ay + w * w)
+    return ay * scale, -ax * scale, 0.0, w * scale
 
 
-def without_twist(x: float, y: float, z: float, w: float) -> Quaternion:
-    """Return a quaternion without its turn about the vertical, which is made first.
+def remove_twist(x: float, y: float, z: float, w: float) -> Quaternion:
+    """Return a quaternion without its rotation about the vertical.
 
-    Of ``q = twist * tilt`` it is the tilt, so where up is in the sensor's frame stays as it was.
+    Of ``q = twist * tilt`` that is the tilt; up stays the same in the sensor's frame.
     """
     length = math.sqrt(z * z + w * w)
-    if length < 1e-12:  # upside down: the twist has no meaning
+    if length < 1e-12:  # upside down: the twist is undefined
         return x, y, z, w
     c, s = w / length, -z / length
     return c * x - s * y, c * y + s * x, 0.0, length

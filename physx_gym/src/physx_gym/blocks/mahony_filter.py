@@ -1,4 +1,4 @@
-"""Attitudes of IMUs from what they measure."""
+"""Observer block that estimates the attitudes of IMUs from their measurements."""
 
 from __future__ import annotations
 
@@ -15,43 +15,43 @@ from physx_core.errors import ConfigError
 from physx_core.rotations import to_roll_pitch_yaw
 from physx_core.simulation import Imu
 from physx_core.typing import Vector
+from physx_gym.blocks.attitude_features import attitude_fieldnames, attitude_space
 from physx_gym.blocks.block import ObserverBlock
 from physx_gym.blocks.mahony import (
     Gains,
-    advanced,
-    advanced_rows,
-    upright,
-    without_twist,
+    advance,
+    advance_rows,
+    attitude_from_gravity,
+    remove_twist,
 )
 
 if TYPE_CHECKING:
-    from physx_gym.env.layers.layer import PipelineEnv
+    from physx_gym.env.pipeline_env import PipelineEnv
 
 
 _STATE = struct.Struct("13d")
-"""A quicker way to write plain numbers into an array."""
+"""Writes plain numbers into an array faster than NumPy."""
 
 
 class MahonyFilter(ObserverBlock):
-    """Estimates how IMUs are turned, from the rates and accelerations that they measure.
+    """Estimates the attitudes of IMUs from the angular velocities and accelerations they measure.
 
-    Its features, each with a column for each IMU: ``orientation``, quaternions x, y, z, w of the
-    sensors in the world; ``angular_velocity``, their rates less the estimated bias, in rad/s, along
+    Its features have a column for each IMU: ``orientation``, quaternions x, y, z, w of the sensors
+    in the world; ``angular_velocity``, the measured one without its estimated bias, in rad/s, along
     the sensors' axes; with `compute_rpy` also ``roll_pitch_yaw``, in rad. Its state: the estimated
-    biases of the rates, in rad/s. The turn about the vertical cannot be seen and drifts. An
-    acceleration whose square is more than half off that of gravity, as in an impact or a fall, is
-    not trusted.
+    biases, in rad/s. Rotation about the vertical is not observable, so it drifts. An acceleration
+    whose square is more than half off that of gravity, as in an impact or a fall, is ignored.
 
     Attributes:
         sensors: Names of the IMUs.
         kp: How fast the attitude follows the acceleration, in rad/s.
         ki: How fast the bias follows it, in rad/s².
-        exact_init: Whether an episode begins with the IMU's own orientation; otherwise with the
-            attitude at which its acceleration points up, without any turn about the vertical.
-        ignore_twist: Whether to leave out all turns about the vertical.
+        exact_init: Whether an episode begins with the IMU's true orientation; otherwise with the
+            attitude for which its acceleration points up, not rotated about the vertical.
+        ignore_twist: Whether to remove all rotation about the vertical.
         compute_rpy: Whether ``roll_pitch_yaw`` is a feature.
-        estimates: A column for each IMU: quaternion, rates less their bias, bias, last rates, and
-            with `compute_rpy` roll, pitch and yaw; shape (13 or 16, IMUs).
+        estimates: A column for each IMU: quaternion, rates without their bias, bias, last rates,
+            and with `compute_rpy` roll, pitch and yaw; shape (13 or 16, IMUs).
     """
 
     memory: ClassVar[tuple[str, ...]] = ("estimates", "_is_first")
@@ -81,7 +81,7 @@ class MahonyFilter(ObserverBlock):
             compute_rpy: See above.
 
         Raises:
-            ConfigError: There is no IMU, or a gain is negative.
+            ConfigError: If there is no IMU, or a gain is negative.
         """
         super().__init__(name, env, update_ratio=update_ratio)
         where = f'MahonyFilter "{name}": '
@@ -97,7 +97,7 @@ class MahonyFilter(ObserverBlock):
         self.sensors = tuple(each.name for each in simulator.sensors if type(each) is Imu)
         if not self.sensors:
             raise ConfigError(
-                f'MahonyFilter "{self.name}": the simulator has no Imu. Give one to its sensors.'
+                f'MahonyFilter "{self.name}": the simulator has no Imu. Add one to its sensors.'
             )
         count = len(self.sensors)
         self._measured: Vector = simulator.sensed["Imu"]
@@ -109,25 +109,21 @@ class MahonyFilter(ObserverBlock):
         if self.compute_rpy:
             places["roll_pitch_yaw"] = slice(13, 16)
         self.observation = {key: self.estimates[place] for key, place in places.items()}
-        self.observation_space = spaces.Dict(
-            {
-                key: spaces.Box(-most, most, part.shape, np.float64)
-                for key, part in self.observation.items()
-                for most in (1.01 if key == "orientation" else np.inf,)
-            }
-        )
+        self.observation_space = attitude_space(count, has_rpy=self.compute_rpy)
         self.observation["orientation"][3] = 1.0
 
     def setup(self) -> None:
-        """Take up the period."""
+        """Compute the coefficients for the period."""
         super().setup()
         gravity = math.hypot(*self.env.simulator.world.gravity)
         self._gains = Gains.of(self.kp, self.ki, self.period, gravity)
 
     def begin(self) -> None:
-        """Begin with the attitudes that the IMUs say, without bias."""
+        """Begin with attitudes from the IMUs, without bias."""
         for column, measured in zip(self.estimates.T, self._measured.T, strict=True):
-            column[:4] = measured[:4] if self.exact_init else upright(*measured[7:].tolist())
+            column[:4] = (
+                measured[:4] if self.exact_init else attitude_from_gravity(*measured[7:].tolist())
+            )
             column[4:7] = column[10:13] = measured[4:7]
             column[7:10] = 0.0
         self._is_first = True
@@ -136,12 +132,7 @@ class MahonyFilter(ObserverBlock):
     @property
     def fieldnames(self) -> dict[str, list[list[str]]]:
         """Names of the features' numbers."""
-        axes = {"orientation": "xyzw", "angular_velocity": "xyz"}
-        names = {key: [[f"{key}.{s}.{a}" for s in self.sensors] for a in axes[key]] for key in axes}
-        if self.compute_rpy:
-            angles = ("roll", "pitch", "yaw")
-            names["roll_pitch_yaw"] = [[f"{a}.{s}" for s in self.sensors] for a in angles]
-        return names
+        return attitude_fieldnames(self.sensors, has_rpy=self.compute_rpy)
 
     @property
     def state_space(self) -> spaces.Box:
@@ -158,25 +149,25 @@ class MahonyFilter(ObserverBlock):
         return [[f"bias.{sensor}.{axis}" for sensor in self.sensors] for axis in "xyz"]
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Bring the attitudes to the present."""
+        """Update the attitudes."""
         state: Any = self._filtered
-        if self._is_first:  # it has seen this measurement when it began
+        if self._is_first:  # `begin` has used this measurement already
             self._is_first = False
             return
         if state.ndim == 1:
             measured = self._moving.tolist()
-            found = advanced(state.tolist(), measured, self._gains)
+            found = advance(state.tolist(), measured, self._gains)
             _STATE.pack_into(state, 0, *found)
         else:
-            state.T[:] = advanced_rows(state.T, self._moving.T, self._gains)
+            state.T[:] = advance_rows(state.T, self._moving.T, self._gains)
         if self.ignore_twist or self.compute_rpy:
             self._complete()
 
     def _complete(self) -> None:
-        """Leave out turns about the vertical, and work out roll, pitch and yaw."""
+        """Remove rotation about the vertical, and compute roll, pitch and yaw."""
         for column in self.estimates.T:
             attitude = column[:4].tolist()
             if self.ignore_twist:
-                attitude = column[:4] = without_twist(*attitude)
+                attitude = column[:4] = remove_twist(*attitude)
             if self.compute_rpy:
                 column[13:] = to_roll_pitch_yaw(attitude)

@@ -1,4 +1,4 @@
-"""The joints of an environment's motors: their limits, and what encoders say of them."""
+"""Joints that an environment's motors drive: their limits and encoder measurements."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from physx_core.typing import Vector
 from physx_gym.shared_arrays import SharedArrays
 
 if TYPE_CHECKING:
-    from physx_gym.env.layers.layer import PipelineEnv
+    from physx_gym.env.pipeline_env import PipelineEnv
 
 
 class JointEncoders(SharedArrays):
-    """What encoders say of joints.
+    """Encoder measurements of joints.
 
     Attributes:
-        values: Positions in rad or m, and velocities in rad/s or m/s, shape (2, joints); where the
-            encoders are those of the joints in their order, the measurement itself.
-        is_copy: Whether they are a copy of the measurement, so that `refresh` has to be called.
+        values: Positions in rad or m, and velocities in rad/s or m/s, shape (2, joints); the
+            measurement itself if the encoders are exactly those of the joints, in order.
+        is_copy: Whether the values are a copy of the measurement, so `refresh` must be called.
     """
 
     def __init__(self, env: PipelineEnv, joints: Sequence[str], purpose: str) -> None:
         """Find the encoders of joints.
 
         Args:
-            env: The environment whose sensors they are.
+            env: The environment that has the sensors.
             joints: Names of the joints.
-            purpose: What needs them, for an error.
+            purpose: What needs the encoders, for errors.
 
         Raises:
-            ConfigError: A joint has no encoder.
+            ConfigError: If a joint does not have an encoder.
         """
         encoders = [each for each in env.simulator.sensors if type(each) is Encoder]
         known = [each.joint for each in encoders]
@@ -42,7 +42,7 @@ class JointEncoders(SharedArrays):
             if joint not in known:
                 raise ConfigError(
                     f'{purpose} needs an Encoder on the joint "{joint}".{nearest(joint, known)} '
-                    "Give one to the simulator's sensors."
+                    "Add one to the simulator's sensors."
                 )
         places = [known.index(joint) for joint in joints]
         ratios = np.array([encoders[place].reduction for place in places])
@@ -52,15 +52,15 @@ class JointEncoders(SharedArrays):
         self.values = np.zeros((2, len(places))) if self.is_copy else self._measured
 
     def refresh(self) -> None:
-        """Bring the values to the present."""
+        """Update the values."""
         if self.is_copy:
             np.take(self._measured, self._places, 1, self.values, "clip")
             np.multiply(self.values, self._scales, self.values)
 
     def buffer(self) -> Vector:
-        """Return a new array like the values, in the same order in memory.
+        """Return a new array like the values, with the same memory layout.
 
-        To calculate with arrays of different orders takes three times as long.
+        Calculating with arrays of different layouts takes three times as long.
         """
         shape = self.values.shape
         if self.values.flags.c_contiguous:
@@ -69,7 +69,7 @@ class JointEncoders(SharedArrays):
 
 
 class MotorJoints(SharedArrays):
-    """The joints that an environment's motors drive, in the motors' order; all of shape (motors,).
+    """Joints that are driven by torques, in the order of the motors; all arrays are (motors,).
 
     Attributes:
         names: Names of the joints.
@@ -77,19 +77,30 @@ class MotorJoints(SharedArrays):
         upper: Highest positions.
         max_velocity: Highest velocities, in rad/s or m/s.
         max_torque: Highest torques of the motors' shafts, in N m or N.
-        reduction: Turns of the motor for one of the joint.
-        encoders: What encoders say of them.
+        reduction: Turns of the motor for each turn of the joint.
+        encoders: Encoder measurements of the joints.
     """
 
     def __init__(self, env: PipelineEnv, purpose: str) -> None:
         """Find the joints of an environment's motors.
 
+        Args:
+            env: The environment.
+            purpose: What needs the motors, for errors.
+
         Raises:
-            ConfigError: There is no motor, or a joint has no encoder.
+            ConfigError: If there is no motor, the environment's action is not one torque for each
+                motor, or a joint does not have an encoder.
         """
         motors, layout = env.simulator.motors, env.simulator.layout
         if not motors:
             raise ConfigError(f"{purpose} needs motors, but the simulator has none.")
+        if env.action_space.shape != (len(motors),):
+            raise ConfigError(
+                f"{purpose}: the environment below takes the action {env.action_space}, not the "
+                f"torques of {len(motors)} motors."
+            )
+        self._purpose = purpose
         self.names = tuple(motor.joint for motor in motors)
         places = [layout.joints.index(name) for name in self.names]
         self.reduction = np.array([motor.reduction for motor in motors])
@@ -101,21 +112,21 @@ class MotorJoints(SharedArrays):
         self.max_torque = np.minimum(layout.max_torque[places] / ratio, strongest)
         self.encoders = JointEncoders(env, self.names, purpose)
 
+    def option(self, name: str, given: Any, *, positive: bool = False) -> Vector:
+        """Return an option as one number for each motor; it may be infinite.
 
-def per_motor(where: str, count: int, option: str, given: Any, *, positive: bool = False) -> Vector:
-    """Return an option as one number for each motor; infinite ones are allowed.
-
-    Raises:
-        ConfigError: It is neither a number nor one for each motor, or is negative or not a number.
-    """
-    try:
-        values = np.broadcast_to(np.asarray(given, np.float64), (count,)).copy()
-    except (TypeError, ValueError) as error:
-        raise ConfigError(
-            f"{where}: {option} is {given!r} but must be a number, or one for each of the {count} "
-            "motors."
-        ) from error
-    if not (values > 0 if positive else values >= 0).all():
-        limit = "above 0" if positive else "0 or above"
-        raise ConfigError(f"{where}: {option} is {given!r} but must be {limit}.")
-    return values
+        Raises:
+            ConfigError: If it is neither a number nor one for each motor, or is NaN or negative.
+        """
+        count = len(self.names)
+        try:
+            values = np.broadcast_to(np.asarray(given, np.float64), (count,)).copy()
+        except (TypeError, ValueError) as error:
+            raise ConfigError(
+                f"{self._purpose}: {name} is {given!r} but must be a number, or one for each of "
+                f"the {count} motors."
+            ) from error
+        if not (values > 0 if positive else values >= 0).all():
+            limit = "positive" if positive else "at least 0"
+            raise ConfigError(f"{self._purpose}: {name} is {given!r} but must be {limit}.")
+        return values

@@ -1,8 +1,7 @@
-"""A limit of torques that keeps joints within soft limits."""
+"""Controller block that limits torques to keep joints within soft limits."""
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,22 +9,20 @@ from numpy import add, maximum, minimum, multiply, subtract
 
 from physx_core.typing import Vector
 from physx_gym.blocks.block import ControllerBlock
-from physx_gym.blocks.motor_joints import MotorJoints, per_motor
-from physx_gym.blocks.pd_controller import check_torques
+from physx_gym.blocks.motor_joints import MotorJoints
 
 if TYPE_CHECKING:
-    from physx_gym.env.layers.layer import PipelineEnv
+    from physx_gym.env.pipeline_env import PipelineEnv
 
 
 class MotorSafetyLimit(ControllerBlock):
-    """Cuts the motors' torques so that soft limits of positions and velocities are kept.
+    """Limits the motors' torques so that soft limits of positions and velocities are respected.
 
-    The closer a joint is to a soft limit of its position, the slower it may move towards it:
-    its velocity shall be between ``-kp * (position - soft_limit)`` of both sides and within
-    `soft_velocity_max`. The torque may at most be ``kd`` times what is left to these velocities;
-    beyond a limit it pushes back. This is how PR2's controllers kept joints safe, see
-    http://wiki.ros.org/pr2_controller_manager/safety_limits. The motors cut what is beyond their
-    own limits.
+    The closer a joint is to a soft limit of its position, the slower it may move towards it: its
+    velocity must be between ``-kp * (position - soft_limit)`` of both sides and within
+    `soft_velocity_max`. The torque may be at most ``kd`` times the distance from these velocities;
+    beyond a limit it pushes back. This is the scheme of the PR2's controllers, see
+    http://wiki.ros.org/pr2_controller_manager/safety_limits. The motors' own limits apply as well.
 
     Its action: torques, as those of the environment below.
 
@@ -52,14 +49,14 @@ class MotorSafetyLimit(ControllerBlock):
             name: Name within the pipeline.
             env: The environment below.
             update_ratio: See `Block`.
-            kp: Velocity for each unit of distance from a soft limit, in 1/s; this and all that
-                follow: a number, or one for each motor.
+            kp: Velocity for each unit of distance from a soft limit, in 1/s; this and all options
+                below: a number, or one for each motor.
             kd: Torque at the joint for each unit of velocity, in N m s/rad or N s/m.
-            soft_position_margin: How far soft limits are within the joints' limits, in rad or m.
+            soft_position_margin: Distance of the soft limits from the joints' limits, in rad or m.
             soft_velocity_max: Highest velocity, in rad/s or m/s.
 
         Raises:
-            ConfigError: An option cannot be, or something is missing below.
+            ConfigError: If an option is invalid, or the environment lacks motors or encoders.
         """
         super().__init__(name, env, update_ratio=update_ratio)
         self.kp, self.kd = kp, kd
@@ -68,25 +65,21 @@ class MotorSafetyLimit(ControllerBlock):
         self.refresh_connection()
 
     def connect(self) -> None:
-        """Take up the limits of the environment's motors."""
-        where = f'MotorSafetyLimit "{self.name}"'
-        self.joints = MotorJoints(self.env, where)
-        count = len(self.joints.names)
-        check_torques(where, self.env, count)
+        """Read the limits of the environment's motors."""
+        self.joints = joints = MotorJoints(self.env, f'MotorSafetyLimit "{self.name}"')
         self.action_space = self.env.action_space
-        numbers = partial(per_motor, where, count)
-        kp, kd = numbers("kp", self.kp, positive=True), numbers("kd", self.kd, positive=True)
-        margin = numbers("soft_position_margin", self.soft_position_margin)
-        fastest = numbers("soft_velocity_max", self.soft_velocity_max)
-        self.soft_lower, self.soft_upper = self.joints.lower + margin, self.joints.upper - margin
-        kd = kd / np.abs(self.joints.reduction)
-        signs = np.sign(self.joints.reduction)
-        # With a shaft that turns the other way, the joint's upper limit is the shaft's lower one.
+        kp, kd = (joints.option(name, getattr(self, name), positive=True) for name in ("kp", "kd"))
+        margin = joints.option("soft_position_margin", self.soft_position_margin)
+        fastest = joints.option("soft_velocity_max", self.soft_velocity_max)
+        self.soft_lower, self.soft_upper = joints.lower + margin, joints.upper - margin
+        kd = kd / np.abs(joints.reduction)
+        signs = np.sign(joints.reduction)
+        # If the shaft turns the other way, the joint's upper limit is the shaft's lower one.
         limits = np.sort(np.array([self.soft_lower, self.soft_upper]) * signs, axis=0)
-        self._encoders = self.joints.encoders
+        self._encoders = joints.encoders
         self._scaled, gains = self._encoders.buffer(), self._encoders.buffer()
         gains[:] = np.array([kp * kd, kd]) * signs
-        self._room = np.zeros((2, count))
+        self._room = np.zeros((2, len(kp)))
         self._parts = (*self._scaled, *(kp * kd * limits), *self._room)
         self._measured = (self._encoders.values, gains, self._scaled)
         self._most = np.array([kd * fastest] * 2)
@@ -94,7 +87,7 @@ class MotorSafetyLimit(ControllerBlock):
         self._bounded = bool(np.isfinite(self._most).any())
 
     def compute_command(self, action: Vector, command: Vector) -> None:
-        """Write the torques that are safe, shape (motors,), in N m or N."""
+        """Write the limited torques, shape (motors,), in N m or N."""
         if self._encoders.is_copy:
             self._encoders.refresh()
         positions, velocities, lower, upper, backward, forward = self._parts

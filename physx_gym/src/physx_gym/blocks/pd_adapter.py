@@ -1,4 +1,4 @@
-"""From targets of positions or velocities to the accelerations that a PD controller takes."""
+"""Converts positions or velocities to the accelerations that a PD controller takes."""
 
 from __future__ import annotations
 
@@ -11,22 +11,21 @@ from numpy import absolute, copysign, less, maximum, minimum, multiply, sqrt, su
 from physx_core.errors import ConfigError
 from physx_core.typing import Vector
 from physx_gym.blocks.block import ControllerBlock
-from physx_gym.blocks.motor_joints import per_motor
 from physx_gym.blocks.pd_controller import PDController
 
 if TYPE_CHECKING:
-    from physx_gym.env.layers.layer import PipelineEnv
+    from physx_gym.env.pipeline_env import PipelineEnv
 
 
 class PDAdapter(ControllerBlock):
-    """Lets a PD controller be told where its targets shall go, instead of their accelerations.
+    """Controls a PD controller's targets by position or velocity instead of acceleration.
 
     Its action: positions (`order` 0) or velocities (`order` 1) of the targets, shape (motors,). In
     each of its periods it sets the constant acceleration that changes the targets' velocities to
-    the wanted ones within the period; with `order` 0 these are the velocities that would lead to
-    the wanted positions in one period. With `is_instantaneous` it works at the controller's own
-    period instead, and moves as fast as the controller's bounds allow: without overshoot to a
-    position, at once to a velocity.
+    the desired ones within the period; with `order` 0 these are the velocities that would reach the
+    desired positions in one period. With `is_instantaneous` it works at the controller's own period
+    instead, and moves as fast as the controller's bounds allow: without overshoot to a position,
+    at once to a velocity.
 
     Attributes:
         controller: The PD controller below.
@@ -52,11 +51,11 @@ class PDAdapter(ControllerBlock):
             update_ratio: See `Block`; not used with `is_instantaneous`.
             order: See above.
             is_instantaneous: See above.
-            deadband: Changes of position, or velocities, below which a target stands still; in rad,
-                m, rad/s or m/s: a number, or one for each motor.
+            deadband: Changes of position, or velocities, below which a target does not move; in
+                rad, m, rad/s or m/s: a number, or one for each motor.
 
         Raises:
-            ConfigError: An option cannot be, or there is no PD controller right below.
+            ConfigError: If an option is invalid, or there is no PD controller directly below.
         """
         super().__init__(name, env, update_ratio=1 if is_instantaneous else update_ratio)
         if order not in (0, 1):
@@ -65,18 +64,19 @@ class PDAdapter(ControllerBlock):
         self.refresh_connection()
 
     def connect(self) -> None:
-        """Take up the bounds of the controller's targets."""
-        where = f'PDAdapter "{self.name}"'
+        """Read the bounds of the controller's targets."""
         controller = getattr(self.env, "controller", None)
         if not isinstance(controller, PDController):
-            raise ConfigError(f"{where} goes right on a ControlledEnv with a PDController.")
+            raise ConfigError(
+                f'PDAdapter "{self.name}" must be directly on a ControlledEnv with a PDController.'
+            )
         self.controller = controller
         low, high = controller.targets.bounds
         count = len(controller.joints.names)
         if self.order == 0:
             low[0], high[0] = controller.lower, controller.upper
         self.action_space = spaces.Box(low[self.order], high[self.order], dtype=np.float64)
-        self._deadband = per_motor(where, count, "deadband", self.deadband)
+        self._deadband = controller.joints.option("deadband", self.deadband)
         self._is_dead = bool(self._deadband.any())
         self._most = controller.max_acceleration
         self._least, self._zero = -self._most, np.zeros(count)
@@ -85,14 +85,14 @@ class PDAdapter(ControllerBlock):
         self._close = np.zeros(count, np.bool_)
 
     def setup(self) -> None:
-        """Take up the periods."""
+        """Compute the periods."""
         super().setup()
         self._rate[:] = 1 / self.period
         self._half[:] = 0.5 * self.period * self._most
 
     @property
     def fieldnames(self) -> list[str]:
-        """Names of the wanted positions or velocities."""
+        """Names of the desired positions or velocities."""
         kind = ("wantedPosition", "wantedVelocity")[self.order]
         return [f"{kind}.{name}" for name in self.controller.joints.names]
 
@@ -115,7 +115,7 @@ class PDAdapter(ControllerBlock):
         maximum(command, self._least, out=command)
 
     def _without_small(self, wanted: Vector) -> Vector:
-        """Return what is wanted, 0 within the deadband."""
+        """Return the desired values, 0 within the deadband."""
         absolute(wanted, self._size)
         less(self._size, self._deadband, self._close)
         np.copyto(self._wanted, wanted)
@@ -123,13 +123,13 @@ class PDAdapter(ControllerBlock):
         return self._wanted
 
     def _slow_down(self, wanted: Vector) -> None:
-        """Turn distances into the highest velocities from which the targets stop there."""
+        """Replace distances by the highest velocities from which the targets can stop there."""
         size = self._size
         absolute(wanted, size)
         direct = size * self._rate
         multiply(size, self._double, size)
         sqrt(size, size)
         subtract(size, self._half, size)
-        # Within the last half period of braking it goes there at once.
+        # Within the last half period of braking it goes there directly.
         maximum(size, minimum(direct, self._half), out=size)
         copysign(size, wanted, wanted)

@@ -1,8 +1,7 @@
-"""A proportional-derivative controller whose targets move within bounds."""
+"""Proportional-derivative controller block whose targets move within bounds."""
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -12,20 +11,20 @@ from numpy import add, maximum, minimum, multiply, subtract
 from physx_core.errors import ConfigError
 from physx_core.typing import Vector
 from physx_gym.blocks.block import ControllerBlock
-from physx_gym.blocks.motor_joints import MotorJoints, per_motor
+from physx_gym.blocks.motor_joints import MotorJoints
 from physx_gym.blocks.targets import Targets
 
 if TYPE_CHECKING:
-    from physx_gym.env.layers.layer import PipelineEnv
+    from physx_gym.env.pipeline_env import PipelineEnv
 
 
 class PDController(ControllerBlock):
-    """Drives the motors' joints to targets that follow an action: accelerations of the targets.
+    """Drives the motors' joints to targets, whose accelerations are the action.
 
-    In each period the targets move on, as in `Targets`, and the torques of the motors are ``kp *
-    ((target - position) + kd * (target_velocity - velocity)) / reduction``, cut at the motors'
-    limits. Positions and velocities are those that encoders measure. An episode begins with the
-    targets where the joints are.
+    In each period the targets move, as described in `Targets`, and the torques of the motors are
+    ``kp * ((target - position) + kd * (target_velocity - velocity)) / reduction``, clipped to the
+    motors' limits. Positions and velocities are those that encoders measure. An episode begins with
+    the targets at the joints' positions.
 
     Its action: accelerations, shape (motors,), in rad/s² or m/s². Its state: positions and
     velocities of the targets, shape (2, motors).
@@ -60,16 +59,16 @@ class PDController(ControllerBlock):
             env: The environment below.
             update_ratio: See `Block`.
             kp: Torque at the joint for each unit of position error, in N m/rad or N/m; this and all
-                that follow: a number, or one for each motor.
+                options below: a number, or one for each motor.
             kd: Damping for each unit of `kp`, in s.
-            joint_position_margin: How far targets stay from the joints' limits, in rad or m.
+            joint_position_margin: Distance of the targets from the joints' limits, in rad or m.
             joint_velocity_limit: Highest velocity of the targets, in rad/s or m/s; those of joints
-                and motors hold too.
+                and motors apply as well.
             joint_acceleration_limit: Highest acceleration of the targets, in rad/s² or m/s²; None:
-                such that a step of the environment can turn the highest velocity around.
+                enough to reverse the highest velocity within a step of the environment.
 
         Raises:
-            ConfigError: An option cannot be, or something is missing below.
+            ConfigError: If an option is invalid, or the environment lacks motors or encoders.
         """
         super().__init__(name, env, update_ratio=update_ratio)
         self.kp, self.kd = kp, kd
@@ -79,44 +78,42 @@ class PDController(ControllerBlock):
         self.refresh_connection()
 
     def connect(self) -> None:
-        """Take up the limits of the environment's motors."""
+        """Read the limits of the environment's motors."""
         where = f'PDController "{self.name}"'
-        self.joints = MotorJoints(self.env, where)
-        check_torques(where, self.env, len(self.joints.names))
-        numbers = partial(per_motor, where, len(self.joints.names))
-        kp, kd = numbers("kp", self.kp, positive=True), numbers("kd", self.kd)
-        margin = numbers("joint_position_margin", self.joint_position_margin)
-        fastest = numbers("joint_velocity_limit", self.joint_velocity_limit)
-        self.max_velocity = np.minimum(self.joints.max_velocity, fastest)
+        self.joints = joints = MotorJoints(self.env, where)
+        kp, kd = joints.option("kp", self.kp, positive=True), joints.option("kd", self.kd)
+        margin = joints.option("joint_position_margin", self.joint_position_margin)
+        fastest = joints.option("joint_velocity_limit", self.joint_velocity_limit)
+        self.max_velocity = np.minimum(joints.max_velocity, fastest)
         most = self.joint_acceleration_limit
         if most is None:
             most = 2 * self.max_velocity / self.env.step_dt
             if not np.isfinite(most).all():
                 raise ConfigError(
-                    f"{where}: the velocities of some joints have no limit. Give "
+                    f"{where}: the velocities of some joints are not limited. Set "
                     "joint_velocity_limit or joint_acceleration_limit."
                 )
-        self.max_acceleration = numbers("joint_acceleration_limit", most, positive=True)
-        self.lower, self.upper = self.joints.lower + margin, self.joints.upper - margin
+        self.max_acceleration = joints.option("joint_acceleration_limit", most, positive=True)
+        self.lower, self.upper = joints.lower + margin, joints.upper - margin
         most = self.max_acceleration
         self.action_space = spaces.Box(-most, most, dtype=np.float64)
         self.targets = Targets(self.lower, self.upper, self.max_velocity, self.max_acceleration)
         self.target_state = self.targets.state
-        gains = kp / self.joints.reduction
-        self._encoders, self._errors = self.joints.encoders, np.zeros((2, len(gains)))
+        gains = kp / joints.reduction
+        self._encoders, self._errors = joints.encoders, np.zeros((2, len(gains)))
         self._gains = np.array([gains, gains * kd])
-        self._least, self._most = -self.joints.max_torque, self.joints.max_torque
-        # Row by row, as what is measured may have another order in memory.
+        self._least, self._most = -joints.max_torque, joints.max_torque
+        # Row by row, as the measurements may have a different memory layout.
         targets = (self.targets.positions, self.targets.velocities)
         self._rows = (*targets, *self._encoders.values, *self._errors)
 
     def setup(self) -> None:
-        """Take up the periods."""
+        """Compute the periods."""
         super().setup()
         self.targets.set_period(self.period)
 
     def begin(self) -> None:
-        """Begin with the targets where the joints are."""
+        """Begin with the targets at the joints' positions."""
         self._encoders.refresh()
         self.targets.start(*self._encoders.values)
 
@@ -141,7 +138,7 @@ class PDController(ControllerBlock):
         return [[f"{kind}.{name}" for name in names] for kind in ("target", "targetVelocity")]
 
     def compute_command(self, action: Vector, command: Vector) -> None:
-        """Move the targets on, and write the torques, shape (motors,), in N m or N."""
+        """Move the targets, and write the torques, shape (motors,), in N m or N."""
         self.targets.step(action)
         if self._encoders.is_copy:
             self._encoders.refresh()
@@ -152,16 +149,3 @@ class PDController(ControllerBlock):
         add(errors, velocity_errors, command)
         minimum(command, self._most, out=command)
         maximum(command, self._least, out=command)
-
-
-def check_torques(where: str, env: PipelineEnv, count: int) -> None:
-    """Check that an environment's action is one torque for each motor.
-
-    Raises:
-        ConfigError: It is not.
-    """
-    if env.action_space.shape != (count,):
-        raise ConfigError(
-            f"{where}: the environment below takes the action {env.action_space}, not the torques "
-            f"of {count} motors."
-        )

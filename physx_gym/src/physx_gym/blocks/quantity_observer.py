@@ -1,4 +1,4 @@
-"""Quantities as features of observations."""
+"""Observer block whose feature is a quantity."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from physx_gym.blocks.block import ObserverBlock
 from physx_gym.tasks.quantities import Quantity
 
 if TYPE_CHECKING:
-    from physx_gym.env.layers.layer import PipelineEnv
+    from physx_gym.env.pipeline_env import PipelineEnv
 
 
 class QuantityObserver(ObserverBlock):
-    """Shows the value of a quantity; quantities know the simulation's true state.
+    """Observes the value of a quantity, which is computed from the true state of the simulation.
 
-    Its feature: the value, an array, or a number of shape ().
+    Its feature is the value: an array, of shape () for a number.
 
     Attributes:
         quantity: The quantity.
@@ -37,16 +37,16 @@ class QuantityObserver(ObserverBlock):
             quantity: What to observe; its value is a number or an array.
 
         Raises:
-            ConfigError: It is no quantity, or its value is no number.
+            ConfigError: If it is not a quantity, or its value is not numeric.
         """
         super().__init__(name, env, update_ratio=update_ratio)
         if not isinstance(quantity, Quantity):
-            raise ConfigError(f'QuantityObserver "{name}": {quantity!r} is no Quantity.')
+            raise ConfigError(f'QuantityObserver "{name}": {quantity!r} is not a Quantity.')
         self.quantity = quantity
         self.refresh_connection()
 
     def connect(self) -> None:
-        """Make a buffer of the form that the quantity has now."""
+        """Create a buffer of the quantity's current shape."""
         quantities = self.env.quantities
         quantities.watch(self.quantity)
         value = quantities.get_value(self.quantity)
@@ -57,8 +57,8 @@ class QuantityObserver(ObserverBlock):
                 f'QuantityObserver "{self.name}": {self.quantity} is {value!r}, which is neither a '
                 "number nor an array of numbers."
             ) from error
-        self._observe_in(spaces.Box(-np.inf, np.inf, shape, np.float64))
+        self._set_observation_space(spaces.Box(-np.inf, np.inf, shape, np.float64))
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Bring the value to the present."""
+        """Update the value."""
         self.observation[...] = self.env.quantities.get_value(self.quantity)

@@ -1,4 +1,4 @@
-"""Targets that move under an acceleration and never leave their bounds."""
+"""Targets that follow accelerations and never leave their bounds."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ from physx_core.typing import Vector
 from physx_gym.shared_arrays import SharedArrays
 
 _ROUNDING = 1e-12
-"""By how much of a bound's size rounding may carry a target beyond it."""
+"""Relative amount by which rounding may carry a target beyond a bound."""
 
 
 class Targets(SharedArrays):
     """Positions and velocities that follow accelerations, each held for a period.
 
-    In each period the velocity changes first, then the position moves with it:
-    ``v += a * dt; q += v * dt``. Position, velocity and acceleration stay within bounds, and the
-    velocity is always such that the target can stop before its position's bound. With the distance
-    d to that bound it is at most ``sqrt(2 * a_max * d) - a_max * dt / 2``: then one period of full
-    braking leads from this curve to itself, exactly. So a target comes to rest at most
-    ``a_max * dt² / 8`` before a bound.
+    In each period the velocity changes first, then the position: ``v += a * dt; q += v * dt``.
+    Position, velocity and acceleration stay within bounds, and the velocity is always such that the
+    target can stop before the bound of its position. At the distance d from that bound it is at
+    most ``sqrt(2 * a_max * d) - a_max * dt / 2``: one period of full braking leads from this curve
+    exactly to itself. So a target comes to rest at most ``a_max * dt² / 8`` before a bound.
 
     Attributes:
         state: Negative positions, positions, velocities; shape (3, n).
@@ -40,14 +39,14 @@ class Targets(SharedArrays):
         """Bound targets, all of shape (n,); only positions and velocities may be unbounded.
 
         Raises:
-            ConfigError: There is no room between the bounds, or an acceleration is not bounded.
+            ConfigError: If the bounds are reversed, or an acceleration is not bounded.
         """
         n = len(lower)
         if not (lower <= upper).all():
-            raise ConfigError(f"Lower bounds {lower} of targets are above the upper {upper}.")
+            raise ConfigError(f"The lower bounds {lower} of targets are above the upper {upper}.")
         if not (np.isfinite(max_acceleration) & (max_acceleration > 0)).all():
             raise ConfigError(
-                f"Accelerations of targets need finite bounds, not {max_acceleration}."
+                f"Accelerations of targets need finite positive bounds, not {max_acceleration}."
             )
         self.lower, self.upper, self.max_velocity = lower, upper, max_velocity
         bounds = np.array([-lower, upper])
@@ -65,7 +64,7 @@ class Targets(SharedArrays):
         self._parts = (*self._room, self.state[0], self.positions, self.velocities)
 
     def set_period(self, period: float) -> None:
-        """Set for how long each acceleration is held, in s; to be called before `start`."""
+        """Set the time for which each acceleration is held, in s; call it before `start`."""
         self._period[:] = period
         self._half[:] = 0.5 * period * self.max_acceleration
 
@@ -78,18 +77,18 @@ class Targets(SharedArrays):
         return low, high
 
     def start(self, positions: Vector, velocities: Vector) -> None:
-        """Begin at positions and velocities, or at what is nearest to them within the bounds."""
+        """Begin at the positions and velocities nearest to the given ones within the bounds."""
         self.positions[:] = np.clip(positions, self.lower, self.upper)
         self.state[0] = -self.positions
         self._find_room()
         self.velocities[:] = np.clip(velocities, -self._room[0], self._room[1])
 
     def step(self, acceleration: Vector) -> None:
-        """Move on by one period.
+        """Move by one period.
 
         Args:
-            acceleration: Shape (n,), in rad/s² or m/s², within their bounds. The other bounds are
-                kept whatever they are.
+            acceleration: Shape (n,), in rad/s² or m/s², within their bounds; the other bounds hold
+                for any accelerations.
         """
         self._find_room()
         backward, forward, opposite, positions, velocities = self._parts
@@ -104,7 +103,7 @@ class Targets(SharedArrays):
         negative(positions, opposite)
 
     def _find_room(self) -> None:
-        """Find the highest velocities backward and forward that can still be stopped."""
+        """Compute the highest velocities in both directions from which targets can still stop."""
         room = self._room
         subtract(self._bounds, self._both, room)
         multiply(room, self._double, room)

@@ -1,8 +1,8 @@
-"""How links of a robot are turned against each other, from the angles of the joints between them.
+"""Orientation of one link relative to another, from the angles of the joints between them.
 
-Turns are a product of exponentials (R. W. Brockett, 1984): with the axes of the joints in a pose of
-reference, ``R = exp(a1 * d1) ... exp(an * dn) * R0``, where d are the joints' ways from there.
-Quaternions are x, y, z, w, in plain numbers, as there are few of them.
+The rotation is a product of exponentials (R. W. Brockett, 1984): with the axes of the joints in a
+reference pose, ``R = exp(a1 * d1) ... exp(an * dn) * R0``, where d are the joints' displacements
+from that pose. Quaternions are x, y, z, w, in plain numbers, as there are only a few of them.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from physx_core.simulation import Simulation
 from physx_core.typing import Vector
 
 
-class Turning:
-    """How one link is turned, from how another one is.
+class RelativeOrientation:
+    """Computes the orientation of one link from that of another.
 
     Attributes:
         joints: Names of the joints between them.
     """
 
     def __init__(self, simulation: Simulation, known: str, wanted: str) -> None:
-        """Find the way between two links of a robot.
+        """Find the joints between two links of a robot.
 
         Args:
-            simulation: Which the links are in.
-            known: Link whose attitude will be known.
-            wanted: Link whose attitude is wanted.
+            simulation: Simulation that the links are in.
+            known: Link whose orientation will be known.
+            wanted: Link whose orientation is wanted.
 
         Raises:
-            FeatureNotSupportedError: The engine has no Jacobians, and the links are not the same.
-            SimulationError: There is no link of such a name.
+            FeatureNotSupportedError: If the links differ and the engine does not have Jacobians.
+            SimulationError: If there is no link of that name.
         """
         self.joints: tuple[str, ...] = ()
         self._up: list[tuple[int, Triple]] = []
@@ -64,17 +64,17 @@ class Turning:
         self._up = [(places[name], axis) for name, axis in chains[0].items()]
         self._down = [(places[name], axis) for name, axis in chains[1].items()]
 
-    def carry(
+    def transfer(
         self,
-        attitude: Quaternion,
+        orientation: Quaternion,
         rate: Sequence[float],
         angles: Sequence[float],
         rates: Sequence[float],
     ) -> tuple[Quaternion, Triple]:
-        """Return attitude and angular velocity of the wanted link.
+        """Return the orientation and angular velocity of the wanted link.
 
         Args:
-            attitude: Of the known link, in the world.
+            orientation: Of the known link, in the world.
             rate: Its angular velocity along its own axes, in rad/s.
             angles: Of the joints, in rad.
             rates: Of the joints, in rad/s.
@@ -83,31 +83,31 @@ class Turning:
             Quaternion in the world, and rad/s along the link's own axes.
         """
         if not self.joints:
-            return attitude, (rate[0], rate[1], rate[2])
-        first, back = _walked(self._up, angles, rates)
-        second, forth = _walked(self._down, angles, rates)
+            return orientation, (rate[0], rate[1], rate[2])
+        first, back = _follow(self._up, angles, rates)
+        second, forth = _follow(self._down, angles, rates)
         first, second = multiply(first, self._before), multiply(second, self._after)
         common = rotate(first, *rate)
         moved = [c - b + f for c, b, f in zip(common, back, forth, strict=True)]
-        whole = multiply(attitude, multiply(invert(first), second))
+        whole = multiply(orientation, multiply(invert(first), second))
         return whole, rotate_back(second, *moved)
 
 
-def _walked(
+def _follow(
     chain: list[tuple[int, Triple]], angles: Sequence[float], rates: Sequence[float]
 ) -> tuple[Quaternion, Triple]:
-    """Return the turn of a chain of joints, and the angular velocity at its end."""
-    turn: Quaternion = IDENTITY
+    """Return the rotation along a chain of joints, and the angular velocity at its end."""
+    rotation: Quaternion = IDENTITY
     wx = wy = wz = 0.0
     for place, axis in chain:
-        x, y, z = rotate(turn, *axis)
+        x, y, z = rotate(rotation, *axis)
         wx, wy, wz = wx + x * rates[place], wy + y * rates[place], wz + z * rates[place]
-        turn = multiply(turn, from_axis_angle(axis, angles[place]))
-    return turn, (wx, wy, wz)
+        rotation = multiply(rotation, from_axis_angle(axis, angles[place]))
+    return rotation, (wx, wy, wz)
 
 
 def _reference(simulation: Simulation) -> Vector:
-    """Return positions with all joints at 0 and all bases as the world's axes are."""
+    """Return positions with all joints at 0 and all bases aligned with the world's axes."""
     found = np.zeros(simulation.layout.nq)
     for part in simulation.layout.parts.values():
         if part.floating:
@@ -116,7 +116,7 @@ def _reference(simulation: Simulation) -> Vector:
 
 
 def _axes(simulation: Simulation, body: str, reference: Vector) -> dict[str, Triple]:
-    """Return the axes of the joints that turn a link, those close to the base first."""
+    """Return the axes of the joints that rotate a link, those next to the base first."""
     jacobian = simulation.jacobian(body, reference)[3:]
     found = {}
     for name, place in simulation.layout.velocity_index.items():
