@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio
 
 from physx_core.typing import Vector
-from physx_dart.pinocchio.resistance import Resistance
+from physx_dart.shared.resistance import Resistance
 
 
 class MoverBatches:

@@ -19,7 +19,7 @@ import pinocchio
 
 from physx_core.typing import Vector
 from physx_dart.batch.batches import Batches, MoverBatches
-from physx_dart.pinocchio.resistance import Resistance
+from physx_dart.shared.resistance import Resistance
 
 FORWARD, GRADIENTS = range(2)
 REQUEST = struct.Struct("<4q")

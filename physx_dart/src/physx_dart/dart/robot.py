@@ -9,7 +9,6 @@ import numpy as np
 from dartpy import dynamics
 
 from physx_core.rotations import (
-    from_matrix_rows,
     from_rotation_vector,
     rotate_back,
     to_matrix,
@@ -149,17 +148,7 @@ class DartRobot(RobotEngine):
         if self._made_shadow is None:
             self._made_shadow = load_skeleton(self.mover)
             self._made_shadow.setGravity(list(self._gravity))
-            self._links = [
-                self._made_shadow.getBodyNode(link_name(link)) for link in self.model.links
-            ]
         return self._made_shadow
-
-    def poses(self, positions: Vector) -> Vector:
-        """Return the poses of all links in positions, shape (links, 7)."""
-        self._place(self._shadow, positions, np.zeros(self.nv))
-        transforms = np.array([body.getWorldTransform().matrix() for body in self._links])
-        quaternions = from_matrix_rows(transforms[:, :3, :3])
-        return np.concatenate([transforms[:, :3, 3], quaternions], axis=1)
 
     def forward(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
         """Return the accelerations that torques cause, resistance included."""

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import dartpy
+import numpy as np
 from dartpy import constraint
 from dartpy.simulation import CollisionDetectorType
 
@@ -61,7 +62,7 @@ class DartBackend(Backend):
         return catalog.robots()
 
 
-class DartSimulation(RobotSimulation):
+class DartSimulation(RobotSimulation[DartRobot]):
     """A world of DART."""
 
     engine = "dart"
@@ -130,7 +131,7 @@ class DartSimulation(RobotSimulation):
         for _ in range(n):
             step(False)
 
-    def touching(self) -> Records:
+    def read_contacts(self) -> Records:
         """Return the contacts of the last physics step."""
         return self._reader.contacts()
 
@@ -143,6 +144,18 @@ class DartSimulation(RobotSimulation):
         if len(first) != len(last):
             raise SimulationError(f"There are {len(first)} begins of rays but {len(last)} ends.")
         return self._reader.raycast(first, last)
+
+    def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
+        """Return the accelerations, shape (nv,), that torques (nv,) cause in a state, by DART."""
+        q, v, tau = self._checked_state(positions, velocities, torques=torques)
+        return np.concatenate([x.forward(q[i], v[j], tau[j]) for x, i, j in self._slices])
+
+    def inverse_dynamics(
+        self, positions: Vector, velocities: Vector, accelerations: Vector
+    ) -> Vector:
+        """Return the torques, shape (nv,), that cause accelerations (nv,) in a state, by DART."""
+        q, v, a = self._checked_state(positions, velocities, accelerations=accelerations)
+        return np.concatenate([x.inverse(q[i], v[j], a[j]) for x, i, j in self._slices])
 
     def close(self) -> None:
         """Free the world; calling it again does nothing."""

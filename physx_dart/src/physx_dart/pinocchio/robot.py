@@ -22,7 +22,6 @@ from physx_dart.pinocchio.contacts import ContactFinder, Places, Touching
 from physx_dart.pinocchio.limits import JointConstraints, solve
 from physx_dart.pinocchio.models import frames_of, load_stepping_model
 from physx_dart.pinocchio.solver import ImpulseSolver
-from physx_dart.shared.algorithms import MoverAlgorithms
 from physx_dart.shared.engine import RobotEngine, base_accelerations
 from physx_dart.shared.parts import Mover, Static
 
@@ -55,8 +54,7 @@ class PinocchioRobot(RobotEngine):
             FeatureNotSupportedError: A collision shape is a mesh.
         """
         super().__init__(mover)
-        self._algorithms: MoverAlgorithms | None = None
-        self._gravity, self._period = world.gravity, world.period
+        self._period = world.period
         resists, dt = self.resistance, world.period
         implicit = resists.armature + dt * resists.damping + dt * dt * resists.stiffness
         self._free = load_stepping_model(mover, world.gravity, armature=implicit)
@@ -360,23 +358,3 @@ class PinocchioRobot(RobotEngine):
         """Return the length of the velocities; NaN or inf where the state is broken."""
         v = self._velocities  # positions come from these, so they are finite if these are
         return math.sqrt(v.dot(v))
-
-    # Any state ------------------------------------------------------------------------------
-
-    @property
-    def _any(self) -> MoverAlgorithms:
-        if self._algorithms is None:
-            self._algorithms = MoverAlgorithms(self.mover, self._gravity)
-        return self._algorithms
-
-    def poses(self, positions: Vector) -> Vector:
-        """Return the poses of all links in positions, shape (links, 7)."""
-        return self._any.poses(positions)
-
-    def forward(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
-        """Return the accelerations that torques cause, resistance included."""
-        return self._any.forward(positions, velocities, torques)
-
-    def inverse(self, positions: Vector, velocities: Vector, accelerations: Vector) -> Vector:
-        """Return the torques that cause accelerations, resistance included."""
-        return self._any.inverse(positions, velocities, accelerations)

@@ -45,7 +45,7 @@ class PinocchioBackend(Backend):
         return catalog.robots()
 
 
-class PinocchioSimulation(RobotSimulation):
+class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
     """A world of Pinocchio."""
 
     engine = "pinocchio"
@@ -66,11 +66,9 @@ class PinocchioSimulation(RobotSimulation):
         self._check_features(parts)
         statics = [] if world.contacts == "none" else parts.statics
         features = sorted(frozenset(FEATURES) - self.lacks)
-        self._stepped_parts = [
-            PinocchioRobot(mover, world, statics, solver, features) for mover in parts.movers
-        ]
+        robots = [PinocchioRobot(mover, world, statics, solver, features) for mover in parts.movers]
         lacks = () if world.integrator == "euler" else (*_WITHOUT_RK4, "restitution")
-        super().__init__(parts, self._stepped_parts, lacks)
+        super().__init__(parts, robots, lacks)
 
     def _check_features(self, parts: Parts) -> None:
         world, features = parts.world, frozenset(FEATURES) - self.lacks
@@ -103,19 +101,14 @@ class PinocchioSimulation(RobotSimulation):
 
     def advance(self, n: int) -> None:
         """Simulate n physics steps."""
-        for robot in self._stepped_parts:
+        for robot in self._robots:
             robot.run(n)
 
-    def touching(self) -> Records:
+    def read_contacts(self) -> Records:
         """Return the contacts of the last physics step."""
         first, statics = 0, len(self.layout.bodies)
         found = []
-        for robot in self._stepped_parts:
+        for robot in self._robots:
             found.append(robot.contacts(first, statics))
             first += len(robot.model.links)
         return np.concatenate(found)
-
-    def close(self) -> None:
-        """Free the world; calling it again does nothing."""
-        super().close()
-        self._stepped_parts = []

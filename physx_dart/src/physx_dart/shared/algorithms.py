@@ -6,7 +6,7 @@ C order, so that ``torch.from_numpy`` takes them as they are.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -15,8 +15,8 @@ import pinocchio
 from physx_core.simulation import World
 from physx_core.typing import Vector
 from physx_dart.pinocchio.models import frames_of, load_model
-from physx_dart.pinocchio.resistance import Resistance
 from physx_dart.shared.parts import Mover, Parts, read_parts, static_poses
+from physx_dart.shared.resistance import Resistance
 
 _WORLD_AXES = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
 _velocity, _acceleration = pinocchio.getFrameVelocity, pinocchio.getFrameClassicalAcceleration
@@ -38,11 +38,6 @@ class MoverAlgorithms:
         self.data = self.model.createData()
         self.frames = frames_of(self.model, mover)
         self._first = 1 if mover.fixed_base else 2
-
-    def poses(self, q: Vector) -> Vector:
-        """Return the poses of all links, shape (links, 7)."""
-        pinocchio.forwardKinematics(self.model, self.data, q)
-        return np.array([self.pose(frame) for frame in self.frames])
 
     def write_motion(self, frame: int, out: Vector) -> None:
         """Write pose, velocity and acceleration of a frame after `pinocchio.forwardKinematics`.
@@ -134,7 +129,12 @@ class Algorithms:
 
     def __init__(self, parts: Parts) -> None:
         self.movers = tuple(MoverAlgorithms(each, parts.world.gravity) for each in parts.movers)
-        self._places = list(self._slices())
+        self._slices: list[tuple[MoverAlgorithms, slice, slice]] = []
+        nq = nv = 0
+        for each in self.movers:
+            ends = nq + each.model.nq, nv + each.model.nv
+            self._slices.append((each, slice(nq, ends[0]), slice(nv, ends[1])))
+            nq, nv = ends
         self._links = [(i, frame) for i, each in enumerate(self.movers) for frame in each.frames]
         self._still = np.zeros((len(parts.statics), 19))
         self._still[:, :7] = static_poses(parts)
@@ -157,7 +157,7 @@ class Algorithms:
                 row[:] = self._still[body - len(self._links), :7]
                 continue
             mover, frame = self._links[body]
-            each, x, _ = self._places[mover]
+            each, x, _ = self._slices[mover]
             if mover not in known:
                 pinocchio.forwardKinematics(each.model, each.data, q[x])
                 known.add(mover)
@@ -183,7 +183,7 @@ class Algorithms:
                 row[:] = self._still[body - len(self._links)]
                 continue
             mover, frame = self._links[body]
-            each, x, y = self._places[mover]
+            each, x, y = self._slices[mover]
             if mover not in known:
                 pinocchio.forwardKinematics(each.model, each.data, q[x], v[y], a[y])
                 known.add(mover)
@@ -192,11 +192,11 @@ class Algorithms:
 
     def forward_dynamics(self, q: Vector, v: Vector, tau: Vector) -> Vector:
         """Return the accelerations, shape (nv,), that torques (nv,) cause in a state."""
-        return np.concatenate([x.forward(q[a], v[b], tau[b]) for x, a, b in self._slices()])
+        return np.concatenate([x.forward(q[a], v[b], tau[b]) for x, a, b in self._slices])
 
     def inverse_dynamics(self, q: Vector, v: Vector, acceleration: Vector) -> Vector:
         """Return the torques, shape (nv,), that cause accelerations (nv,) in a state."""
-        slices = self._slices()
+        slices = self._slices
         return np.concatenate([x.inverse(q[a], v[b], acceleration[b]) for x, a, b in slices])
 
     def joint_wrenches(
@@ -212,7 +212,7 @@ class Algorithms:
                 body's origin, 6 numbers along the world's axes.
         """
         found, begin = [], 0
-        for each, x, y in self._slices():
+        for each, x, y in self._slices:
             end = begin + len(each.frames)
             mine = {body - begin: outer[body] for body in outer if begin <= body < end}
             found.append(each.joint_wrenches(q[x], v[y], a[y], mine))
@@ -221,12 +221,12 @@ class Algorithms:
 
     def mass_matrix(self, q: Vector) -> Vector:
         """Return the mass matrix, shape (nv, nv)."""
-        return self._diagonal([each.mass(q[a]) for each, a, _ in self._slices()])
+        return self._diagonal([each.mass(q[a]) for each, a, _ in self._slices])
 
     def jacobian(self, body: int, q: Vector, point: Vector) -> Vector:
         """Return the Jacobian, shape (6, nv), of a point of a body, by its place in the layout."""
         whole = np.zeros((6, sum(each.model.nv for each in self.movers)))
-        for each, a, b in self._slices():
+        for each, a, b in self._slices:
             if body < len(each.frames):
                 whole[:, b] = each.jacobian(body, q[a], point)
                 return whole
@@ -237,16 +237,9 @@ class Algorithms:
         self, q: Vector, v: Vector, tau: Vector
     ) -> tuple[Vector, Vector, Vector]:
         """Return the derivatives of `forward_dynamics` by positions, velocities and torques."""
-        found = [each.derivatives(q[a], v[b], tau[b]) for each, a, b in self._slices()]
+        found = [each.derivatives(q[a], v[b], tau[b]) for each, a, b in self._slices]
         by_q, by_v, by_tau = (self._diagonal(blocks) for blocks in zip(*found, strict=True))
         return by_q, by_v, by_tau
-
-    def _slices(self) -> Iterator[tuple[MoverAlgorithms, slice, slice]]:
-        """Return each mover, its part of the positions, and that of the velocities."""
-        nq = nv = 0
-        for each in self.movers:
-            yield each, slice(nq, nq + each.model.nq), slice(nv, nv + each.model.nv)
-            nq, nv = nq + each.model.nq, nv + each.model.nv
 
     def _diagonal(self, blocks: Any) -> Vector:
         """Return a matrix with square blocks along its diagonal."""

@@ -1,33 +1,138 @@
-"""Checks and joins of what goes through a simulation."""
+"""Validation of what callers give to a simulation."""
 
 from __future__ import annotations
 
+import math
 import operator
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from physx_core.errors import SimulationError
+from physx_core.errors import SimulationError, listed, nearest
+from physx_core.simulation import Layout, finite_rows, finite_vector
 from physx_core.typing import Vector
 
 
 def integer(name: str, given: Any, least: int) -> int:
-    """Return an integer that is not below a bound.
+    """Return a value as an integer.
 
     Raises:
-        SimulationError: It is none.
+        SimulationError: If it is not an integer, or is below `least`.
     """
     try:
         number = operator.index(given)
     except TypeError:
         raise SimulationError(f"{name} is {given!r} but must be an integer.") from None
     if number < least:
-        what = "cannot be negative" if least == 0 else f"must be at least {least}"
-        raise SimulationError(f"{name} is {number}: it {what}.")
+        what = "must not be negative" if least == 0 else f"must be at least {least}"
+        raise SimulationError(f"{name} is {number} but {what}.")
     return number
 
 
-def joined(parts: Sequence[Vector]) -> Vector:
-    """Return vectors one after the other."""
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+class LayoutChecks:
+    """Validates states and names of bodies against a simulation's layout."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self._bodies = {name: place for place, name in enumerate(layout.names)}
+        self._floating = [part for part in layout.parts.values() if part.floating]
+
+    def positions(self, given: Any) -> Vector:
+        """Return positions as a new vector (nq,), their quaternions scaled to length 1.
+
+        Raises:
+            SimulationError: If the shape is wrong, a value is not finite, or the length of a
+                quaternion is not 1 within 0.001.
+        """
+        q = finite_vector("positions", given, self._layout.nq)
+        for part in self._floating:
+            base = slice(part.positions.start + 3, part.positions.start + 7)
+            length = math.hypot(*q[base].tolist())
+            if not abs(length - 1.0) <= 1e-3:
+                raise SimulationError(
+                    f'The quaternion of "{part.name}" (positions {base.start} to {base.stop - 1}, '
+                    f"in the order x, y, z, w) has length {length:g}, not 1."
+                )
+            q[base] /= length
+        return q
+
+    def velocities(self, name: str, given: Any) -> Vector:
+        """Return velocities, accelerations, or torques as a new vector (nv,).
+
+        Raises:
+            SimulationError: If the shape is wrong or a value is not finite.
+        """
+        return finite_vector(name, given, self._layout.nv)
+
+    def rows(self, positions: Any, **others: Any) -> list[Vector]:
+        """Return many states as new arrays: positions (n, nq), then the others (n, nv).
+
+        Raises:
+            SimulationError: If a shape is wrong, a value is not finite, or the length of a
+                quaternion is not 1 within 0.001.
+        """
+        q, nv = finite_rows("positions", positions, self._layout.nq), self._layout.nv
+        rows = [finite_rows(name, values, nv) for name, values in others.items()]
+        if any(len(each) != len(q) for each in rows):
+            counts = (f"{len(each)} {name}" for name, each in zip(others, rows, strict=True))
+            raise SimulationError(
+                f"There are {len(q)} positions, {', '.join(counts)}; each state needs one row of "
+                "each."
+            )
+        for part in self._floating:
+            quaternions = q[:, part.positions.start + 3 : part.positions.start + 7]
+            lengths = np.sqrt((quaternions**2).sum(axis=1, keepdims=True))
+            if not (np.abs(lengths - 1.0) <= 1e-3).all():
+                raise SimulationError(
+                    f'A quaternion of "{part.name}" (x, y, z, w) has length '
+                    f"{lengths[np.argmax(np.abs(lengths - 1.0))].item():g}, not 1."
+                )
+            quaternions /= lengths
+        return [q, *rows]
+
+    def body(self, name: Any) -> int:
+        """Return the place of a body in `Layout.names`.
+
+        Raises:
+            SimulationError: If there is no body of that name.
+        """
+        place = self._bodies.get(name) if isinstance(name, str) else None
+        if place is None:
+            raise SimulationError(
+                f'There is no link "{name}".{nearest(str(name), self._bodies)} '
+                f"Links: {listed(self._bodies)}."
+            )
+        return place
+
+    def bodies(self, names: Any) -> list[int]:
+        """Return the places of bodies in `Layout.names`; None: all that move.
+
+        Raises:
+            SimulationError: If `names` is not a list of names of bodies.
+        """
+        if names is None:
+            return list(range(len(self._layout.bodies)))
+        if isinstance(names, str):
+            raise SimulationError(f'names is the text "{names}" but must be a list of names.')
+        try:
+            return [self._bodies[name] for name in names]
+        except (KeyError, TypeError):
+            pass
+        try:
+            return [self.body(name) for name in names]
+        except TypeError:
+            raise SimulationError(f"names is {names!r} but must be a list of names.") from None
+
+    def part(self, name: Any) -> int:
+        """Return the place of a robot or moving object in `Layout.parts`.
+
+        Raises:
+            SimulationError: If nothing of that name moves.
+        """
+        known = list(self._layout.parts)
+        if name not in known:
+            raise SimulationError(
+                f'There is no robot or object "{name}" that moves.{nearest(str(name), known)} '
+                f"There are: {listed(known)}."
+            )
+        return known.index(name)

@@ -9,8 +9,8 @@ import numpy as np
 
 from physx_core.rotations import Triple, cross, rotate_back
 from physx_core.typing import Vector
-from physx_dart.pinocchio.resistance import Resistance
 from physx_dart.shared.parts import Mover
+from physx_dart.shared.resistance import Resistance
 
 
 class RobotEngine(ABC):
@@ -92,18 +92,6 @@ class RobotEngine(ABC):
     @abstractmethod
     def release(self) -> None:
         """End all wrenches."""
-
-    @abstractmethod
-    def poses(self, positions: Vector) -> Vector:
-        """Return the poses of all links in positions, shape (links, 7)."""
-
-    @abstractmethod
-    def forward(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
-        """Return the accelerations that torques cause, resistance included."""
-
-    @abstractmethod
-    def inverse(self, positions: Vector, velocities: Vector, accelerations: Vector) -> Vector:
-        """Return the torques that cause accelerations, resistance included."""
 
 
 def base_accelerations(

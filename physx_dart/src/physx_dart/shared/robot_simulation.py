@@ -1,25 +1,39 @@
-"""What the simulations of all engines have in common: stepping, and what acts meanwhile.
+"""Simulation of a world whose robots and objects are stepped by an engine.
 
-An engine implements `RobotEngine` for one robot, and `RobotSimulation.advance` for its world.
+An engine implements `RobotEngine` for one robot, and `RobotSimulation.advance` and
+`RobotSimulation.read_contacts` for its world.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
 from physx_core.errors import SimulationError, listed
 from physx_core.rotations import cross, to_matrix
-from physx_core.simulation import CONTACT, FEATURES, Hook, State, Wrench, finite_vector
+from physx_core.simulation import (
+    CONTACT,
+    FEATURES,
+    Hook,
+    Simulation,
+    State,
+    Wrench,
+    finite_vector,
+    written,
+)
 from physx_core.typing import Records, Vector
-from physx_dart.shared.checks import integer
+from physx_dart.shared.checks import LayoutChecks, integer
 from physx_dart.shared.engine import RobotEngine
 from physx_dart.shared.influences import Hooks, Wrenches
-from physx_dart.shared.parts import Parts
-from physx_dart.shared.world_state import WorldState
+from physx_dart.shared.parts import Parts, layout_of
+from physx_dart.shared.reach import Reach
+
+if TYPE_CHECKING:
+    from physx_dart.batch.processes import SharedBatches
+    from physx_dart.shared.algorithms import Algorithms
 
 _FASTEST = 1e8
 """Speed, in m/s or rad/s, beyond which a state counts as no longer finite."""
@@ -27,24 +41,45 @@ _BLOCK = 64
 """Physics steps between two checks of the state."""
 
 
-class RobotSimulation(WorldState):
-    """A world that is stepped."""
+Engine = TypeVar("Engine", bound=RobotEngine)
+
+
+class RobotSimulation(Simulation, Generic[Engine]):
+    """A world whose robots and moving objects are each simulated by a `RobotEngine`."""
 
     lacks: ClassVar[frozenset[str]] = frozenset()
     """Features that the engine never has."""
 
-    def __init__(self, parts: Parts, robots: Sequence[RobotEngine], lacks: Sequence[str]) -> None:
-        """Keep the robots and put them at rest in their neutral configuration.
+    def __init__(self, parts: Parts, robots: Sequence[Engine], lacks: Sequence[str]) -> None:
+        """Put the robots at rest in their neutral configuration.
 
         Args:
-            parts: All of the world.
-            robots: Of each mover of the world.
+            parts: Everything in the world.
+            robots: One for each mover of the world.
             lacks: Features that this simulation does not have.
         """
-        super().__init__(parts, robots)
         self.features = frozenset(FEATURES) - self.lacks - set(lacks)
+        self.parts = parts
+        self.period = parts.world.period
+        self.layout = layout_of(parts)
+        self._checks = LayoutChecks(self.layout)
+        self._robots = tuple(robots)
+        self._only = robots[0] if len(robots) == 1 else None
+        self._joint_count = len(self.layout.joints)
+        self._closed = self._stepped = self._stepping = False
         self._frame = 0
-        self._stepping = False
+        places = self.layout.parts.values()
+        self._slices = [
+            (robot, place.positions, place.velocities)
+            for robot, place in zip(robots, places, strict=True)
+        ]
+        self._joints = [place.joints for place in places]
+        self._links = [(robot, link) for robot in robots for link in range(len(robot.model.links))]
+        self._made_algorithms: Algorithms | None = None
+        self._made_batches: SharedBatches | None = None
+        self._reaches: dict[int, Reach] = {}
+        for robot in robots:
+            robot.write(robot.neutral(), np.zeros(robot.nv))
         self._wrenches, self._hooks = Wrenches(self.period), Hooks()
         self._set_command_limits()
         self._watch()
@@ -174,7 +209,7 @@ class RobotSimulation(WorldState):
             return
         self._release()
         for wrench, force, torque in self._wrenches.at(self._frame):
-            robot, link = self._bodies[wrench.body]
+            robot, link = self._links[self._checks.body(wrench.body)]
             point, local = np.array(wrench.point), wrench.frame == "body"
             robot.push(link, force, torque, point, local)
 
@@ -235,9 +270,8 @@ class RobotSimulation(WorldState):
     def _check_wrench(self, wrench: Wrench) -> None:
         if not isinstance(wrench, Wrench):
             raise SimulationError(f"{wrench!r} is no Wrench.")
-        self._place(wrench.body)
-        robot, link = self._bodies.get(wrench.body, (None, 0))
-        if robot is None or not robot.can_move(link):
+        body = self._checks.body(wrench.body)
+        if body >= len(self._links) or not self._links[body][0].can_move(self._links[body][1]):
             raise SimulationError(f'"{wrench.body}" cannot move, so no wrench acts on it.')
 
     def remove_wrench(self, number: int) -> None:
@@ -250,15 +284,40 @@ class RobotSimulation(WorldState):
 
     # State ----------------------------------------------------------------------------------
 
+    def positions(self, out: Vector | None = None) -> Vector:
+        """Return the positions, shape (nq,), written into `out` if it is given."""
+        if self._closed:
+            self._check_open()
+        only = self._only
+        found = only.positions() if only else _join([robot.positions() for robot in self._robots])
+        return found if out is None else written(found, out)
+
+    def velocities(self, out: Vector | None = None) -> Vector:
+        """Return the velocities, shape (nv,), written into `out` if it is given."""
+        if self._closed:
+            self._check_open()
+        only = self._only
+        found = only.velocities() if only else _join([each.velocities() for each in self._robots])
+        return found if out is None else written(found, out)
+
+    def accelerations(self) -> Vector:
+        """Return the change of the velocities in the last step by the period, shape (nv,)."""
+        if self._closed:
+            self._check_open()
+        if not self._stepped:
+            return np.zeros(self.layout.nv)
+        only = self._only
+        return only.accelerations() if only else _join([r.accelerations() for r in self._robots])
+
     def set_state(self, positions: Vector, velocities: Vector) -> None:
         """Put the world into a state; time goes on."""
         self._check_open()
-        q = self._checked_positions(positions)
-        self._write(q, finite_vector("velocities", velocities, self.layout.nv))
+        q = self._checks.positions(positions)
+        self._write(q, self._checks.velocities("velocities", velocities))
 
     def _write(self, q: Vector, v: Vector) -> None:
         self._stepped = False
-        for robot, part, speed in zip(self._robots, self._q, self._v, strict=True):
+        for robot, part, speed in self._slices:
             robot.write(q[part], v[speed])
 
     def snapshot(self) -> State:
@@ -280,7 +339,7 @@ class RobotSimulation(WorldState):
         if not isinstance(state, State):
             raise SimulationError(f"restore takes what snapshot returned, not {state!r}.")
         commands = finite_vector("state.commands", state.commands, len(self.layout.joints))
-        q = self._checked_positions(state.positions)
+        q = self._checks.positions(state.positions)
         v = finite_vector("state.velocities", state.velocities, self.layout.nv)
         frame = integer("state.frame", state.frame, 0)
         for applied in state.wrenches:
@@ -305,12 +364,14 @@ class RobotSimulation(WorldState):
         ]
         return list(zip(given[::2], given[1::2], strict=True))
 
+    # Measurements ---------------------------------------------------------------------------
+
     def contacts(self) -> Records:
         """Return the contacts of the last physics step: an array of `CONTACT` records, a copy."""
         self._check_open()
         if "contacts" not in self.features:
             raise self._lacks("contacts")
-        return self.touching() if self._stepped else np.zeros(0, CONTACT)
+        return self.read_contacts() if self._stepped else np.zeros(0, CONTACT)
 
     def joint_wrenches(self) -> Vector:
         """Return what the joints carried in the last step, shape (joints, 6)."""
@@ -332,7 +393,7 @@ class RobotSimulation(WorldState):
                     acting = [sign * part for part in force]
                     _add(found, body, acting, cross(x - a, y - b, z - c, *acting))
         for wrench, force, torque in self._wrenches.before(self._frame):
-            body = self._places[wrench.body]
+            body = self._checks.body(wrench.body)
             turn = to_matrix(poses[body, 3:])
             if wrench.frame == "body":
                 force, torque = turn @ force, turn @ torque
@@ -341,18 +402,164 @@ class RobotSimulation(WorldState):
         return found
 
     @abstractmethod
-    def touching(self) -> Records:
+    def read_contacts(self) -> Records:
         """Return the contacts of the last physics step."""
+
+    # Bodies and dynamics of any state -------------------------------------------------------
+
+    def body_poses(
+        self, names: Sequence[str] | None = None, positions: Vector | None = None
+    ) -> Vector:
+        """Return the poses of bodies, shape (names, 7): x, y, z and quaternion x, y, z, w."""
+        self._check_open()
+        q = self.positions() if positions is None else self._checks.positions(positions)
+        return self._algorithms.body_poses(q, self._checks.bodies(names))
+
+    def body_velocities(
+        self,
+        names: Sequence[str] | None = None,
+        positions: Vector | None = None,
+        velocities: Vector | None = None,
+    ) -> Vector:
+        """Return the velocities of bodies' origins, shape (names, 6): linear, angular."""
+        if positions is None and velocities is None:
+            return self.body_motions(names)[:, 7:13].copy()
+        self._check_open()
+        q = self.positions() if positions is None else self._checks.positions(positions)
+        v = self.velocities()
+        if velocities is not None:
+            v = self._checks.velocities("velocities", velocities)
+        chosen, nothing = self._checks.bodies(names), np.zeros(self.layout.nv)
+        return self._algorithms.motions(q, v, nothing, chosen)[:, 7:13].copy()
+
+    def body_accelerations(self, names: Sequence[str] | None = None) -> Vector:
+        """Return the accelerations of bodies' origins, shape (names, 6): linear, angular."""
+        return self.body_motions(names)[:, 13:].copy()
+
+    def body_motions(self, names: Sequence[str] | None = None) -> Vector:
+        """Return the present poses, velocities and accelerations of bodies, shape (names, 19)."""
+        if self._closed:
+            self._check_open()
+        q, v, a = self.positions(), self.velocities(), self.accelerations()
+        return self._algorithms.motions(q, v, a, self._checks.bodies(names))
+
+    def reach(self, name: str, direction: Vector, positions: Vector | None = None) -> float:
+        """Return how far the collision shapes of a robot or object reach along a direction."""
+        self._check_open()
+        place, along = self._checks.part(name), finite_vector("direction", direction, 3)
+        if place not in self._reaches:
+            self._reaches[place] = Reach(self.parts.movers[place])
+        bodies = self.layout.parts[name].bodies
+        q = self.positions() if positions is None else self._checks.positions(positions)
+        poses = self._algorithms.body_poses(q, range(bodies.start, bodies.stop))
+        return self._reaches[place].along(along, poses)
+
+    def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
+        """Return the accelerations, shape (nv,), that torques (nv,) cause in a state."""
+        return self._algorithms.forward_dynamics(
+            *self._checked_state(positions, velocities, torques=torques)
+        )
+
+    def inverse_dynamics(
+        self, positions: Vector, velocities: Vector, accelerations: Vector
+    ) -> Vector:
+        """Return the torques, shape (nv,), that cause accelerations (nv,) in a state."""
+        return self._algorithms.inverse_dynamics(
+            *self._checked_state(positions, velocities, accelerations=accelerations)
+        )
+
+    def mass_matrix(self, positions: Vector) -> Vector:
+        """Return the mass matrix, shape (nv, nv)."""
+        self._check_open()
+        return self._algorithms.mass_matrix(self._checks.positions(positions))
+
+    def jacobian(
+        self, body: str, positions: Vector, point: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> Vector:
+        """Return the Jacobian, shape (6, nv), of a point of a link or object."""
+        self._check_open()
+        place, at = self._checks.body(body), finite_vector("point", point, 3)
+        return self._algorithms.jacobian(place, self._checks.positions(positions), at)
+
+    def forward_dynamics_derivatives(
+        self, positions: Vector, velocities: Vector, torques: Vector
+    ) -> tuple[Vector, Vector, Vector]:
+        """Return the derivatives of `forward_dynamics` by positions, velocities and torques."""
+        return self._algorithms.forward_dynamics_derivatives(
+            *self._checked_state(positions, velocities, torques=torques)
+        )
+
+    def forward_dynamics_batch(
+        self, positions: Vector, velocities: Vector, torques: Vector, *, processes: int = 1
+    ) -> Vector:
+        """Return `forward_dynamics` of many states, shape (n, nv), by Pinocchio's algorithms."""
+        self._check_open()
+        processes = integer("processes", processes, 1)
+        q, v, tau = self._checks.rows(positions, velocities=velocities, torques=torques)
+        return self._batches.forward(q, v, tau, processes=processes)
+
+    def forward_dynamics_gradients_batch(
+        self,
+        positions: Vector,
+        velocities: Vector,
+        accelerations: Vector,
+        weights: Vector,
+        *,
+        processes: int = 1,
+    ) -> Vector:
+        """Return gradients of weighted sums of `forward_dynamics`, shape (3, n, nv)."""
+        self._check_open()
+        processes = integer("processes", processes, 1)
+        q, v, a, w = self._checks.rows(
+            positions, velocities=velocities, accelerations=accelerations, weights=weights
+        )
+        return self._batches.gradients(q, v, a, w, processes=processes)
+
+    def _checked_state(
+        self, positions: Any, velocities: Any, **third: Any
+    ) -> tuple[Vector, Vector, Vector]:
+        self._check_open()
+        check = self._checks.velocities
+        ((name, values),) = third.items()
+        q = self._checks.positions(positions)
+        return q, check("velocities", velocities), check(name, values)
+
+    @property
+    def _batches(self) -> SharedBatches:
+        if self._made_batches is None:
+            from physx_dart.batch.batches import Batches, MoverBatches
+            from physx_dart.batch.processes import SharedBatches
+
+            movers = [MoverBatches(x.model, x.resistance) for x in self._algorithms.movers]
+            self._made_batches = SharedBatches(Batches(movers))
+        return self._made_batches
+
+    @property
+    def _algorithms(self) -> Algorithms:
+        if self._made_algorithms is None:
+            from physx_dart.shared.algorithms import Algorithms  # its library loads slowly
+
+            self._made_algorithms = Algorithms(self.parts)
+        return self._made_algorithms
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise SimulationError("The simulation is closed; build a new one.")
 
     def close(self) -> None:
         """Free the world; calling it again does nothing."""
         self._closed = True
         self._robots, self._only = (), None
-        self._bodies = {}
+        self._links, self._slices = [], []
         self._hooks.clear()
         if self._made_batches is not None:
             self._made_batches.close()
         self._made_algorithms = self._made_batches = None
+
+
+def _join(parts: Sequence[Vector]) -> Vector:
+    """Return vectors one after the other."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _add(wrenches: dict[int, list[float]], body: int, force: Any, torque: Any) -> None:
