@@ -261,8 +261,8 @@ class Forgetful(RLEnvironment):
 
 
 SERVED = [
-    (None, {}, "None is no environment. What can be served"),
-    (RLAgent, {}, "which is no gymnasium environment"),
+    (None, {}, "None is not an environment. Give an RLEnvironment"),
+    (RLAgent, {}, "which is not a Gymnasium environment"),
     (Forgetful, {}, r"Forgetful.__init__ must call super\(\).__init__\(\)"),
     (OnDart, {"env_kwargs": {"size": 3}}, "does not take these arguments"),
     (OnDart, {"env_kwargs": [1]}, "env_kwargs is .* must be a dictionary"),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
@@ -68,16 +71,25 @@ def test_ids_of_gymnasium():
     ("reference", "error", "said"),
     [
         ("gym/CartPol-v1", ComponentNotFoundError, 'Did you mean "CartPole-v1"'),
-        ("nowhere/Nothing-v0", ComponentNotFoundError, "gymnasium"),
+        ("nowhere/Nothing-v0", ComponentNotFoundError, "Gymnasium .*package:id"),
+        ("nowhere:Nothing-v0", ConfigError, "No module named 'nowhere'"),
         ("toy/sprin", ComponentNotFoundError, 'Did you mean "spring"'),
         ("nowhere/spring", PluginNotFoundError, "nowhere"),
-        ("physx_core.toy:Linear", ConfigError, "no environment|not take|no gymnasium"),
+        ("physx_core.toy:Linear", ConfigError, "not an environment|not take|not a Gymnasium"),
         ("physx_remote.serving.worlds:open_worlds", ConfigError, "does not take"),
     ],
 )
 def test_references_that_lead_nowhere(reference, error, said):
     with pytest.raises((error, UsageError), match=said):
         open_worlds(reference)
+
+
+@pytest.mark.parametrize("name", ["physx/Cartpole-v0", "physx_gym:physx/Cartpole-v0"])
+def test_ids_of_another_package(name):
+    pytest.importorskip("physx_gym", reason="it registers the id")
+    code = f"from physx_remote import open_worlds; print(open_worlds({name!r}).name)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip() == name, done.stderr
 
 
 def test_arguments_reach_each_environment():
@@ -107,7 +119,7 @@ def test_an_error_within_a_constructor_is_its_own():
 
 
 def test_what_is_made_must_be_an_environment():
-    with pytest.raises(UsageError, match="no gymnasium environment"):
+    with pytest.raises(UsageError, match="not a Gymnasium environment"):
         open_worlds(lambda: 3)
     with pytest.raises(ConfigError, match="at least 1"):
         open_worlds(Plain, 0)
@@ -142,7 +154,7 @@ def test_snapshots_go_through_wrappers_and_count_their_steps():
     second = [worlds.step(0, np.ones(2)) for _ in range(2)]
     np.testing.assert_equal(first, second)
     assert first[-1][3], "truncated by the limit, both times"
-    with pytest.raises(UsageError, match="no state"):
+    with pytest.raises(UsageError, match="was not returned by snapshot"):
         worlds.restore(0, {"environment": 3})
     with pytest.raises(UsageError, match="no snapshots"):
         open_worlds("gym/CartPole-v1").snapshot(0)

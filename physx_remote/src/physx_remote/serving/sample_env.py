@@ -1,4 +1,4 @@
-"""SampleEnv: an environment of physx as a gymnasium environment."""
+"""SampleEnv: an environment of physx as a Gymnasium environment."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from physx_core.typing import Array, Sample
 from physx_core.workers import Instance
 
 REWARD, TERMINATED, TRUNCATED = "reward", "terminated", "truncated"
-"""Fields that are no part of the observation but stand for themselves, where there are any."""
+"""Fields with a meaning of their own, which are not part of the observation."""
 
 _LARGEST_SEED = 1 << 63
 
 
 class SampleEnv(gymnasium.Env[Any, Any]):
-    """An environment of physx, driven from outside in the place of a network.
+    """An environment of physx, driven by actions in place of a network's predictions.
 
     The observation is the sample's training fields by name. The action is what a network would
-    predict, in physical units: it is given to `apply_prediction` before the step, and
-    `get_prediction` within the step answers with it. Which fields a network predicts is not for an
-    environment to say, so the user names them; without any the environment runs by itself.
+    predict, in physical units: it is passed to `apply_prediction` before the step, and returned by
+    `get_prediction` within the step. An environment does not know which fields a network predicts,
+    so the user names them; without any the environment takes no action.
 
     The reward is the field ``reward``, or 0. An episode ends with the fields ``terminated`` and
-    ``truncated``, and is also truncated when the environment calls `new_episode` in the step.
-    `reset` makes the environment anew, with its seed, and makes one step without an action, in
-    which `get_prediction` answers with zeros.
+    ``truncated``, and is also truncated if the environment calls `new_episode` in the step.
+    `reset` creates the environment again, with its seed, and makes one step without an action, in
+    which `get_prediction` returns zeros.
     Additional fields, and the numbers of the step and of the trajectory, are in `info`.
     """
 
@@ -47,7 +47,7 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         instance_nb: int = 1,
         **env_kwargs: Any,
     ) -> None:
-        """Make the environment once, to learn its fields.
+        """Create the environment once to determine its fields.
 
         Args:
             environment: The environment's class or reference.
@@ -57,8 +57,8 @@ class SampleEnv(gymnasium.Env[Any, Any]):
             env_kwargs: Further arguments of the environment.
 
         Raises:
-            ConfigError: An action field is no training field, or a field is complex.
-            PhysxError: The environment cannot be made.
+            ConfigError: If an action field is not a training field, or a field is complex.
+            PhysxError: If the environment cannot be created.
         """
         self._reference, self._arguments = environment, env_kwargs
         self._instance_id, self._instance_nb = instance_id, instance_nb
@@ -68,8 +68,8 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         self._prediction: Sample = {}
         self._parameters: dict[str, Any] = {}
         self._instance: Instance | None = None
-        self._columns = RowBuffer(self._learn_fields(), 1)
-        fields = {field.name: field for field in self._columns.fields if field.role == "training"}
+        self._row = RowBuffer(self._find_fields(), 1)
+        fields = {field.name: field for field in self._row.fields if field.role == "training"}
         self._observed = [n for n in fields if n not in (REWARD, TERMINATED, TRUNCATED)]
         self.observation_space = spaces.Dict({n: _space(fields[n]) for n in self._observed})
         self._actions = {n: _space(fields[n]) for n in action_fields}
@@ -78,19 +78,19 @@ class SampleEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Array], dict[str, Any]]:
-        """Make the environment anew and return its first sample.
+        """Create the environment again and return its first sample.
 
         Args:
             seed: Seed of the environment; None: the next of a stream of seeds.
-            options: Nothing is understood.
+            options: Must be empty.
 
         Raises:
-            UsageError: There are options.
-            PhysxError: The environment raised.
+            UsageError: If there are options.
+            PhysxError: If the environment raises.
         """
         super().reset(seed=seed)
         if options:
-            raise UsageError(f"An environment of physx takes no options at reset: {list(options)}.")
+            raise UsageError(f"An environment of physx takes no reset options: {list(options)}.")
         self._open(int(self.np_random.integers(_LARGEST_SEED)) if seed is None else seed)
         observation, _, _, _, info = self._advance()
         return observation, info
@@ -104,18 +104,18 @@ class SampleEnv(gymnasium.Env[Any, Any]):
             action: Field name to value, in the field's physical unit.
 
         Raises:
-            EpisodeError: `reset` was not called.
-            ActionError: The action has other fields, or a value is not what its field is.
-            PhysxError: The environment raised.
+            EpisodeError: If `reset` was not called.
+            ActionError: If the action has other fields, or a value does not fit its field.
+            PhysxError: If the environment raises.
         """
         if self._instance is None:
-            raise EpisodeError("reset() comes before step().")
+            raise EpisodeError("Call reset() before step().")
         if action.keys() != self._actions.keys():
             raise ActionError(
-                f"An action has the fields {listed(self._actions)}, and this one: {listed(action)}."
+                f"An action has the fields {listed(self._actions)}, not {listed(action)}."
             )
         self._prediction = {
-            name: _array(name, space, action[name]) for name, space in self._actions.items()
+            name: _to_array(name, space, action[name]) for name, space in self._actions.items()
         }
         if self._prediction:
             self._instance.apply(self._prediction)
@@ -127,27 +127,27 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         if instance is not None:
             instance.close()
 
-    # What the environment may ask: `Services` ---------------------------------------------------
+    # `Services` of the environment --------------------------------------------------------------
 
     def predict(self, fields: Sample) -> Sample:
-        """Return the action of this step in the place of a network's prediction.
+        """Return the action of this step in place of a network's prediction.
 
         Raises:
-            UsageError: There is no action.
+            UsageError: If there are no action fields.
         """
         if not self._action_fields:
             raise UsageError(
-                "get_prediction() is answered with the action, and there is none: name the fields "
-                "that a network would predict in action_fields."
+                "get_prediction() returns the action, and there is none: name the fields that a "
+                "network would predict in action_fields."
             )
         return {name: value.copy() for name, value in self._prediction.items()}
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Keep values of the environment as long as this object lives."""
+        """Keep values of the environment for the life of this object."""
         self._parameters.update(values)
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return the values that the environment kept."""
+        """Return the values that the environment saved."""
         return dict(self._parameters)
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:
@@ -177,19 +177,19 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         """Return an action of zeros.
 
         Raises:
-            ConfigError: An action field is no training field.
+            ConfigError: If an action field is not a training field.
         """
         fields = {field.name: field for field in given if field.role == "training"}
         for name in self._action_fields:
             if name not in fields:
                 raise ConfigError(
-                    f'The action field "{name}" is no training field.{nearest(name, fields)} '
+                    f'The action field "{name}" is not a training field.{nearest(name, fields)} '
                     f"Training fields: {listed(fields)}."
                 )
         return {n: np.zeros(fields[n].shape or (), fields[n].dtype) for n in self._action_fields}
 
-    def _learn_fields(self) -> list[Field]:
-        """Return the fields with their shapes; where one is open, a first sample tells it."""
+    def _find_fields(self) -> list[Field]:
+        """Return the fields with their shapes; undeclared ones are those of a first sample."""
         instance = self._open(0)
         try:
             if all(field.shape is not None for field in instance.fields):
@@ -204,10 +204,8 @@ class SampleEnv(gymnasium.Env[Any, Any]):
             raise UsageError("The environment is closed.")
         episode = instance.environment.episode_index
         sample = instance.step()
-        self._columns.put(
-            0, sample, instance.instance_id, instance.last_episode, instance.last_step
-        )
-        row = copy_row(self._columns.rows(1), 0)
+        self._row.put(0, sample, instance.instance_id, instance.last_episode, instance.last_step)
+        row = copy_row(self._row.rows(1), 0)
         observation = {name: row.pop(name) for name in self._observed}
         reward = float(row.pop(REWARD, 0.0))
         terminated = bool(row.pop(TERMINATED, False))
@@ -215,13 +213,13 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         return observation, reward, terminated, bool(row.pop(TRUNCATED, False)) or jumped, row
 
 
-def _array(name: str, space: spaces.Space[Any], value: Any) -> Array:
-    """Return the value of an action's field as an array of its own."""
+def _to_array(name: str, space: spaces.Space[Any], value: Any) -> Array:
+    """Return the value of an action's field as a new array."""
     shape = space.shape or ()
     try:
         array = np.array(value, space.dtype)
     except (TypeError, ValueError) as error:
-        raise ActionError(f'The field "{name}" is no array: {error}.', name) from error
+        raise ActionError(f'The field "{name}" is not an array: {error}.', name) from error
     if array.shape != shape:
         raise ActionError(f'The field "{name}" has shape {array.shape}, not {shape}.', name)
     if not is_finite(array):
@@ -230,11 +228,11 @@ def _array(name: str, space: spaces.Space[Any], value: Any) -> Array:
 
 
 def _space(field: Field) -> spaces.Space[Any]:
-    """Return the space of a field's values; a boolean one has numbers 0 and 1."""
+    """Return the space of a field's values; booleans are 0 and 1."""
     dtype, shape = np.dtype(field.dtype), field.shape or ()
     if dtype.kind == "c":
         raise ConfigError(
-            f'Field "{field.name}" is complex, which no space of gymnasium can be. Define its '
+            f'Field "{field.name}" is complex, which Gymnasium has no space for. Define its '
             "real and imaginary parts."
         )
     if dtype.kind == "f":

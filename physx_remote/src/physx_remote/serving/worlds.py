@@ -1,4 +1,4 @@
-"""Worlds: what a service drives, one or several gymnasium environments of one kind."""
+"""Worlds: one or several Gymnasium environments of one kind, for a service to drive."""
 
 from __future__ import annotations
 
@@ -11,19 +11,17 @@ import gymnasium
 from physx_core import Closeable, PhysxError
 from physx_core.components import Environment
 from physx_core.errors import ComponentNotFoundError, ConfigError, UsageError
-from physx_core.plugins import resolve
+from physx_core.plugins import available, load, resolve
 from physx_remote.serving.sample_env import SampleEnv
 
-GYMNASIUM = "gym/"
-"""Beginning of a reference whose rest is an id of gymnasium."""
+_PLUGIN = "gym"
+"""The plugin of Gymnasium's environments; its import registers further ids."""
+_PREFIX = f"{_PLUGIN}/"
 
 _SERVED = (
-    "What can be served: an RLEnvironment or its class, an environment of Gymnasium or a function "
-    'that makes one, an environment of physx, or a reference such as "gym/CartPole-v1" or '
-    '"script.py:Class".'
+    "Give an RLEnvironment or its class, a Gymnasium environment or a function that returns one, "
+    'an environment of physx, or a reference such as "gym/CartPole-v1" or "script.py:Class".'
 )
-
-_OWN, _OWN_MODULE = "physx/", "physx_gym"  # who imports the module registers the ids
 
 Served: TypeAlias = str | gymnasium.Env[Any, Any] | Callable[..., Any]
 """What can be served: see `open_worlds`."""
@@ -34,24 +32,24 @@ Transition: TypeAlias = tuple[Any, float, bool, bool, dict[str, Any]]
 class Worlds(Closeable):
     """One or several gymnasium environments with the same spaces. A context manager.
 
-    What an environment raises passes through: whoever serves the worlds reports it and lives on.
+    Errors of the environments pass through; services report them and go on.
 
     Attributes:
         environments: The environments, by number of the world.
-        name: What they are, for messages.
+        name: Name of the environments, for messages.
         observation_space: Space of one world's observations.
         action_space: Space of one world's actions.
     """
 
     def __init__(self, environments: Sequence[gymnasium.Env[Any, Any]], name: str = "") -> None:
-        """Keep the environments.
+        """Take the environments.
 
         Args:
             environments: At least one.
-            name: What they are; empty: what the first one calls itself.
+            name: Name of the environments; empty: the id or class of the first one.
 
         Raises:
-            UsageError: There is none, or their spaces differ.
+            UsageError: If there is none, or their spaces differ.
         """
         if not environments:
             raise UsageError("There must be at least one world.")
@@ -66,8 +64,8 @@ class Worlds(Closeable):
             for kind in ("observation_space", "action_space"):
                 if getattr(other, kind) != getattr(first, kind):
                     raise UsageError(
-                        f"World {number} has the {kind} {getattr(other, kind)}, and world 0 has "
-                        f"{getattr(first, kind)}. Worlds that are served together need the same."
+                        f"World {number} has the {kind} {getattr(other, kind)}, but world 0 has "
+                        f"{getattr(first, kind)}. Worlds served together need equal spaces."
                     )
 
     @property
@@ -90,36 +88,36 @@ class Worlds(Closeable):
 
     @property
     def has_snapshots(self) -> bool:
-        """Whether the environments can be put back to where they were."""
+        """Whether the environments can return and restore their state."""
         return self._keeper(0) is not None
 
     def snapshot(self, world: int) -> Any:
         """Return one world's state.
 
         Raises:
-            UsageError: The environment has no method `snapshot`.
+            UsageError: If the environment does not define `snapshot`.
         """
         keeper = self._required_keeper(world)
         elapsed = [limit._elapsed_steps for limit in self._limits(world)]
         return {"environment": keeper.snapshot(), "elapsed_steps": elapsed}
 
     def restore(self, world: int, state: Mapping[str, Any]) -> None:
-        """Put one world back to a state that `snapshot` returned.
+        """Restore one world to a state that `snapshot` returned.
 
         Raises:
-            UsageError: The environment has no method `restore`, or the state is none of these.
+            UsageError: If the environment does not define `snapshot`, or it did not return the
+                state.
         """
         limits = self._limits(world)
-        if set(state) != {"environment", "elapsed_steps"} or len(state["elapsed_steps"]) != len(
-            limits
-        ):
-            raise UsageError(f"This is no state that snapshot() of {self.name} returned.")
+        is_own = set(state) == {"environment", "elapsed_steps"}
+        if not is_own or len(state["elapsed_steps"]) != len(limits):
+            raise UsageError(f"This state was not returned by snapshot() of {self.name}.")
         self._required_keeper(world).restore(state["environment"])
         for limit, elapsed in zip(limits, state["elapsed_steps"], strict=True):
             limit._elapsed_steps = elapsed
 
     def _keeper(self, world: int) -> Any:
-        """Return the outermost part of an environment that has snapshots, or None."""
+        """Return the outermost wrapper or environment that has snapshots, or None."""
         found = (env for env in self._parts(world) if hasattr(env, "snapshot"))
         return next(found, None)
 
@@ -127,7 +125,7 @@ class Worlds(Closeable):
         keeper = self._keeper(world)
         if keeper is None:
             raise UsageError(
-                f"{self.name} has no snapshots: its environment defines no snapshot()."
+                f"{self.name} has no snapshots: its environment does not define snapshot()."
             )
         return keeper
 
@@ -137,7 +135,7 @@ class Worlds(Closeable):
         return [env for env in self._parts(world) if isinstance(env, limit)]
 
     def _parts(self, world: int) -> list[gymnasium.Env[Any, Any]]:
-        """Return an environment's wrappers from outside inwards, and what they wrap."""
+        """Return an environment's wrappers, outermost first, and the environment itself."""
         parts = [self.environments[world]]
         while isinstance(parts[-1], gymnasium.Wrapper):
             parts.append(parts[-1].env)
@@ -161,84 +159,91 @@ class Worlds(Closeable):
 def open_worlds(
     environment: Served, num_worlds: int = 1, env_kwargs: Mapping[str, Any] | None = None
 ) -> Worlds:
-    """Make the worlds that a user names.
+    """Create worlds.
 
     Args:
-        environment: ``"gym/CartPole-v1"``: the id ``CartPole-v1`` of gymnasium; an id that has a
-            version, such as ``"physx/Cartpole-v0"``; a reference of a physx environment, such as
-            ``"toy/spring"``, which is served as `SampleEnv` does; ``"package.module:Class"`` or
-            ``"script.py:Class"`` of either kind; a class, a function that makes an environment; or
-            one gymnasium environment.
-        num_worlds: How many worlds to make.
-        env_kwargs: Keyword arguments of each environment; `SampleEnv` takes its own from them.
+        environment: A Gymnasium id, as ``"gym/CartPole-v1"`` or, if it has a version,
+            ``"physx/Cartpole-v0"`` or ``"package:id-v0"``, which imports the package first; a
+            reference of a physx environment, such as ``"toy/spring"``, which becomes a `SampleEnv`;
+            ``"package.module:Class"`` or ``"script.py:Class"`` of either kind; a class, or a
+            function that returns an environment; or one Gymnasium environment.
+        num_worlds: How many worlds to create.
+        env_kwargs: Keyword arguments of each environment, and those of `SampleEnv`.
 
     Raises:
-        ConfigError: An environment does not take the arguments.
-        UsageError: One environment shall be several worlds, or what was made is no environment.
-        PhysxError: The reference leads nowhere: see `physx_core.plugins.resolve`.
+        ConfigError: If an environment does not take the arguments.
+        UsageError: If several worlds of one existing environment are requested, or a function
+            returns something else than an environment.
+        PhysxError: If the reference cannot be resolved: see `physx_core.plugins.resolve`.
     """
     if type(num_worlds) is not int or num_worlds < 1:
-        raise ConfigError(f"num_worlds is {num_worlds!r} but must be a whole number, at least 1.")
+        raise ConfigError(f"num_worlds is {num_worlds!r} but must be an integer of at least 1.")
     arguments = dict(env_kwargs or {})
     if isinstance(environment, gymnasium.Env):
         if num_worlds > 1 or arguments:
             raise UsageError(
-                "An environment that is made already is one world and takes no arguments. "
-                "Give the class, or a function that makes one."
+                "An existing environment is one world and takes no arguments: give its class, or a "
+                "function that returns one."
             )
         return Worlds([environment])
     made: list[gymnasium.Env[Any, Any]] = []
     try:
         for number in range(num_worlds):
-            made.append(_world(environment, arguments, number, num_worlds))
+            made.append(_make_world(environment, arguments, number, num_worlds))
         return Worlds(made, environment if isinstance(environment, str) else "")
     except BaseException:
-        for opened in made:
-            opened.close()
+        for world in made:
+            world.close()
         raise
 
 
-def _world(
+def is_gymnasium_id(reference: str) -> bool:
+    """Return whether a reference is a Gymnasium id: it begins with ``gym/`` or has a version."""
+    return reference.startswith(_PREFIX) or reference.rpartition("-v")[2].isdigit()
+
+
+def _make_world(
     environment: Any, arguments: dict[str, Any], number: int, num_worlds: int
 ) -> gymnasium.Env[Any, Any]:
     if isinstance(environment, str):
-        if environment.startswith(GYMNASIUM):
-            return _of_gymnasium(environment.removeprefix(GYMNASIUM), arguments)
-        if ":" not in environment and environment.rpartition("-v")[2].isdigit():
-            return _of_gymnasium(environment, arguments)
+        if is_gymnasium_id(environment):
+            return _make_gymnasium(environment.removeprefix(_PREFIX), arguments)
         environment = resolve("environment", environment)
     if isinstance(environment, type) and issubclass(environment, Environment):
         return SampleEnv(environment, **arguments, instance_id=number + 1, instance_nb=num_worlds)
     if not callable(environment):
-        raise UsageError(f"{environment!r} is no environment. {_SERVED}")
-    made = called(environment, arguments)
+        raise UsageError(f"{environment!r} is not an environment. {_SERVED}")
+    made = call_with(environment, arguments)
     if isinstance(made, gymnasium.Env):
         return made
-    raise UsageError(f"{environment!r} made {made!r:.80}, which is no gymnasium environment.")
+    raise UsageError(
+        f"{environment!r} returned {made!r:.80}, which is not a Gymnasium environment."
+    )
 
 
-def called(maker: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-    """Return what a function or class makes of the arguments.
+def call_with(maker: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
+    """Call a function or class with arguments.
 
     Raises:
-        ConfigError: It does not take them.
+        ConfigError: If it does not take them.
     """
     try:
         return maker(**arguments)
     except TypeError as error:
         if error.__traceback__ is not None and error.__traceback__.tb_next is not None:
-            raise  # not the call failed, but what was called
+            raise  # the call succeeded, and the code within it failed
         raise ConfigError(f"{maker!r} does not take these arguments: {error}.") from error
 
 
-def _of_gymnasium(name: str, arguments: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-    place = f"{_OWN_MODULE}:{name}" if name.startswith(_OWN) else name
+def _make_gymnasium(name: str, arguments: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+    if ":" not in name and name not in gymnasium.registry and _PLUGIN in available():
+        load(_PLUGIN)
     try:
-        return gymnasium.make(place, disable_env_checker=True, **arguments)
+        return gymnasium.make(name, disable_env_checker=True, **arguments)
     except gymnasium.error.UnregisteredEnv as error:
-        known = gymnasium.registry
-        raise ComponentNotFoundError("environment", name, "gymnasium", known) from error
-    except (gymnasium.error.Error, TypeError) as error:
+        place = 'Gymnasium (ids of other packages are written "package:id")'
+        raise ComponentNotFoundError("environment", name, place, gymnasium.registry) from error
+    except (gymnasium.error.Error, ModuleNotFoundError, TypeError) as error:
         if isinstance(error, PhysxError):
             raise
-        raise ConfigError(f"gymnasium cannot make {name}: {error}") from error
+        raise ConfigError(f"Gymnasium cannot create {name}: {error}") from error
