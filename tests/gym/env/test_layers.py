@@ -227,7 +227,7 @@ def test_names_are_unique():
 def test_a_block_is_of_one_environment():
     first, second = base(), base()
     block = Passing("pass", first)
-    with pytest.raises(ConfigError, match="was made for"):
+    with pytest.raises(ConfigError, match="was created for"):
         ControlledEnv(second, block)
     with pytest.raises(ConfigError, match="needs a ControllerBlock"):
         ControlledEnv(first, MahonyFilter("mahony", first))

@@ -86,7 +86,7 @@ def test_keys_become_actions_until_the_end(env):
 def test_without_a_pause_it_runs_at_once_until_the_episode_ends(env, capsys):
     env.play_interactive(start_paused=False)
     assert len(env.calls) == 6
-    assert capsys.readouterr().out.splitlines() == ["keys: k ends, p pauses", "terminated"]
+    assert capsys.readouterr().out.splitlines() == ["keys: k quits, p pauses", "terminated"]
 
 
 def test_the_next_episode_begins_if_wanted(env, capsys):

@@ -341,5 +341,5 @@ def test_a_viewer_without_pictures_is_refused():
     env = RobotEnv("cartpole", 0.02, render_mode="rgb_array")
     env.viewer_kwargs["visualizer"] = Fake
     env.reset(seed=0)
-    with pytest.raises(VisualizerError, match="Fake makes no pictures"):
+    with pytest.raises(VisualizerError, match="Fake cannot render pictures"):
         env.render()

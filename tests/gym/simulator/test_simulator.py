@@ -161,7 +161,7 @@ def test_sensors_with_a_past_measure_between_the_steps(backend):
     sensors = [Encoder(name="a", joint="slider", **options), Encoder(name="b", joint="hinge")]
     simulator = Simulator.build("cartpole", backend=backend, period=1e-3, sensors=sensors)
     simulator.seed(4)
-    simulator.set_moment(10)
+    simulator.set_reading_period(10)
     simulator.start([0.0, 0.1], [1.0, 0.0])
     bare = Simulator.build("cartpole", backend=backend, period=1e-3).simulation
     bare.set_state(np.array([0.0, 0.1]), np.array([1.0, 0.0]))

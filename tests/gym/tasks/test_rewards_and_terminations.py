@@ -195,11 +195,11 @@ def test_what_touches_slips_and_strains():
 
 def test_mistakes_are_named():
     env = ant()
-    with pytest.raises(ConfigError, match="no Reward"):
+    with pytest.raises(ConfigError, match="not a Reward"):
         ComposedEnv(env, reward=1.0)
-    with pytest.raises(ConfigError, match="no Termination"):
+    with pytest.raises(ConfigError, match="not a Termination"):
         ComposedEnv(env, terminations=[1.0])
-    with pytest.raises(ConfigError, match="one name"):
+    with pytest.raises(ConfigError, match="same name"):
         ComposedEnv(env, terminations=[base_height(0.1), base_height(0.2)])
     with pytest.raises(ConfigError, match="one name"):
         Sum([Survival(), Survival()])
@@ -242,7 +242,7 @@ def test_trajectories_are_interpolated_and_kept(tmp_path):
     (tmp_path / "noise.h5").write_bytes(b"noise" * 100)
     with pytest.raises(LogError, match="cannot be read"):
         Trajectory.load(tmp_path / "noise.h5")
-    with pytest.raises(ConfigError, match="must grow"):
+    with pytest.raises(ConfigError, match="must not decrease"):
         Trajectory(np.array([1.0, 0.0]), q, v)
     with pytest.raises(ConfigError, match="finite"):
         Trajectory(path.times, q * np.nan, v)

@@ -14,11 +14,11 @@ from physx_gym.spaces import format_path, leaves, value_at
 
 
 class ObservationChecks(SharedArrays):
-    """Finds what is no number in observations of a space, and what is outside of it.
+    """Finds NaN in observations of a space, and observations outside of it.
 
     Attributes:
         space: The space.
-        tells_nan: Whether nothing that is inside holds a NaN.
+        excludes_nan: Whether an observation within the space is free of NaN.
     """
 
     def __init__(self, space: spaces.Space[Any], flat: NDArray[Any] | None = None) -> None:
@@ -26,24 +26,24 @@ class ObservationChecks(SharedArrays):
 
         Args:
             space: Their space.
-            flat: Memory of the one buffer that they all are, its leaves one after the other in the
-                order of the space; None: any observation.
+            flat: Memory of the only buffer to be checked, with its leaves in the order of the
+                space; None: any observation.
         """
         self.space = space
         self._leaves = list(leaves(space))
         boxes = [each for _, each in self._leaves if isinstance(each, spaces.Box)]
         floating = all(np.issubdtype(each.dtype, np.floating) for each in boxes)
-        self._flat, self._even = flat, floating and len(boxes) == len(self._leaves)
+        self._flat, self._is_floating = flat, floating and len(boxes) == len(self._leaves)
         low = np.concatenate([np.ravel(each.low) for each in boxes]) if boxes else np.zeros(0)
         high = np.concatenate([np.ravel(each.high) for each in boxes]) if boxes else np.zeros(0)
         self._low, self._high = low, high
-        self._bounded = bool(np.isfinite(low).any() or np.isfinite(high).any())
-        self.tells_nan = self._even and self._bounded
+        self._is_bounded = bool(np.isfinite(low).any() or np.isfinite(high).any())
+        self.excludes_nan = self._is_floating and self._is_bounded
         self._within = np.empty((2, len(low)), np.bool_)
         self._above, self._below = self._within
 
     def _vector(self, observation: Any) -> Any:
-        """Return all numbers of an observation, if they are floating, as a vector."""
+        """Return all numbers of an observation, which are floating, as a vector."""
         if self._flat is not None:
             return self._flat
         if type(observation) is np.ndarray:
@@ -54,9 +54,9 @@ class ObservationChecks(SharedArrays):
         """Check that there is no NaN.
 
         Raises:
-            SimulationError: There is one; the message says where.
+            SimulationError: If there is one; the message says where.
         """
-        if self._even:
+        if self._is_floating:
             vector = self._vector(observation)
             total = vector.dot(vector)
             if total == total:
@@ -71,11 +71,11 @@ class ObservationChecks(SharedArrays):
                     "refresh_observation, and at what the simulation measures."
                 )
 
-    def inside(self, observation: Any) -> bool:
+    def is_inside(self, observation: Any) -> bool:
         """Return whether an observation is within its space."""
-        if not self._even:
+        if not self._is_floating:
             return bool(self.space.contains(observation))
-        if not self._bounded:
+        if not self._is_bounded:
             return True
         vector = self._vector(observation)
         np.greater_equal(vector, self._low, self._above)
@@ -86,7 +86,7 @@ class ObservationChecks(SharedArrays):
         """Check that an observation has the form of its space, whatever its values.
 
         Raises:
-            SimulationError: It has another one.
+            SimulationError: If it does not.
         """
         for path, space in self._leaves:
             try:

@@ -1,24 +1,22 @@
-"""What the base environment and every layer of a pipeline have in common."""
+"""The interface of a pipeline: that of the base environment and of every layer on it."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from physx_core.simulation import Part
+from physx_core.typing import Vector
 from physx_gym.shared_arrays import SharedArrays
+from physx_gym.simulator.simulator import Simulator
+from physx_gym.simulator.states import RobotState, StepperState
 from physx_gym.spaces import copy_tree, fill
-
-if TYPE_CHECKING:
-    from physx_core.simulation import Part
-    from physx_core.typing import Vector
-    from physx_gym.env.robot_env import RobotEnv
-    from physx_gym.simulator.simulator import Simulator
-    from physx_gym.simulator.states import RobotState, StepperState
+from physx_gym.telemetry.episode_recorder import EpisodeRecorder
 
 Info = dict[str, Any]
 Step = tuple[Any, float, bool, bool, Info]
@@ -31,23 +29,24 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
     updated in place; `reset` and `step` return copies.
 
     Attributes:
-        observation: What this layer observed last.
-        action: What this layer was told last, within the action space.
+        observation: The latest observation of this layer.
+        action: The latest action of this layer, within the action space.
         simulator: The world, its motors and sensors.
-        robot: Place of the robot that acts in the simulation's state.
-        robot_state: State of the robot that acts.
+        robot: Place of the controlled robot in the simulation's state.
+        robot_state: State of the controlled robot.
         stepper_state: Time and physics steps of the episode.
         is_simulation_running: Whether an episode runs; shape ().
         num_steps: Steps since the last reset; -1 before the first; shape ().
-        measurements: What the simulation measured last: ``t``, ``states``, ``measurements``.
+        measurements: The latest measurement: ``t``, ``states``, ``measurements``.
         quantities: Values that rewards and terminations share, computed at most once a step.
+        recorder: Records episodes.
         simulation_duration_max: Time, in s, after which an episode is truncated.
         debug: Whether every physics step is recorded.
         reset_options: The options that `reset` was given.
         viewer_kwargs: Options of the viewer.
         step_dt: Time of a step, in s.
         control_dt: Time between two commands, in s; of a layer, between two of its own.
-        observe_dt: Time between two observations within a step, likewise.
+        observe_dt: Time between two observations within a step, in s; likewise.
     """
 
     observation: Any
@@ -60,6 +59,7 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
     num_steps: NDArray[np.int64]
     measurements: dict[str, Any]
     quantities: Any
+    recorder: EpisodeRecorder
     simulation_duration_max: float
     debug: bool
     reset_options: dict[str, Any]
@@ -72,31 +72,31 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
 
     @abstractmethod
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Bring `observation` to the present, in place.
+        """Update `observation` in place.
 
         Called every `observe_dt` and at the end of each step and reset.
 
         Args:
-            measurement: What was measured: ``t``, ``states``, ``measurements``.
+            measurement: The latest measurement: ``t``, ``states``, ``measurements``.
         """
 
     @abstractmethod
     def compute_command(self, action: Any, command: Vector) -> None:
-        """Write the command of the layer below, or of the motors, in place.
+        """Write the action of the layer below, or the command of the motors, in place.
 
         Called every `control_dt`.
 
         Args:
-            action: What this layer shall do: its own `action`.
+            action: The action of this layer.
             command: Torques of the motors, shape (motors,), in N m or N.
         """
 
     @abstractmethod
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
-        """Return whether the episode terminated, and whether it is truncated.
+        """Return whether the episode is terminated, and whether it is truncated.
 
         Args:
-            info: Of this step; to be added to.
+            info: Information of this step, to be extended.
         """
 
     @abstractmethod
@@ -104,14 +104,14 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         """Return the reward of this step, of this layer and all below.
 
         Args:
-            terminated: Whether this step ended the task.
-            info: Of this step; to be added to.
+            terminated: Whether this step terminated the episode.
+            info: Information of this step, to be extended.
         """
 
     def _setup(self) -> None:
-        """Configure for the episode that begins, before its first state is known.
+        """Configure the next episode, before its first state is known.
 
-        Called at every reset: the base environment's first, then each layer's from below.
+        Called at every reset: the base environment's first, then each layer's, from below.
         """
 
     @abstractmethod
@@ -124,49 +124,28 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
 
     @abstractmethod
     def _initialize_buffers(self) -> None:
-        """Prepare for the episode: it runs, but nothing was observed yet."""
+        """Prepare for the episode: the simulation runs, but nothing is observed yet."""
 
     @abstractmethod
     def _refresh_buffers(self) -> None:
-        """Bring to the present what termination and reward share; called once a step."""
+        """Update what termination and reward share; called once a step."""
 
     # The pipeline ----------------------------------------------------------------------------
 
     @property
     @abstractmethod
-    def unwrapped(self) -> RobotEnv:
-        """The base environment of the pipeline."""
+    def unwrapped(self) -> Any:
+        """The base environment of the pipeline, a `RobotEnv`."""
 
     @property
-    def derived(self) -> PipelineEnv:
-        """The topmost layer of the pipeline that this environment is part of."""
-        return self.unwrapped.derived
+    @abstractmethod
+    def outermost(self) -> PipelineEnv:
+        """The outermost environment of the pipeline that this one is part of."""
 
     @property
+    @abstractmethod
     def layers(self) -> tuple[PipelineEnv, ...]:
         """This environment and all below it, the base first."""
-        found: list[PipelineEnv] = []
-        layer: PipelineEnv | None = self
-        while layer is not None:
-            found.append(layer)
-            layer = layer._below()
-        return tuple(reversed(found))
-
-    def _below(self) -> PipelineEnv | None:
-        """Return the layer below; None: this is the base."""
-        return None
-
-    def has_wrapper_attr(self, name: str) -> bool:
-        """Return whether this environment or one below has an attribute."""
-        return hasattr(self, name)
-
-    def get_wrapper_attr(self, name: str) -> Any:
-        """Return an attribute of this environment, or of the first below that has it.
-
-        Raises:
-            AttributeError: None has it.
-        """
-        return getattr(self, name)
 
     def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
         """Set an attribute on the first environment that has it, from this one to the base.
@@ -174,61 +153,77 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         Args:
             name: Name of the attribute.
             value: Its value.
-            force: Where none has it: whether to add it to this one.
+            force: Whether to add it to this environment if none has it.
 
         Returns:
             Whether it was set.
         """
         for layer in reversed(self.layers):
-            if name in vars(layer) or _is_own(type(layer), name):
+            if name in vars(layer) or _defines(type(layer), name):
                 setattr(layer, name, value)
                 return True
         if force:
             setattr(self, name, value)
         return force
 
-    @property
-    def log_fieldnames(self) -> Mapping[str, Any]:
-        """Names of the recorded numbers of every registered variable, of all layers."""
-        return self.unwrapped.recording.telemetry.fieldnames
-
     # Running ---------------------------------------------------------------------------------
 
+    @abstractmethod
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, Info]:
-        """Begin an episode with this environment as the top of its pipeline.
+        """Start an episode with this environment as the outermost of its pipeline.
 
         Args:
-            seed: Of everything that is drawn from now on; None: go on with what is there.
+            seed: Seed of everything that is random from now on; None: continue the sequence.
             options: For `_setup` of all layers, which find them in `reset_options`.
 
         Returns:
             The first observation, and information.
 
         Raises:
-            EpisodeError: The first state ends the episode already.
-            ConfigError: Periods do not fit together.
-            SimulationError: The first state makes no sense.
+            EpisodeError: If the first state already ends the episode.
+            ConfigError: If periods do not fit together.
+            SimulationError: If the first state is invalid.
         """
-        return self.unwrapped.run_reset(self, seed, options)
 
+    @abstractmethod
     def step(self, action: Any) -> Step:
         """Simulate `step_dt` under an action.
 
         Args:
-            action: Brought into the bounds of the action space before anything sees it.
+            action: Clipped to the bounds of the action space before anything sees it.
 
         Returns:
-            Observation, reward, whether the episode terminated, whether it is truncated, and
+            Observation, reward, whether the episode is terminated, whether it is truncated, and
             information.
 
         Raises:
-            EpisodeError: No episode runs, it is over, or another layer began it.
-            ActionError: The action has another form than the action space, or is not a number.
-            SimulationError: The simulation, an observation or a reward is no longer finite.
+            EpisodeError: If no episode runs, it is over, or another layer started it.
+            ActionError: If the action does not have the form of the action space, or is not finite.
+            SimulationError: If the simulation, an observation or a reward is no longer finite.
         """
-        return self.unwrapped.run_step(self, action)
+
+    @abstractmethod
+    def stop(self) -> None:
+        """End the episode and write what was recorded. To continue, call `reset`."""
+
+    @property
+    @abstractmethod
+    def training(self) -> bool:
+        """Whether this is for training; otherwise for evaluation, where episodes are recorded."""
+
+    @abstractmethod
+    def train(self, mode: bool = True) -> None:
+        """Switch between training and evaluation.
+
+        Raises:
+            EpisodeError: If an episode runs.
+        """
+
+    def eval(self) -> None:
+        """Switch to evaluation; see `train`."""
+        self.train(False)
 
     def evaluate(
         self,
@@ -257,16 +252,67 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
 
         play(self, enable_travelling, start_paused, enable_is_done, verbose, **kwargs)
 
-    @abstractmethod
-    def stop(self) -> None:
-        """End the episode; what was recorded is written. To go on, call `reset`."""
+    # Recording -------------------------------------------------------------------------------
+
+    def register_variable(
+        self,
+        name: str,
+        value: Any,
+        fieldnames: str | Mapping[str, Any] | Sequence[Any] | None = None,
+        namespace: str | None = None,
+        *,
+        is_eval_only: bool = True,
+    ) -> None:
+        """Record arrays from the next reset on.
+
+        Args:
+            name: Name of the variable; its columns begin with it.
+            value: An array of float64 or int64, or nested containers of them. They are read
+                whenever a row is recorded, so keep them and update them in place.
+            fieldnames: Names of all numbers, nested like the value; None: numbered.
+            namespace: Prefix of the name; None: none.
+            is_eval_only: Whether it is left out in training.
+        """
+        self.recorder.telemetry.register(
+            name, value, fieldnames, namespace, is_eval_only=is_eval_only
+        )
+
+    @property
+    def log_fieldnames(self) -> Mapping[str, Any]:
+        """Names of the recorded numbers of every registered variable, of all layers."""
+        return self.recorder.telemetry.fieldnames
+
+    @property
+    def log_data(self) -> dict[str, Any]:
+        """What was recorded of the running episode, up to now, or of the last one.
+
+        A dictionary of ``"constants"`` and ``"variables"``, columns by name; empty without rows.
+        """
+        return self.recorder.data()
+
+    def plot(self, enable_block_states: bool = False, **kwargs: Any) -> Any:
+        """Plot the running episode, or the last one; see `physx_gym.show.plotting.plot`.
+
+        Args:
+            enable_block_states: Whether states of blocks are shown too.
+            kwargs: For `physx_gym.show.plotting.plot`.
+        """
+        from physx_gym.show.plotting import plot
+
+        return plot(self.log_data, enable_block_states=enable_block_states, **kwargs)
+
+    def replay(self, **kwargs: Any) -> Any:
+        """Show the running episode, or the last one; see `physx_gym.show.replaying.replay`."""
+        from physx_gym.show.replaying import replay
+
+        return replay(self.log_data, **kwargs)
 
     # State -----------------------------------------------------------------------------------
 
     def snapshot(self) -> Any:
-        """Return everything that `restore` needs to go on exactly from here; plain data.
+        """Return everything that `restore` needs to continue exactly from here; plain data.
 
-        It holds the simulation, all draws, and every layer up to this one.
+        It holds the simulation, all random generators, and every layer up to this one.
         """
         layers = self.layers
         return {
@@ -274,23 +320,23 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
             "own": [layer._snapshot_own() for layer in layers],
         }
 
+    @abstractmethod
     def restore(self, state: Any) -> None:
-        """Go back to a snapshot of this environment, or of one that is built alike.
+        """Return to a snapshot of this environment, or of one that is built alike.
 
         Raises:
-            SimulationError: It is of another environment.
+            SimulationError: If the snapshot is of another environment.
         """
-        self.unwrapped.run_restore(self, state)
 
     def _memory(self) -> Any:
-        """Return what this layer alone remembers, as plain data; None: nothing.
+        """Return what this layer alone keeps from one step to the next, as plain data.
 
-        To be overridden, with `_recall`, where attributes live from one step to the next.
+        To be overridden together with `_recall`; None: nothing.
         """
         return None
 
     def _recall(self, memory: Any) -> None:
-        """Take up what `_memory` returned."""
+        """Restore what `_memory` returned."""
 
     def _snapshot_own(self) -> dict[str, Any]:
         return {
@@ -305,7 +351,7 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         self._recall(copy_tree(own["memory"]))
 
 
-def _is_own(kind: type, name: str) -> bool:
+def _defines(kind: type, name: str) -> bool:
     """Return whether a class below `PipelineEnv` has an attribute that can be set."""
     for each in kind.__mro__:
         if each in (PipelineEnv, SharedArrays, gymnasium.Env, object):

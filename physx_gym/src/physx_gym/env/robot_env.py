@@ -1,22 +1,34 @@
-"""The base environment: a robot in a world, to be controlled step by step."""
+"""The base environment: a robot in a world, controlled step by step."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import weakref
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import gymnasium
 import numpy as np
 
+from physx_core import checks
 from physx_core.components import Factory
-from physx_core.errors import ConfigError, EpisodeError, UsageError
+from physx_core.errors import ConfigError, EpisodeError, SimulationError, UsageError
 from physx_core.typing import Vector
-from physx_gym.env.episodes import Episodes
-from physx_gym.env.pipeline_env import Info
-from physx_gym.simulator.boxes import action_space_of, observation_space_of, observed
-from physx_gym.spaces import neutral
+from physx_gym.env import subclass_checks
+from physx_gym.env.control_loop import ControlLoop
+from physx_gym.env.default_spaces import (
+    action_space_of,
+    allocate_observation,
+    observation_space_of,
+)
+from physx_gym.env.observation_checks import ObservationChecks
+from physx_gym.env.pipeline_env import Info, PipelineEnv, Step
+from physx_gym.env.timing import StepTiming
+from physx_gym.simulator.simulator import Simulator, make_simulator
+from physx_gym.spaces import copy_tree, fill, neutral
+from physx_gym.telemetry.episode_recorder import EpisodeRecorder
 
 
-class RobotEnv(Episodes):
+class RobotEnv(PipelineEnv):
     """A robot that is controlled step by step, as a Gymnasium environment.
 
     The observation is the time, the state of the robot, and what its sensors measure; the action is
@@ -25,29 +37,114 @@ class RobotEnv(Episodes):
     `refresh_observation`. `_initialize_action_space` and `_initialize_observation_space` are called
     at construction, and at a reset after `_setup` has changed the simulator's options.
 
-    Members and the order in which they are called are those of the class that `Episodes` describes.
+    Reset: `stop`; the seed; registered forces are removed; `_setup`; spaces, if the simulator was
+    rebuilt; actions become neutral; `_setup` of the layers; `_sample_state`; the simulation starts;
+    `_initialize_buffers`; `_refresh_buffers`; `refresh_observation`; `has_terminated`.
+
+    Step: the action is checked and clipped; every `control_dt` `compute_command`, every
+    `observe_dt` `refresh_observation` (before a command at the same time); then once
+    `_refresh_buffers`, `refresh_observation`, `has_terminated`, `compute_reward`. All methods are
+    those of the outermost environment. An exception stops the episode.
     """
 
     metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 - as gymnasium has it
 
     holds_command: ClassVar[bool | None] = None
-    """Whether `compute_command` depends on nothing but the action, so that once a step is enough,
-    where nothing observes between; None: if it is not overridden."""
+    """Whether `compute_command` depends on nothing but the action, so that once a step is enough if
+    nothing observes in between; None: if it is not overridden."""
+
+    _left_out: ClassVar[frozenset[str]] = frozenset({"_outermost", "_own_renderer"})
+
+    def __init__(
+        self,
+        simulator: Any,
+        step_dt: float,
+        simulation_duration_max: float = 86400.0,
+        debug: bool = False,
+        render_mode: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Create an environment; nothing runs before `reset`.
+
+        Args:
+            simulator: A `Simulator`; or a world, or the path or name of a robot, to create one of.
+            step_dt: Time of a step, in s; a multiple of the control and observation periods.
+            simulation_duration_max: Time, in s, after which an episode is truncated.
+            debug: Whether every physics step is recorded, in training too.
+            render_mode: ``"human"``, ``"rgb_array"``, or None: whichever is possible.
+            kwargs: Options of `Simulator.build` or `Simulator`, if one is created; otherwise those
+                of the next class that an environment with several base classes inherits from.
+
+        Raises:
+            ConfigError: If an option is invalid.
+        """
+        if not isinstance(simulator, Simulator):
+            simulator, kwargs = make_simulator(simulator, kwargs), {}
+        subclass_checks.construct_next(RobotEnv, self, kwargs)
+        subclass_checks.check_mode(render_mode, self.metadata["render_modes"])
+        self.simulator, self.render_mode, self.debug = simulator, render_mode, bool(debug)
+        self.step_dt = checks.positive("step_dt", step_dt)
+        self.metadata = subclass_checks.metadata_of(type(self), self.step_dt)
+        self.simulation_duration_max = simulation_duration_max
+        self.num_steps = np.full((), -1, np.int64)
+        self.reset_options: dict[str, Any] = {}
+        self.viewer_kwargs: dict[str, Any] = {}
+        self.recorder = EpisodeRecorder(simulator)
+        self.control_dt = self.observe_dt = -1.0
+        self._control_loop = ControlLoop()
+        self._outermost: weakref.ref[PipelineEnv] | None = None
+        self._own_renderer: Any = None
+        self._own_quantities: Any = None
+        self._is_training = True
+        self._set_timing()
+        self._initialize_spaces()
+
+    # Spaces and buffers ------------------------------------------------------------------------
 
     def _initialize_action_space(self) -> None:
-        """Set `action_space`: by default a torque for each motor, within what it can give."""
+        """Set `action_space`: by default the torques that the motors can exert."""
         self.action_space = action_space_of(self.simulator)
 
     def _initialize_observation_space(self) -> None:
         """Set `observation_space`: by default that of `measurements`."""
-        self.observation_space = observation_space_of(self.simulator, self.periods.longest)
+        longest = self._control_loop.timing.longest
+        self.observation_space = observation_space_of(self.simulator, longest)
 
-    def _make_buffers(self) -> None:
-        """Make `action` and `observation`, and check that subclasses belong to their spaces."""
-        default = observation_space_of(self.simulator, self.periods.longest)
-        self._flat_observation = None
+    def _set_timing(self) -> None:
+        """Determine what is due when in a step."""
+        simulator = self.simulator
+        self._control_loop.timing = timing = StepTiming(
+            simulator.period,
+            self.step_dt,
+            simulator.control_period,
+            simulator.observe_period,
+            self.simulation_duration_max,
+        )
+        self.control_dt, self.observe_dt = timing.control_dt, timing.observe_dt
+        simulator.set_reading_period(1 if self.debug else timing.tick)
+
+    def _initialize_spaces(self) -> None:
+        """Initialize what depends on the simulator: spaces, buffers and their checks."""
+        simulator, loop = self.simulator, self._control_loop
+        simulator.prepare()
+        self.robot, self.robot_state = simulator.robot, simulator.robot_state
+        self.stepper_state, self.measurements = simulator.stepper_state, simulator.measurements
+        self.is_simulation_running = simulator.is_simulation_running
+        self._initialize_action_space()
+        self._initialize_observation_space()
+        subclass_checks.check_spaces(self)
+        self._allocate_buffers()
+        loop.own_checks = ObservationChecks(self.observation_space, self._flat_observation)
+        loop.builds = simulator.builds
+
+    def _allocate_buffers(self) -> None:
+        """Allocate `action` and `observation`, and check that the subclass fills its own spaces."""
+        default = observation_space_of(self.simulator, self._control_loop.timing.longest)
+        self._flat_observation: Any = None
         if self.observation_space == default:
-            self.__observed, self._flat_observation, self.observation = observed(self.simulator)
+            self._observed_index, self._flat_observation, self.observation = allocate_observation(
+                self.simulator
+            )
         else:
             self.observation = neutral(self.observation_space)
             if type(self).refresh_observation is RobotEnv.refresh_observation:
@@ -56,34 +153,26 @@ class RobotEnv(Episodes):
                     "refresh_observation, which writes into self.observation."
                 )
         self.action = neutral(self.action_space)
-        own_command = type(self).compute_command is not RobotEnv.compute_command
-        if not own_command and np.shape(self.action) != self.robot_state.command.shape:
+        has_own_command = type(self).compute_command is not RobotEnv.compute_command
+        if not has_own_command and np.shape(self.action) != self.robot_state.command.shape:
             raise ConfigError(
                 f"{type(self).__name__} has its own action space: override compute_command, which "
                 f"writes torques of the {len(self.robot_state.command)} motors into `command`."
             )
 
-    def _is_held(self) -> bool:
-        own = type(self)
-        held = own.holds_command
-        if held is None:
-            held = own.compute_command is RobotEnv.compute_command
-        observes = own.refresh_observation is not RobotEnv.refresh_observation
-        return held and (not observes or self.periods.observe == self.periods.whole)
-
-    # What happens in an episode ----------------------------------------------------------------
+    # What subclasses may override --------------------------------------------------------------
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Bring `observation` to the present, in place: by default it is the measurement.
+        """Update `observation` in place: by default it is the measurement.
 
-        Called every `observe_dt` and at the end of each step and reset. Only `measurement` is to be
-        relied on for the state.
+        Called every `observe_dt` and at the end of each step and reset. Rely on nothing but
+        `measurement` for the state.
 
         Args:
-            measurement: What was measured: ``t``, ``states``, ``measurements``.
+            measurement: The latest measurement: ``t``, ``states``, ``measurements``.
         """
         if self._flat_observation is not None:
-            self.simulator.values.take(self.__observed, None, self._flat_observation, "clip")
+            self.simulator.values.take(self._observed_index, None, self._flat_observation, "clip")
 
     def compute_command(self, action: Any, command: Vector) -> None:
         """Write the torques of the motors, in place: by default the action.
@@ -91,28 +180,35 @@ class RobotEnv(Episodes):
         Called every `control_dt`, and never before the first step.
 
         Args:
-            action: What the agent wants: `action`, within its space.
-            command: Torques of the motors, shape (motors,), in N m or N of their shafts; the motors
-                cut them.
+            action: The buffer `action`, within its space.
+            command: Torques of the motors' shafts, shape (motors,), in N m or N; the motors clip
+                them.
         """
         command[:] = action
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
         """Return whether the task is over, and whether the episode is to be cut off.
 
-        By default nothing terminates, and an observation outside of its space truncates. What lasts
-        longer than `simulation_duration_max` is truncated besides. Called after `observation` was
-        brought to the present.
+        By default nothing terminates, and an observation outside of its space truncates. Episodes
+        longer than `simulation_duration_max` are truncated in any case. Called after `observation`
+        was updated.
 
         Args:
-            info: Of this step; to be added to.
+            info: Information of this step, to be extended.
 
         Raises:
-            EpisodeError: No episode runs.
+            EpisodeError: If no episode runs.
         """
         if not self.is_simulation_running:
-            raise EpisodeError("has_terminated is of a running episode: call reset first.")
+            raise EpisodeError("has_terminated needs a running episode: call reset first.")
         return False, not self.is_inside()
+
+    def is_inside(self) -> bool:
+        """Return whether `observation` is within its space."""
+        loop = self._control_loop
+        inside = loop.own_checks.is_inside(self.observation)
+        loop.is_finite = inside and loop.own_checks.excludes_nan
+        return inside
 
     def compute_reward(self, terminated: bool, info: Info) -> float:
         """Return the reward of this step: by default 0.
@@ -120,25 +216,23 @@ class RobotEnv(Episodes):
         Called once a step after `has_terminated`.
 
         Args:
-            terminated: Whether this step ended the task.
-            info: Of this step; to be added to.
+            terminated: Whether this step terminated the episode.
+            info: Information of this step, to be extended.
         """
         return 0.0
 
-    # How an episode begins ---------------------------------------------------------------------
-
     def _setup(self) -> None:
-        """Configure for the episode that begins.
+        """Configure the next episode.
 
         Called at every reset before anything of the episode exists. Options of the simulator may be
         set and forces registered here; `step_dt` is known, `control_dt` and `observe_dt` are those
-        of the episode before. `reset_options` is what `reset` was given.
+        of the previous episode. `reset_options` is what `reset` was given.
         """
 
     def _neutral(self) -> Vector:
-        """Return positions of the robot, shape (nq,), to begin at.
+        """Return the neutral positions of the robot, shape (nq,).
 
-        By default each joint is at 0, or in the middle of its limits if 0 is not within them, and a
+        By default each joint is at 0, or in the middle of its limits if 0 is outside of them, and a
         floating base is where the world puts it. Called by `_sample_state`.
         """
         return self.simulator.neutral()
@@ -147,38 +241,36 @@ class RobotEnv(Episodes):
         """Return the first positions and velocities, of the robot or of the whole world.
 
         By default the neutral positions at rest; a floating base is moved up or down so that the
-        lowest collision shape touches the ground. Called once at every reset; it draws from
-        `np_random`, if at all.
+        lowest collision shape touches the ground. Called once at every reset; draw random numbers
+        from `np_random` only.
         """
         positions = self.simulator.place_on_ground(self._neutral())
         return positions, np.zeros(len(self.robot_state.v))
 
     def _initialize_buffers(self) -> None:
-        """Prepare for the episode: it runs, but nothing was observed yet.
+        """Prepare for the episode: the simulation runs, but nothing is observed yet.
 
         Called once at every reset, before `_refresh_buffers`.
         """
 
     def _refresh_buffers(self) -> None:
-        """Bring to the present what `has_terminated` and `compute_reward` share.
+        """Update what `has_terminated` and `compute_reward` share.
 
         Called once at every reset and step, before the last observation of the step.
         """
 
-    # Who watches and plays ---------------------------------------------------------------------
-
     def _key_to_action(
         self, key: str | None, obs: Any, reward: float | None, **kwargs: Any
     ) -> Any | None:
-        """Return the action of a key, for `play_interactive`; None: hold the present action.
+        """Return the action of a key, for `play_interactive`; None: keep the present action.
 
         Called before every step.
 
         Args:
-            key: Which was pressed since the last step; None: none.
+            key: The key pressed since the last step; None: none.
             obs: The last observation.
             reward: The last reward; None right after `reset`.
-            kwargs: What `play_interactive` was given besides.
+            kwargs: Further options of `play_interactive`.
         """
         raise UsageError(
             f"{type(self).__name__} cannot be played: override _key_to_action, which returns the "
@@ -186,30 +278,292 @@ class RobotEnv(Episodes):
         )
 
     def _draw(self, scene: Factory) -> None:
-        """Draw what is shown but is not in the world, such as a goal, before the first frame.
+        """Draw what is not simulated, such as a goal, before the first frame.
 
         Args:
-            scene: What to draw with.
+            scene: Factory to draw with.
         """
 
     def _redraw(self, scene: Factory) -> None:
-        """Bring what `_draw` drew to the present, before every further frame.
+        """Update what `_draw` drew, before every further frame.
 
         Args:
-            scene: What it was drawn with.
+            scene: Factory that it was drawn with.
         """
+
+    # The pipeline ------------------------------------------------------------------------------
+
+    @property
+    def unwrapped(self) -> RobotEnv:
+        """This environment."""
+        return self
+
+    @property
+    def outermost(self) -> PipelineEnv:
+        """The outermost layer of the pipeline on this environment; itself, if there is none."""
+        found = None if self._outermost is None else self._outermost()
+        return self if found is None else found
+
+    @property
+    def layers(self) -> tuple[PipelineEnv, ...]:
+        """This environment alone."""
+        return (self,)
+
+    def _update_pipeline(self, outermost: PipelineEnv | None) -> None:
+        """Make a layer the outermost of the pipeline; None: this environment alone."""
+        self.adopt(outermost)
+        if self._control_loop.is_ready:
+            self._control_loop.refuse("The pipeline has changed: call reset().")
+
+    def adopt(self, outermost: PipelineEnv | None) -> None:
+        """Make a layer the outermost of the pipeline without ending its episode."""
+        if outermost is None or outermost is self:
+            self._outermost = None
+        else:
+            self._outermost = weakref.ref(outermost)
+
+    @property
+    def quantities(self) -> Any:
+        """Values that rewards and terminations share, computed at most once a step."""
+        if self._own_quantities is None:
+            from physx_gym.tasks.quantities import Quantities
+
+            self._own_quantities = Quantities(self.simulator, self.step_dt)
+        return self._own_quantities
+
+    @property
+    def training(self) -> bool:
+        """Whether this is for training; otherwise for evaluation, where episodes are recorded."""
+        return self._is_training
+
+    def train(self, mode: bool = True) -> None:
+        """Switch between training and evaluation.
+
+        Raises:
+            EpisodeError: If an episode runs.
+        """
+        if bool(mode) is not self._is_training and self.is_simulation_running:
+            raise EpisodeError("An episode runs: call stop() before train() or eval().")
+        self._is_training = bool(mode)
+
+    # Reset -------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, Info]:
+        """Start an episode without layers; see `PipelineEnv.reset`."""
+        return self.run_reset(self, seed, options)
+
+    def run_reset(
+        self, outermost: PipelineEnv, seed: int | None, options: dict[str, Any] | None
+    ) -> tuple[Any, Info]:
+        """Start an episode with an outermost environment; see `reset`."""
+        if options is not None and not isinstance(options, Mapping):
+            raise ConfigError(f"The options of reset are {options!r} but must be a mapping.")
+        self.stop()
+        simulator, loop, layers = self.simulator, self._control_loop, outermost.layers
+        self._update_pipeline(outermost)
+        if seed is not None or self._np_random is None:
+            self._initialize_seed(seed)
+        self.reset_options = dict(options or {})
+        simulator.remove_all_forces()
+        self._setup()
+        self._set_timing()
+        simulator.prepare()
+        if simulator.builds != loop.builds:
+            self._initialize_spaces()
+            for layer in layers[1:]:
+                layer._initialize_action_space()
+                layer._initialize_observation_space()
+            self._seed_spaces(layers)
+        loop.episode += 1
+        for layer in layers:
+            fill(layer.action, neutral(layer.action_space))
+        self.num_steps[...] = loop.steps = 0
+        for layer in layers[1:]:
+            layer._setup()
+        state = subclass_checks.check_pair(self, "_sample_state", self._sample_state())
+        if self._own_quantities is not None:
+            self._own_quantities.reset()
+        try:
+            simulator.start(*state)
+            info = self._begin_episode(outermost, loop)
+        except BaseException:
+            self.stop()
+            raise
+        loop.is_ready = True
+        if self.render_mode == "human":
+            self.render()
+        return loop.copy(outermost.observation), info
+
+    def _initialize_seed(self, seed: int | None = None) -> None:
+        """Seed everything that is random: states, errors of sensors, samples of spaces.
+
+        Args:
+            seed: A seed, from 0; None: a random one.
+        """
+        if seed is None:
+            self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random()
+        else:
+            gymnasium.Env.reset(self, seed=seed)
+        self._control_loop.episode = 0
+        self.simulator.seed(np.random.SeedSequence(self.np_random_seed, spawn_key=(1,)))
+        self._seed_spaces(self.outermost.layers)
+
+    def _seed_spaces(self, layers: tuple[PipelineEnv, ...]) -> None:
+        """Seed the samples of the layers' spaces, unless the seed of the environment is unknown."""
+        episode = self._control_loop.episode
+        for i, layer in enumerate(layers if self.np_random_seed >= 0 else ()):
+            for k, space in enumerate((layer.action_space, layer.observation_space)):
+                key = (2, i, k, episode) if episode else (2, i, k)
+                sequence = np.random.SeedSequence(self.np_random_seed, spawn_key=key)
+                space.seed(int(sequence.generate_state(1)[0]))
+
+    def _begin_episode(self, outermost: PipelineEnv, loop: ControlLoop) -> Info:
+        """Observe the first state, and prepare the steps."""
+        outermost._initialize_buffers()
+        outermost._refresh_buffers()
+        if self._own_quantities is not None:
+            self._own_quantities.clear()
+        if outermost.refresh_observation(self.measurements) is not None:
+            raise subclass_checks.not_written(outermost, "refresh_observation", "self.observation")
+        loop.connect(outermost, outermost is self)
+        loop.checks.check_form(outermost.observation)
+        loop.checks.check_finite(outermost.observation)
+        info: Info = {}
+        if self._is_training and not self.debug:
+            loop.is_recorded = self.recorder.begin_training()
+        else:
+            info["log_path"] = self._begin_recording(outermost)
+            loop.is_recorded = True
+        is_held = outermost is self and not loop.is_recorded and self._is_command_held()
+        loop.schedule = loop.timing.schedule(is_held, loop.is_recorded and self.debug)
+        ends = subclass_checks.check_pair(
+            outermost, "has_terminated", outermost.has_terminated(info)
+        )
+        if any(ends):
+            word = "terminated" if ends[0] else "truncated"
+            raise EpisodeError(
+                f"The episode is {word} at its first state already. Look at _sample_state and "
+                f"has_terminated; the first observation is {outermost.observation}."
+            )
+        return info
+
+    def _begin_recording(self, outermost: PipelineEnv) -> str:
+        """Start to record everything; return the path of the log."""
+        constants = {
+            "seed": self.np_random_seed,
+            "step_dt": self.step_dt,
+            "control_dt": self.control_dt,
+            "observe_dt": self.observe_dt,
+        }
+        path = self.reset_options.get("log_path")
+        return self.recorder.begin(type(self).__name__, outermost.action, path, constants)
+
+    def _is_command_held(self) -> bool:
+        """Return whether commands and observations within a step make no difference."""
+        own, timing = type(self), self._control_loop.timing
+        is_held = own.holds_command
+        if is_held is None:
+            is_held = own.compute_command is RobotEnv.compute_command
+        observes = own.refresh_observation is not RobotEnv.refresh_observation
+        return is_held and (not observes or timing.observe == timing.step)
+
+    # Step --------------------------------------------------------------------------------------
+
+    def step(self, action: Any) -> Step:
+        """Simulate `step_dt` under an action; see `PipelineEnv.step`."""
+        return self.run_step(self, action)
+
+    def run_step(self, outermost: PipelineEnv, action: Any) -> Step:
+        """Simulate a step under an action of the outermost environment; see `step`."""
+        loop = self._control_loop
+        if not loop.is_ready or outermost is not self.outermost:
+            raise self._step_error(outermost)
+        loop.actions.write(action)
+        try:
+            self._simulate(outermost, loop)
+            outermost.refresh_observation(self.measurements)
+            info: Info = {}
+            loop.is_finite = False
+            terminated, truncated = outermost.has_terminated(info)
+            if not loop.is_finite or outermost is not self:
+                loop.checks.check_finite(outermost.observation)
+            if self.stepper_state.iter >= loop.timing.last:
+                truncated = True
+            reward = outermost.compute_reward(terminated, info)
+            if type(reward) is not float:
+                reward = subclass_checks.check_number(outermost, reward)
+            if reward != reward:
+                raise SimulationError(f"The reward of {type(outermost).__name__} is not a number.")
+        except BaseException:
+            self.stop()
+            raise
+        if terminated or truncated:
+            loop.refuse(
+                f"The episode {'terminated' if terminated else 'was truncated'}: call reset()."
+            )
+        if self.render_mode == "human":
+            self.render()
+        observation = loop.copy(outermost.observation)
+        return observation, reward, bool(terminated), bool(truncated), info
+
+    def _simulate(self, outermost: PipelineEnv, loop: ControlLoop) -> None:
+        """Control and simulate for a step, up to its last observation."""
+        simulator, quantities = self.simulator, self._own_quantities
+        measurements, command = self.measurements, self.robot_state.command
+        for observe, control, steps in loop.schedule:
+            if observe:
+                outermost.refresh_observation(measurements)
+            if control:
+                if outermost.compute_command(outermost.action, command) is not None:
+                    raise subclass_checks.not_written(outermost, "compute_command", "command")
+                simulator.apply_command()
+            if loop.is_recorded:
+                self.recorder.record()
+            simulator.step(steps)
+        loop.steps += 1
+        self.num_steps[()] = loop.steps
+        outermost._refresh_buffers()
+        if quantities is not None:
+            quantities.clear()
+
+    def _step_error(self, outermost: PipelineEnv) -> EpisodeError:
+        if not self._control_loop.is_ready:
+            return EpisodeError(self._control_loop.reason)
+        return EpisodeError(
+            f"The episode belongs to {type(self.outermost).__name__}, the outermost of the "
+            f"pipeline, but step was called on {type(outermost).__name__}: call step there, or "
+            "reset here."
+        )
+
+    def stop(self) -> None:
+        """End the episode and write what was recorded. To continue, call `reset`."""
+        if self.is_simulation_running:
+            self.recorder.end(keep=self._control_loop.steps > 0)
+            self.simulator.stop()
+            self._control_loop.refuse("The episode was stopped: call reset().")
+
+    def close(self) -> None:
+        """Stop, and free engine and viewer; `reset` brings them back."""
+        self.stop()
+        if self._own_renderer is not None:
+            self._own_renderer.close()
+            self._own_renderer = None
+        self.recorder.close()
+        self.simulator.close()
 
     def render(self) -> Any:
         """Show the world as `render_mode` says, with the options `viewer_kwargs`.
 
-        Without a mode, a viewer follows it where there is a display; elsewhere pictures are made.
+        Without a mode, a viewer follows it if there is a display; otherwise pictures are rendered.
 
         Returns:
-            A picture, shape (height, width, 3), uint8; None where a viewer shows the world.
+            A picture, shape (height, width, 3), uint8; None if a viewer shows the world.
 
         Raises:
-            PluginNotFoundError: The viewer is not installed; the message says how to install it.
-            VisualizerError: It cannot draw; the message says what is missing.
+            PluginNotFoundError: If the viewer is not installed.
+            VisualizerError: If the viewer cannot draw; the message says what is missing.
         """
         if self._own_renderer is None:
             from physx_gym.show.rendering import Renderer
@@ -217,50 +571,48 @@ class RobotEnv(Episodes):
             self._own_renderer = Renderer(self)
         return self._own_renderer.frame()
 
-    def plot(self, enable_block_states: bool = False, **kwargs: Any) -> Any:
-        """Plot the running episode, or the last one; see `physx_gym.show.plotting.plot`.
+    # State -------------------------------------------------------------------------------------
 
-        Args:
-            enable_block_states: Whether states of blocks are shown too.
-            kwargs: For `physx_gym.show.plotting.plot`.
-        """
-        from physx_gym.show.plotting import plot
+    def restore(self, state: Any) -> None:
+        """Return to a snapshot without layers; see `PipelineEnv.restore`."""
+        self.run_restore(self, state)
 
-        return plot(self.log_data, enable_block_states=enable_block_states, **kwargs)
+    def run_restore(self, outermost: PipelineEnv, state: Any) -> None:
+        """Return to a snapshot of a pipeline; see `restore`."""
+        layers = outermost.layers
+        names = [type(layer).__name__ for layer in layers]
+        if not isinstance(state, dict) or state.get("layers") != names or "own" not in state:
+            given = state.get("layers") if isinstance(state, dict) else state
+            raise SimulationError(f"The snapshot is of {given}, not of {names}.")
+        runs = state["own"][0]["simulator"]["running"]
+        if not runs or self.outermost is not outermost or not self.is_simulation_running:
+            self.run_reset(outermost, None, state["own"][0]["options"])
+        for layer, own in zip(layers, state["own"], strict=True):
+            layer._restore_own(own)
+        if not runs:
+            self.recorder.telemetry.discard()
 
-    def replay(self, **kwargs: Any) -> Any:
-        """Show the running episode, or the last one; see `physx_gym.show.replaying.replay`."""
-        from physx_gym.show.replaying import replay
+    def _snapshot_own(self) -> dict[str, Any]:
+        loop, quantities = self._control_loop, self._own_quantities
+        return super()._snapshot_own() | {
+            "simulator": self.simulator.snapshot(),
+            "random": copy_tree(self.np_random.bit_generator.state),
+            "seed": self.np_random_seed,
+            "num_steps": int(self.num_steps),
+            "ready": (loop.is_ready, loop.reason),
+            "options": dict(self.reset_options),
+            "quantities": None if quantities is None else quantities.snapshot(),
+        }
 
-        return replay(self.log_data, **kwargs)
-
-    def register_variable(
-        self,
-        name: str,
-        value: Any,
-        fieldnames: str | Mapping[str, Any] | Sequence[Any] | None = None,
-        namespace: str | None = None,
-        *,
-        is_eval_only: bool = True,
-    ) -> None:
-        """Record arrays from the next reset on.
-
-        Args:
-            name: Of the variable; its columns begin with it.
-            value: An array of float64 or int64, or nested containers of them. They are read
-                whenever a row is recorded, so keep them and update them in place.
-            fieldnames: Names of all numbers, nested like the value; None: numbered.
-            namespace: What the name begins with; None: nothing.
-            is_eval_only: Whether it is left out in training.
-        """
-        self.recording.telemetry.register(
-            name, value, fieldnames, namespace, is_eval_only=is_eval_only
-        )
-
-    @property
-    def log_data(self) -> Any:
-        """What was recorded of the running episode, up to now, or of the last one.
-
-        A dictionary of ``"constants"`` and ``"variables"``, columns by name; empty without rows.
-        """
-        return self.recording.data(self)
+    def _restore_own(self, own: dict[str, Any]) -> None:
+        loop = self._control_loop
+        self.simulator.restore(own["simulator"])
+        self.np_random.bit_generator.state = own["random"]
+        self._np_random_seed = own["seed"]
+        self.num_steps[...] = loop.steps = own["num_steps"]
+        loop.is_ready, loop.reason = own["ready"]
+        self.reset_options = dict(own["options"])
+        self.recorder.telemetry.rewind(self.stepper_state.t)
+        if own["quantities"] is not None or self._own_quantities is not None:
+            self.quantities.restore(own["quantities"] or [])
+        super()._restore_own(own)

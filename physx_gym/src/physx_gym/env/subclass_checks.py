@@ -1,4 +1,4 @@
-"""What subclasses of environments say, are given, and return."""
+"""Checks of subclasses of environments: their options, spaces, and returned values."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from physx_gym.show.display import has_display
 
 
 def construct_next(kind: type[Any], env: Any, options: Mapping[str, Any]) -> None:
-    """Call the constructor of the class after another one in an environment's order of classes.
+    """Call the constructor of the next class in the method resolution order of an environment.
 
     Args:
-        kind: That other one.
+        kind: The class before.
         env: The environment.
-        options: What the constructor is given.
+        options: Options of the constructor.
 
     Raises:
-        UnknownOptionError: There are options, but no class that takes them.
+        UnknownOptionError: If there are options, but no class takes them.
     """
     order = type(env).__mro__
     after = order[order.index(kind) + 1 :]
@@ -32,7 +32,7 @@ def construct_next(kind: type[Any], env: Any, options: Mapping[str, Any]) -> Non
 
 
 def _names(kind: type[Any], own: type[Any]) -> list[str]:
-    """Return the options of a class; of those that it hands on, the ones with a default."""
+    """Return the options of a class; of those that it passes on, the ones with a default."""
     found: dict[str, None] = {}
     for each in own.__mro__[: own.__mro__.index(kind) + 1]:
         if "__init__" not in vars(each):
@@ -54,20 +54,20 @@ _PAIRS = {
 
 
 def check_mode(mode: Any, modes: Sequence[str]) -> None:
-    """Check a mode of rendering; None: whatever is possible.
+    """Check a render mode; None: whichever is possible.
 
     Raises:
-        UnknownOptionError: There is no such mode.
+        UnknownOptionError: If there is no such mode.
     """
     if mode is not None and mode not in modes:
         raise UnknownOptionError("render_mode", [str(mode)], modes)
 
 
 def metadata_of(kind: type[Any], step_dt: float) -> dict[str, Any]:
-    """Return what a class says of itself, with what is possible on this machine.
+    """Return the metadata of a class of environments, with the modes possible on this machine.
 
     Args:
-        kind: Class of an environment.
+        kind: The class.
         step_dt: Time of a step, in s.
     """
     modes = [mode for mode in kind.metadata["render_modes"] if mode != "human" or has_display()]
@@ -75,11 +75,11 @@ def metadata_of(kind: type[Any], step_dt: float) -> dict[str, Any]:
     return {"render_fps": frames, **kind.metadata, "render_modes": modes}
 
 
-def pair_of(env: Any, method: str, found: Any) -> tuple[Any, Any]:
-    """Return what a method returned, if it is two things.
+def check_pair(env: Any, method: str, found: Any) -> tuple[Any, Any]:
+    """Return what a method returned, if it is a pair.
 
     Raises:
-        ConfigError: It is something else.
+        ConfigError: If it is not.
     """
     if not isinstance(found, (tuple, list)) or len(found) != 2:
         raise ConfigError(
@@ -88,11 +88,11 @@ def pair_of(env: Any, method: str, found: Any) -> tuple[Any, Any]:
     return found[0], found[1]
 
 
-def number_of(env: Any, reward: Any) -> float:
+def check_number(env: Any, reward: Any) -> float:
     """Return a reward as a number.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: If it is not a number.
     """
     try:
         return float(reward)
@@ -106,7 +106,7 @@ def check_spaces(env: Any) -> None:
     """Check that an environment has its spaces.
 
     Raises:
-        ConfigError: One is missing, or is none.
+        ConfigError: If one is missing, or is not a space.
     """
     for kind in ("action_space", "observation_space"):
         space = getattr(env, kind, None)
@@ -118,8 +118,8 @@ def check_spaces(env: Any) -> None:
 
 
 def not_written(env: Any, method: str, where: str) -> ConfigError:
-    """Return the error of a method that returned what it should have written."""
+    """Return the error for a method that returned what it should have written."""
     return ConfigError(
-        f"{type(env).__name__}.{method} returned something, but nobody reads that: write into "
+        f"{type(env).__name__}.{method} returned a value, which is not used: write into "
         f"`{where}` in place, and return nothing."
     )

@@ -8,7 +8,7 @@ from typing import Any
 
 from physx_core.typing import Vector
 from physx_gym.defaults import BACKEND
-from physx_gym.env.layers.layer import Info
+from physx_gym.env.pipeline_env import Info
 from physx_gym.environments import limits
 from physx_gym.environments.one_motor import OneMotorEnv
 

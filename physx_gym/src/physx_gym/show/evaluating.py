@@ -1,4 +1,4 @@
-"""Evaluating: an episode under a policy, recorded, with its rewards."""
+"""Evaluation: one recorded episode under a policy."""
 
 from __future__ import annotations
 
@@ -6,22 +6,20 @@ import inspect
 import math
 import warnings
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from physx_core import checks
 from physx_core.errors import ConfigError
 from physx_gym.show.display import has_display
-
-if TYPE_CHECKING:
-    from physx_gym.env.pipeline_env import Info, PipelineEnv
+from physx_gym.show.playable import Info, Playable
 
 PolicyFn = Callable[[Any, Any, float | None, bool, bool, dict[str, Any]], Any]
 """Takes observation, previous action, reward, terminated, truncated and information; returns an
-action. Previous action and reward are None at the beginning."""
+action. Previous action and reward are None at the start."""
 
 
 def evaluate(
-    env: PipelineEnv,
+    env: Playable,
     policy_fn: PolicyFn,
     seed: int | None = None,
     horizon: float | None = None,
@@ -29,25 +27,25 @@ def evaluate(
     enable_replay: bool | None = None,
     **kwargs: Any,
 ) -> tuple[list[float], list[Info]]:
-    """Run one episode in evaluation mode, and go back to the mode there was before.
+    """Run one episode in evaluation mode, then return to the previous mode.
 
-    It ends when it is terminated or truncated, at the horizon, or with Ctrl-C. The policy is asked
-    once more at the state that ends it, so that it can keep what it saw.
+    It ends when it is terminated or truncated, at the horizon, or with Ctrl-C. The policy is called
+    once more with the final state, so that it can keep what it saw.
 
     Args:
-        env: Top of the pipeline; what is around it takes no part.
+        env: The outermost environment of the pipeline; wrappers around it are not used.
         policy_fn: The policy; see `PolicyFn`.
-        seed: Of the episode; None: go on with what is there.
+        seed: Seed of the episode; None: continue the sequence.
         horizon: Longest time to simulate, in s; None: until the episode ends.
-        enable_stats: Whether to print number of steps and total reward.
-        enable_replay: Whether to replay it afterwards; None: where there is a display.
+        enable_stats: Whether to print the number of steps and the total reward.
+        enable_replay: Whether to replay it afterwards; None: if there is a display.
         kwargs: For the replay.
 
     Returns:
         Rewards of all steps, and information: one more, as the first is that of the reset.
 
     Raises:
-        ConfigError: The horizon is not positive, or the policy does not take what it is asked with.
+        ConfigError: If the horizon is not positive, or the policy does not accept its arguments.
     """
     _check(policy_fn)
     steps = math.inf
@@ -55,36 +53,38 @@ def evaluate(
         steps = math.ceil(checks.positive("horizon", horizon) / env.step_dt - 1e-9)
     rewards: list[float] = []
     infos: list[Info] = []
-    base = env.unwrapped
-    was_training = base.training
-    base.stop()
-    base.eval()
+    was_training = env.training
+    env.stop()
+    env.train(False)
     try:
         _run(env, policy_fn, seed, steps, rewards, infos)
     except KeyboardInterrupt:
-        pass  # who watches has seen enough
+        pass  # the user has seen enough
     finally:
-        base.stop()
-        base.train(was_training)
+        env.stop()
+        env.train(was_training)
     if enable_stats:
         text = f"steps: {len(rewards)} ({len(rewards) * env.step_dt:g} s)"
-        print(f"{text}, total reward: {math.fsum(rewards):g}")  # noqa: T201 - what was asked for
+        print(f"{text}, total reward: {math.fsum(rewards):g}")  # noqa: T201 - as requested
     if enable_replay or (enable_replay is None and has_display()):
-        _replay(env, kwargs)
+        try:
+            env.replay(**kwargs)
+        except Exception as error:  # a viewer that fails does not spoil the evaluation
+            warnings.warn(f"The episode cannot be replayed: {error}", stacklevel=3)
     return rewards, infos
 
 
 def _check(policy_fn: Any) -> None:
-    """Check that a policy can be asked.
+    """Check that a policy accepts its arguments.
 
     Raises:
-        ConfigError: It cannot.
+        ConfigError: If it does not.
     """
     try:
         inspect.signature(policy_fn).bind(*[None] * 6)
     except (TypeError, ValueError) as error:
         if callable(policy_fn) and isinstance(error, ValueError):
-            return  # made in C: it says itself what it does not take
+            return  # implemented in C, without a signature
         raise ConfigError(
             "The policy is called with observation, previous action, reward, terminated, truncated "
             f"and information, and returns an action; {policy_fn!r} cannot be: {error}."
@@ -92,13 +92,14 @@ def _check(policy_fn: Any) -> None:
 
 
 def _run(
-    env: PipelineEnv,
+    env: Playable,
     policy_fn: PolicyFn,
     seed: int | None,
     steps: float,
     rewards: list[float],
     infos: list[Info],
 ) -> None:
+    """Run an episode; rewards and information are appended, so that they survive Ctrl-C."""
     observation, info = env.reset(seed=seed)
     infos.append(info)
     action, reward, terminated, truncated = None, None, False, False
@@ -109,11 +110,3 @@ def _run(
         observation, reward, terminated, truncated, info = env.step(action)
         rewards.append(reward)
         infos.append(info)
-
-
-def _replay(env: PipelineEnv, options: dict[str, Any]) -> None:
-    """Replay the episode; a viewer that fails takes nothing from the evaluation."""
-    try:
-        env.unwrapped.replay(**options)
-    except Exception as error:  # whatever a viewer may raise
-        warnings.warn(f"The episode cannot be replayed: {error}", stacklevel=3)

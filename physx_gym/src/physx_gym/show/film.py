@@ -1,4 +1,4 @@
-"""Films of pictures, in formats that browsers and documents show by themselves."""
+"""Films in formats that browsers and documents can show."""
 
 from __future__ import annotations
 
@@ -14,24 +14,25 @@ SUFFIXES = (".gif", ".webp", ".png")
 
 
 def write_film(pictures: Iterable[NDArray[np.uint8]], path: Path, frame_rate: float) -> Path:
-    """Write pictures one after another as an animation that repeats itself.
+    """Write pictures as a looping animation.
 
     Args:
-        pictures: Each of shape (height, width, 3); at least one.
+        pictures: At least one, each of shape (height, width, 3).
         path: File to write; its suffix is one of `SUFFIXES`.
-        frame_rate: Pictures a second; a ``.gif`` has at most 50.
+        frame_rate: Pictures per second; at most 50 in a ``.gif``.
 
     Returns:
         The path.
 
     Raises:
-        ConfigError: The format is none of these.
-        MissingLibraryError: Pillow is not installed.
+        ConfigError: If the suffix is not one of these.
+        MissingLibraryError: If Pillow is not installed.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise ConfigError(
-            f"A film is a file {', '.join(SUFFIXES)}, not {path.name}. For other formats give the "
-            "pictures of render() to a library such as imageio, or use gymnasium's RecordVideo."
+            f"The suffix of a film must be {', '.join(SUFFIXES)}, not {path.name}. For other "
+            "formats pass the pictures of render() to a library such as imageio, or use "
+            "gymnasium's RecordVideo."
         )
     try:
         from PIL import Image

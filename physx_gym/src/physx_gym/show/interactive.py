@@ -1,4 +1,4 @@
-"""Playing: an environment driven by keys, in real time."""
+"""Playing: an environment controlled with the keyboard, in real time."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ import sys
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from physx_core.errors import UsageError
 from physx_gym.show.display import has_display
+from physx_gym.show.playable import Playable
 from physx_gym.show.rendering import Renderer
-
-if TYPE_CHECKING:
-    from physx_gym.env.pipeline_env import PipelineEnv
 
 EXIT, PAUSE = "k", "p"
 ARROWS = {b"A": "Up", b"B": "Down", b"C": "Right", b"D": "Left"}
@@ -23,7 +21,7 @@ _ESCAPE = b"\x1b"
 
 
 class Keyboard:
-    """Keys as they are pressed in a terminal, which is as before when the ``with`` block ends."""
+    """Keys pressed in a terminal, whose settings are restored when the ``with`` block ends."""
 
     def __init__(self, descriptor: int | None = None) -> None:
         """Keep the terminal.
@@ -37,10 +35,10 @@ class Keyboard:
         self._bytes = b""
 
     def __enter__(self) -> Self:
-        """Let the terminal hand over keys at once.
+        """Make the terminal pass on keys immediately.
 
         Raises:
-            UsageError: There is no terminal.
+            UsageError: If there is no terminal.
         """
         try:
             import termios
@@ -50,9 +48,9 @@ class Keyboard:
             self._before = termios.tcgetattr(self._descriptor)
             tty.setcbreak(self._descriptor, termios.TCSANOW)
         except (ImportError, OSError, ValueError, AttributeError) as error:
-            raise _no_terminal() from error
+            raise _terminal_error() from error
         except termios.error as error:
-            raise _no_terminal() from error
+            raise _terminal_error() from error
         return self
 
     def __exit__(
@@ -61,13 +59,13 @@ class Keyboard:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Put the terminal back as it was."""
+        """Restore the settings of the terminal."""
         import termios
 
         termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
 
     def read(self) -> list[str]:
-        """Return the keys that were pressed since the last call: characters, and `ARROWS`."""
+        """Return the keys pressed since the last call: characters, and `ARROWS`."""
         while select.select([self._descriptor], [], [], 0)[0]:
             read = os.read(self._descriptor, 1024)
             if not read:
@@ -77,7 +75,7 @@ class Keyboard:
         while self._bytes:
             size = _length(self._bytes)
             if size == 0:
-                break  # the rest of it is on its way
+                break  # the rest of the key has yet to arrive
             key, self._bytes = self._bytes[:size], self._bytes[size:]
             if key[:1] != _ESCAPE:
                 found.append(key.decode(errors="replace"))
@@ -87,7 +85,7 @@ class Keyboard:
 
 
 def _length(read: bytes) -> int:
-    """Return how many of the bytes are the first key; 0: it is not complete."""
+    """Return the number of bytes of the first key; 0: it is incomplete."""
     if read[:1] == _ESCAPE:
         if len(read) < 2:
             return 0
@@ -99,7 +97,7 @@ def _length(read: bytes) -> int:
     return size if len(read) >= size else 0
 
 
-def _no_terminal() -> UsageError:
+def _terminal_error() -> UsageError:
     return UsageError(
         "Playing needs a terminal for the keys: start the script in one, on Linux or macOS, and do "
         "not redirect its input."
@@ -107,29 +105,29 @@ def _no_terminal() -> UsageError:
 
 
 def play(
-    env: PipelineEnv,
+    env: Playable,
     enable_travelling: bool | None = None,
     start_paused: bool = True,
     enable_is_done: bool = True,
     verbose: bool = True,
     **kwargs: Any,
 ) -> None:
-    """Play an environment in real time; the key ``k`` ends, ``p`` pauses and goes on.
+    """Play an environment in real time; the key ``k`` quits, ``p`` pauses and resumes.
 
     All other keys go to `RobotEnv._key_to_action`: characters, ``"Up"``, ``"Down"``, ``"Left"`` and
-    ``"Right"``. Where there is a display, a viewer shows the robot.
+    ``"Right"``. If there is a display, a viewer shows the robot.
 
     Args:
-        env: Top of the pipeline; what is around it takes no part.
+        env: The outermost environment of the pipeline; wrappers around it are not used.
         enable_travelling: Whether the viewer's camera follows a robot whose base floats; None: it
             does.
-        start_paused: Whether to begin with a pause.
+        start_paused: Whether to start paused.
         enable_is_done: Whether the end of an episode ends the game; otherwise the next one begins.
-        verbose: Whether to tell what happens.
+        verbose: Whether to print what happens.
         kwargs: For `RobotEnv._key_to_action`.
 
     Raises:
-        UsageError: There is no terminal, or the environment does not say what keys do.
+        UsageError: If there is no terminal, or the environment does not define what keys do.
     """
     viewer = _viewer(env, enable_travelling)
     try:
@@ -137,23 +135,23 @@ def play(
             game = _Game(env, keyboard, viewer, verbose)
             game.run(start_paused, enable_is_done, kwargs)
     finally:
-        env.unwrapped.stop()
+        env.stop()
         if viewer is not None:
             viewer.close()
 
 
-def _viewer(env: PipelineEnv, follow: bool | None) -> Renderer | None:
-    """Return a viewer, where there is a display; an environment for humans has its own."""
+def _viewer(env: Playable, follow: bool | None) -> Renderer | None:
+    """Return a viewer, if there is a display; in the mode ``"human"`` the environment has one."""
     if env.render_mode == "human" or not has_display():
         return None
-    return Renderer(env, mode="human", follow=follow is not False)
+    return Renderer(env.layers[0], mode="human", follow=follow is not False)
 
 
 class _Game:
     """The loop of keys, steps and pauses."""
 
     def __init__(
-        self, env: PipelineEnv, keyboard: Keyboard, viewer: Renderer | None, verbose: bool
+        self, env: Playable, keyboard: Keyboard, viewer: Renderer | None, verbose: bool
     ) -> None:
         self._env, self._keyboard, self._viewer, self._verbose = env, keyboard, viewer, verbose
         owners = (each for each in reversed(env.layers) if hasattr(each, "_key_to_action"))
@@ -166,11 +164,11 @@ class _Game:
         observation, _ = env.reset()
         reward: float | None = None
         self._is_paused = start_paused
-        self._tell(f"keys: {EXIT} ends, {PAUSE} {'begins' if start_paused else 'pauses'}")
+        self._print(f"keys: {EXIT} quits, {PAUSE} {'starts' if start_paused else 'pauses'}")
         self._show()
         due = time.monotonic()
         while True:
-            key, is_over = self._pressed()
+            key, is_over = self._read_keys()
             if is_over:
                 return
             if not self._is_paused:
@@ -179,27 +177,27 @@ class _Game:
                 observation, reward, terminated, truncated, _ = env.step(chosen)
                 self._show()
                 if terminated or truncated:
-                    self._tell("terminated" if terminated else "truncated")
+                    self._print("terminated" if terminated else "truncated")
                     if ends:
                         return
                     (observation, _), reward = env.reset(), None
             due = self._wait(due + env.step_dt)
 
-    def _pressed(self) -> tuple[str | None, bool]:
-        """Return the last key that was pressed for the robot, and whether the game is over."""
+    def _read_keys(self) -> tuple[str | None, bool]:
+        """Return the last key pressed for the robot, and whether the game is over."""
         last = None
         for key in self._keyboard.read():
             if key == EXIT:
                 return None, True
             if key == PAUSE:
                 self._is_paused = not self._is_paused
-                self._tell("paused" if self._is_paused else "running")
+                self._print("paused" if self._is_paused else "running")
             else:
                 last = key
         return last, False
 
     def _wait(self, due: float) -> float:
-        """Wait until a time; return it, or the present one where that is much later."""
+        """Wait until a time; return it, or the present one if that is much later."""
         now = time.monotonic()
         time.sleep(max(0.0, due - now))
         return max(due, now - 0.2)
@@ -208,6 +206,6 @@ class _Game:
         if self._viewer is not None:
             self._viewer.frame()
 
-    def _tell(self, text: str) -> None:
+    def _print(self, text: str) -> None:
         if self._verbose:
-            print(text, flush=True)  # noqa: T201 - what was asked for
+            print(text, flush=True)  # noqa: T201 - as requested

@@ -1,10 +1,10 @@
-"""Rendering: pictures of a running environment, or a viewer's window that follows it."""
+"""Rendering: pictures of a running environment, or a viewer that follows it."""
 
 from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,7 @@ from physx_core.simulation import World
 from physx_gym.defaults import VIEWER
 from physx_gym.show.display import has_display
 from physx_gym.show.drawing import WorldDrawing
-
-if TYPE_CHECKING:
-    from physx_gym.env.pipeline_env import PipelineEnv
+from physx_gym.show.playable import Drawable
 
 MODES = ("human", "rgb_array")
 PICTURE_SIZE = (640, 480)
@@ -31,14 +29,14 @@ def open_viewer(title: str, instances: int = 1, **options: Any) -> Visualizer:
     """Open a viewer.
 
     Args:
-        title: What its recording is called.
-        instances: How many worlds are shown.
+        title: Title of its recording.
+        instances: Number of worlds to show.
         options: Of the visualizer; ``visualizer`` is its reference, by default `VIEWER`.
 
     Raises:
-        PluginNotFoundError: It is not installed; the message says how to install it.
-        UnknownOptionError: It does not have such an option.
-        VisualizerError: It cannot be opened.
+        PluginNotFoundError: If the visualizer is not installed.
+        UnknownOptionError: If it does not have an option.
+        VisualizerError: If it cannot be opened.
     """
     options = dict(options)
     kind: Any = plugins.resolve("visualizer", options.pop("visualizer", VIEWER))
@@ -50,20 +48,20 @@ def open_viewer(title: str, instances: int = 1, **options: Any) -> Visualizer:
 class Renderer:
     """Shows an environment as its ``render_mode`` says, with the options ``viewer_kwargs``.
 
-    ``"rgb_array"`` makes pictures without a window, ``"human"`` opens a viewer; None opens a viewer
-    where there is a display, and makes pictures elsewhere.
+    ``"rgb_array"`` renders pictures without a window, ``"human"`` opens a viewer; None opens a
+    viewer if there is a display, and renders pictures otherwise.
     """
 
-    def __init__(self, env: PipelineEnv, mode: str | None = None, *, follow: bool = True) -> None:
+    def __init__(self, env: Drawable, mode: str | None = None, *, follow: bool = True) -> None:
         """Keep the environment; the viewer is opened at the first frame.
 
         Args:
-            env: What to show.
-            mode: Instead of the environment's ``render_mode``.
+            env: The environment to show.
+            mode: Overrides the environment's ``render_mode``.
             follow: Whether the camera follows a robot whose base floats.
 
         Raises:
-            UnknownOptionError: There is no such ``render_mode``.
+            UnknownOptionError: If there is no such ``render_mode``.
         """
         mode = mode or env.render_mode or ("human" if has_display() else "rgb_array")
         if mode not in MODES:
@@ -83,11 +81,10 @@ class Renderer:
             A picture, shape (height, width, 3); None in the mode ``"human"``.
 
         Raises:
-            PluginNotFoundError: The viewer is not installed; the message says how to install it.
-            VisualizerError: It cannot draw; the message says what is missing.
+            PluginNotFoundError: If the viewer is not installed.
+            VisualizerError: If the viewer cannot draw; the message says what is missing.
         """
         simulator = self._env.simulator
-        own: Any = self._env.unwrapped  # the `RobotEnv` below all layers
         poses = simulator.simulation.body_poses()
         if self._world is not simulator.world:
             self.close()
@@ -104,17 +101,17 @@ class Renderer:
                 follow=self._follow,
             )
             self._drawing.add(poses)
-            own._draw(self._factory)
+            self._env._draw(self._factory)
         else:
             self._drawing.move(poses)
-            own._redraw(self._factory)
+            self._env._redraw(self._factory)
         self._viewer.events(1, self._frames, self._factory.take_events())
         self._frames += 1
         if self.mode == "human":
             return None
         picture = self._viewer.capture()
         if picture is None:
-            raise VisualizerError(f"{type(self._viewer).__name__} makes no pictures.")
+            raise VisualizerError(f"{type(self._viewer).__name__} cannot render pictures.")
         return picture
 
     def _open(self) -> Visualizer:
@@ -126,7 +123,7 @@ class Renderer:
         return open_viewer(type(self._env).__name__, **options)
 
     def close(self) -> None:
-        """Let the viewer go; the next frame opens another one."""
+        """Close the viewer; the next frame opens another one."""
         if self._drawing is not None:
             self._drawing.close()
         if self._viewer is not None:

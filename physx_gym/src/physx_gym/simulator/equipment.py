@@ -121,12 +121,12 @@ class Equipment:
         """The sensors in the order of their values."""
         return () if self.sensors is None else self.sensors.sensors
 
-    def begin(self, random: np.random.Generator, moment: int) -> None:
+    def begin(self, random: np.random.Generator, reading_period: int) -> None:
         """Start from the simulation's present state.
 
         Args:
             random: Generator of the errors of the sensors.
-            moment: Measurements are read at multiples of so many physics steps.
+            reading_period: Measurements are read at multiples of so many physics steps.
         """
         if self._memoryless:
             self._direct.begin()
@@ -134,14 +134,16 @@ class Equipment:
             self.motors.reset(self._simulation)
         if self.sensors is not None and self._lookup is None:
             self.sensors.reset(random)
-            self._hook(moment)
+            self._hook(reading_period)
 
-    def _hook(self, moment: int) -> None:
+    def _hook(self, reading_period: int) -> None:
         """Let sensors measure before physics steps too, if that makes a difference."""
         sensors = self.sensors
         if sensors is None:
             return
-        fits = all(every % moment == 0 or moment % every == 0 for every in self._every)
+        fits = all(
+            every % reading_period == 0 or reading_period % every == 0 for every in self._every
+        )
         wanted = self._remembers or not fits
         if wanted and not self._hooked:
             sensors.attach(self._simulation)
@@ -185,14 +187,16 @@ class Equipment:
             None if self.sensors is None else self.sensors.snapshot(),
         )
 
-    def restore(self, state: EquipmentState, random: np.random.Generator, moment: int) -> None:
+    def restore(
+        self, state: EquipmentState, random: np.random.Generator, reading_period: int
+    ) -> None:
         """Return to a snapshot, with a generator that is in its state of then; see `begin`."""
         if self.motors is not None and state.motors is not None:
             self.motors.restore(state.motors)
         if self.sensors is not None and state.sensors is not None and self._lookup is None:
             self.sensors.reset(random)
             self.sensors.restore(state.sensors)
-            self._hook(moment)
+            self._hook(reading_period)
 
 
 class _DirectMotors:

@@ -132,7 +132,7 @@ class Simulator(SharedArrays):
         self._random = np.random.default_rng()
         self._forces: list[tuple[int, Wrench]] = []
         self._pending: list[tuple[int, Wrench]] = []
-        self._moment = 1
+        self._reading_period = 1
         self._engine: Engine | None = None
         self._stale = False
 
@@ -366,12 +366,12 @@ class Simulator(SharedArrays):
         """Seed the errors of the sensors, from the next start on."""
         self._random = np.random.default_rng(seed)
 
-    def set_moment(self, steps: int) -> None:
+    def set_reading_period(self, steps: int) -> None:
         """Declare that measurements are only read at multiples of so many physics steps.
 
         Sensors then measure no more often than that, unless it makes a difference.
         """
-        self._moment = steps
+        self._reading_period = steps
 
     # Forces ----------------------------------------------------------------------------------
 
@@ -429,7 +429,7 @@ class Simulator(SharedArrays):
         engine.simulation.restore(first)
         engine.simulation.set_state(q, v)
         self.robot_state.command.fill(0.0)
-        engine.equipment.begin(self._random, self._moment)
+        engine.equipment.begin(self._random, self._reading_period)
         self._pending = list(self._forces)
         self.stepper_state.iter = 0
         self._apply_forces(engine)
@@ -509,7 +509,7 @@ class Simulator(SharedArrays):
             "forces": tuple(self._forces),
             "pending": tuple(self._pending),
             "random": self._random.bit_generator.state,
-            "moment": self._moment,
+            "reading_period": self._reading_period,
             "running": bool(self.is_simulation_running),
         }
 
@@ -525,8 +525,8 @@ class Simulator(SharedArrays):
             raise SimulationError("The snapshot is not of this simulator: its size differs.")
         engine.simulation.restore(state["simulation"])
         self._random.bit_generator.state = state["random"]
-        self._moment = state["moment"]
-        engine.equipment.restore(state["equipment"], self._random, self._moment)
+        self._reading_period = state["reading_period"]
+        engine.equipment.restore(state["equipment"], self._random, self._reading_period)
         np.copyto(self.values, state["values"])
         np.copyto(self.robot_state.command, state["command"])
         self._forces, self._pending = list(state["forces"]), list(state["pending"])

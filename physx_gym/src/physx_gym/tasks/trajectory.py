@@ -1,4 +1,4 @@
-"""A motion of a robot in time, to follow or to look at."""
+"""Motions of a robot over time, to follow or to replay."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import h5py
 import numpy as np
 
 from physx_core.errors import ConfigError, LogError
@@ -18,17 +17,18 @@ Beyond = Literal["raise", "wrap", "clip"]
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """How a robot, or everything in a world, moved.
+    """The motion of a robot, or of everything in a world.
 
-    Between two rows positions and velocities are on the line between them; a quaternion turns the
-    short way.
+    Positions and velocities are interpolated linearly between two rows, quaternions along the
+    shorter arc.
 
     Attributes:
-        times: Growing, shape (rows,), in s.
+        times: Non-decreasing, shape (rows,), in s.
         positions: Shape (rows, nq), in the convention of `physx_core.simulation.layout`.
         velocities: Shape (rows, nv), likewise.
-        beyond: What is before the first and behind the last row: ``"raise"``, an error; ``"wrap"``,
-            the motion begins anew, from where it ended on the ground; ``"clip"``, it rests.
+        beyond: What happens before the first and after the last row: ``"raise"``, an error;
+            ``"wrap"``, the motion repeats from where it ended on the ground; ``"clip"``, the first
+            or last row holds.
     """
 
     times: Vector
@@ -40,7 +40,7 @@ class Trajectory:
         """Check that the arrays fit together.
 
         Raises:
-            ConfigError: They do not.
+            ConfigError: If they do not.
         """
         rows = len(self.times)
         shapes = [np.shape(a) for a in (self.times, self.positions, self.velocities)]
@@ -50,9 +50,9 @@ class Trajectory:
                 f"not {shapes}."
             )
         if not all(is_finite(np.asarray(a)) for a in (self.times, self.positions, self.velocities)):
-            raise ConfigError("A trajectory must be finite numbers.")
+            raise ConfigError("The values of a trajectory must be finite.")
         if (np.diff(self.times) < 0).any():
-            raise ConfigError("The times of a trajectory must grow.")
+            raise ConfigError("The times of a trajectory must not decrease.")
         if self.beyond not in ("raise", "wrap", "clip"):
             raise ConfigError(f'beyond is "{self.beyond}", not "raise", "wrap" or "clip".')
 
@@ -65,8 +65,8 @@ class Trajectory:
         """Return positions (nq,) and velocities (nv,) at a time, in s.
 
         Raises:
-            ConfigError: It is beyond the trajectory, where that is an error; or there is more than
-                one floating base in the positions.
+            ConfigError: If the time is beyond the trajectory and `beyond` is ``"raise"``, or if
+                there is more than one floating base in the positions.
         """
         first, last = float(self.times[0]), float(self.times[-1])
         laps = 0
@@ -75,7 +75,7 @@ class Trajectory:
             t -= laps * self.duration
         elif self.beyond == "raise" and not first - 1e-9 <= t <= last + 1e-9:
             raise ConfigError(
-                f"The trajectory is from {first:g} s to {last:g} s, but {t:g} s is asked for: "
+                f"The trajectory is from {first:g} s to {last:g} s, but {t:g} s was requested: "
                 'choose beyond="clip" or "wrap".'
             )
         t = min(max(t, first), last)
@@ -83,13 +83,13 @@ class Trajectory:
         after = min(row + 1, len(self.times) - 1)
         span = float(self.times[after] - self.times[row])
         share = (t - float(self.times[row])) / span if span > 0 else 0.0
-        q = _between(self.positions[row], self.positions[after], share)
+        q = _interpolate(self.positions[row], self.positions[after], share)
         if self._floats:
             here, there = self.positions[row, 3:7], self.positions[after, 3:7]
-            turn = _between(here, there if here @ there >= 0 else -there, share)
+            turn = _interpolate(here, there if here @ there >= 0 else -there, share)
             q[3:7] = turn / np.linalg.norm(turn)
             q[:2] += laps * (self.positions[-1, :2] - self.positions[0, :2])
-        return q, _between(self.velocities[row], self.velocities[after], share)
+        return q, _interpolate(self.velocities[row], self.velocities[after], share)
 
     @property
     def _floats(self) -> bool:
@@ -97,13 +97,15 @@ class Trajectory:
         more = self.positions.shape[1] - self.velocities.shape[1]
         if more > 1:
             raise ConfigError(
-                "This trajectory is of several floating bases; take that of one robot, for example "
+                "This trajectory has several floating bases; use that of one robot, for example "
                 "Log.trajectory(robot)."
             )
         return bool(more == 1)
 
     def save(self, path: str | Path) -> None:
         """Write the trajectory to an HDF5 file."""
+        import h5py
+
         with h5py.File(path, "w") as file:
             file.attrs["format"], file.attrs["beyond"] = "physx trajectory", self.beyond
             for name in ("times", "positions", "velocities"):
@@ -111,18 +113,20 @@ class Trajectory:
 
     @classmethod
     def load(cls, path: str | Path) -> Trajectory:
-        """Read what `save` wrote.
+        """Read a file written by `save`.
 
         Raises:
-            LogError: It is not such a file.
+            LogError: If the file is not a trajectory.
         """
+        import h5py
+
         try:
             with h5py.File(path, "r") as file:
                 if file.attrs.get("format") != "physx trajectory":
-                    raise LogError(f"{path} is no trajectory.")
+                    raise LogError(f"{path} is not a trajectory.")
                 names = ("times", "positions", "velocities")
                 if not all(isinstance(file.get(n, getlink=True), h5py.HardLink) for n in names):
-                    raise LogError(f"{path} is no trajectory: it has parts elsewhere, or none.")
+                    raise LogError(f"{path} is not a trajectory: parts are missing or links.")
                 times, positions, velocities = (np.asarray(file[n], float) for n in names)
                 beyond: Any = file.attrs["beyond"]
                 return cls(times, positions, velocities, beyond)
@@ -130,6 +134,6 @@ class Trajectory:
             raise LogError(f"{path} cannot be read as a trajectory: {error}") from error
 
 
-def _between(first: Vector, second: Vector, share: float) -> Vector:
-    between: Vector = first + share * (second - first)
-    return between
+def _interpolate(first: Vector, second: Vector, share: float) -> Vector:
+    value: Vector = first + share * (second - first)
+    return value

@@ -1,25 +1,22 @@
-"""What every environment records, and what its logs say beside the columns."""
+"""The columns that every log has, and the description of the simulator beside them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from physx_core import __version__
 from physx_core.config import reference_of
 from physx_core.simulation import Layout, Part, Sensor
 from physx_gym.simulator.equipment import kind_of
+from physx_gym.simulator.simulator import Simulator
 from physx_gym.telemetry.log import POSITIONS, VELOCITIES
 from physx_gym.telemetry.telemetry import Telemetry
 
-if TYPE_CHECKING:
-    from physx_gym.env.pipeline_env import PipelineEnv
-    from physx_gym.simulator.simulator import Simulator
-
 BASE_POSITION = {"x": "m", "y": "m", "z": "m", "qx": "", "qy": "", "qz": "", "qw": ""}
-"""Numbers of a floating base's or an object's position, and their units."""
+"""Coordinates of the position of a floating base or an object, and their units."""
 BASE_VELOCITY = {"vx": "m/s", "vy": "m/s", "vz": "m/s", "wx": "rad/s", "wy": "rad/s", "wz": "rad/s"}
-"""Likewise of its velocity."""
+"""Components of its velocity, and their units."""
 _SENSED = {
     "orientation": "",
     "angular_velocity": "rad/s",
@@ -27,13 +24,13 @@ _SENSED = {
     "normal_force": "N",
     "force": "N",
 }
-"""Units of what sensors measure, where they do not depend on the kind of a joint."""
+"""Units of measured quantities that do not depend on the type of a joint."""
 
 
 def register_simulator(telemetry: Telemetry, simulator: Simulator) -> None:
-    """Register the world's state, the sensors, and what the motors do.
+    """Register the state of the world, the sensors, and the commands and torques of the motors.
 
-    To be called before each episode: a simulator whose options changed has other arrays.
+    To be called before each episode: a simulator whose options have changed has new arrays.
     """
     layout, state = simulator.layout, simulator.robot_state
     positions, velocities = state_names(layout)
@@ -58,7 +55,7 @@ def register_simulator(telemetry: Telemetry, simulator: Simulator) -> None:
 
 
 def state_names(layout: Layout) -> tuple[list[str], list[str]]:
-    """Return names of the positions and of the velocities of a world: part, then place in it."""
+    """Return the names of the positions and velocities of a world: part, then coordinate."""
     positions, velocities = [""] * layout.nq, [""] * layout.nv
     for part in layout.parts.values():
         joints = _joints(layout, part)
@@ -73,7 +70,7 @@ def _joints(layout: Layout, part: Part) -> list[str]:
 
 
 def sensor_names(sensors: Sequence[Sensor]) -> list[list[str]]:
-    """Return names of the values of each sensor of a kind: sensor, quantity, number in it."""
+    """Return the names of the values of each sensor of a kind: sensor, quantity, index."""
     return [
         [
             f"{sensor.name}.{quantity}" + (f".{number}" if size > 1 else "")
@@ -84,11 +81,9 @@ def sensor_names(sensors: Sequence[Sensor]) -> list[list[str]]:
     ]
 
 
-def constants_of(env: PipelineEnv) -> dict[str, Any]:
-    """Return what a log says of an environment beside its columns."""
-    simulator, layout = env.simulator, env.simulator.layout
+def describe_simulator(simulator: Simulator) -> dict[str, Any]:
+    """Return the description of a simulator in a log."""
     return {
-        "environment": type(env).__name__,
         "physx": __version__,
         "world": simulator.world,
         "backend": reference_of(simulator.backend),
@@ -99,11 +94,7 @@ def constants_of(env: PipelineEnv) -> dict[str, Any]:
                 "positions": [part.positions.start, part.positions.stop],
                 "velocities": [part.velocities.start, part.velocities.stop],
             }
-            for part in layout.parts.values()
+            for part in simulator.layout.parts.values()
         },
         "options": simulator.get_options(),
-        "seed": env.np_random_seed,
-        "step_dt": env.step_dt,
-        "control_dt": env.control_dt,
-        "observe_dt": env.observe_dt,
     }

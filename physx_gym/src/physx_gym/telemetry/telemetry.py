@@ -178,9 +178,10 @@ class Telemetry:
             self.log.write(self._path)
 
     def discard(self) -> None:
-        """End the episode without a file."""
-        self._path = None
-        self.end()
+        """End the episode without a file; nothing happens if none is being recorded."""
+        if self.is_recording:
+            self._path = None
+            self.end()
 
     @property
     def rows(self) -> int:

@@ -1,4 +1,4 @@
-"""What layers with a block have in common."""
+"""Layers that run a block."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from gymnasium import spaces
 from physx_core.errors import ConfigError
 from physx_core.typing import Vector
 from physx_gym.blocks.block import ControllerBlock, ObserverBlock
-from physx_gym.env.layers.layer import Layer, PipelineEnv
+from physx_gym.env.layers.layer import Layer
+from physx_gym.env.pipeline_env import PipelineEnv
 
 
-class Rhythm:
-    """When a block runs, and what to call: at hand in one place, as a layer's attributes are slow.
+class Schedule:
+    """When a block runs, and what it calls: in one place, as attributes of layers are slow.
 
     Attributes:
         run: Runs the block.
-        act: Computes commands in the next environment below that does.
-        observe: Observes in the next environment below that does.
-        target: Action of that environment.
-        stepper: Where the episode is.
+        act: Computes commands in the next environment below that overrides it.
+        observe: Observes in the next environment below that overrides it.
+        target: Action of the environment that `act` belongs to.
+        stepper: Progress of the episode.
         every: Period of the block, in physics steps.
-        last: Physics step of the episode at which the block ran last; -1: not yet.
+        last: Physics step of the episode at which the block last ran; -1: not yet.
     """
 
     __slots__ = ("act", "every", "last", "observe", "run", "stepper", "target")
@@ -40,7 +41,7 @@ class Rhythm:
 
 
 def _next_with(method: str, env: PipelineEnv) -> PipelineEnv:
-    """Return the next environment, from this one down, that does more than to forward a method."""
+    """Return the next environment, from this one down, that does not merely forward a method."""
     forwards = (getattr(Layer, method), getattr(BlockLayer, method))
     while isinstance(env, Layer) and getattr(type(env), method) in forwards:
         env = env.env
@@ -57,15 +58,15 @@ class BlockLayer(Layer):
     block: ObserverBlock | ControllerBlock
 
     def __init__(self, env: PipelineEnv, block: ObserverBlock | ControllerBlock) -> None:
-        """Put a block on the environment that it was made for.
+        """Put a block on the environment that it was created for.
 
         Raises:
-            ConfigError: It was made for another one, or its name is taken.
+            ConfigError: If it was created for another environment, or its name is taken.
         """
         if block.env is not env:
             raise ConfigError(
-                f'The block "{block.name}" was made for {block.env!r}, not for {env!r}. '
-                "Make a block and the layer that runs it for the same environment."
+                f'The block "{block.name}" was created for {block.env!r}, not for {env!r}. '
+                "Create a block and the layer that runs it for the same environment."
             )
         for below in env.layers:
             if isinstance(below, BlockLayer) and below.block.name == block.name:
@@ -76,11 +77,11 @@ class BlockLayer(Layer):
         self.block = block
         self._basis: tuple[Any, ...] = ()
         self._build = -1
-        self._rhythm = Rhythm(env, block)
+        self._schedule = Schedule(env, block)
         super().__init__(env)
 
     def _initialize_action_space(self) -> None:
-        """Let the block take up what changed in the simulator."""
+        """Connect the block to the simulator, unless that is unchanged."""
         self.block.refresh_connection()
         self._initialize_actions()
 
@@ -89,7 +90,7 @@ class BlockLayer(Layer):
         super()._initialize_action_space()
 
     def _initialize_observation_space(self) -> None:
-        """Add the block's parts to the observation below, unless that is as it was."""
+        """Add the block's parts to the observation below, unless that is unchanged."""
         build = self.block.connected_to
         basis = (self.env.observation_space, self.env.observation, self.action)
         if build == self._build and all(a is b for a, b in zip(self._basis, basis, strict=True)):
@@ -103,58 +104,58 @@ class BlockLayer(Layer):
             self.register_variable("state", state, self.block.state_fieldnames, self.block.name)
 
     def _add_parts(self) -> None:
-        """Add what is observed besides the block's state."""
+        """Add the parts of the observation other than the block's state."""
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Let the layers below observe."""
-        self._rhythm.observe(measurement)
+        """Update the observation of the layers below."""
+        self._schedule.observe(measurement)
 
     def compute_command(self, action: Any, command: Vector) -> None:
         """Let the layers below compute the command of this layer's action."""
-        self._rhythm.act(action, command)
+        self._schedule.act(action, command)
 
     def _initialize_buffers(self) -> None:
         super()._initialize_buffers()
         self.block.setup()
         self.block.begin()
-        self._rhythm = Rhythm(self.env, self.block)
+        self._schedule = Schedule(self.env, self.block)
 
     def _memory(self) -> Any:
-        return {"block": self.block.snapshot(), "last": self._rhythm.last}
+        return {"block": self.block.snapshot(), "last": self._schedule.last}
 
     def _recall(self, memory: Any) -> None:
         self.block.restore(memory["block"])
-        self._rhythm.last = memory["last"]
+        self._schedule.last = memory["last"]
 
     def _add_part(self, group: str, space: spaces.Space[Any], value: Any) -> None:
         """Add a part to the observation, under the block's name."""
-        self.observation_space, self.observation = with_part(
+        self.observation_space, self.observation = add_part(
             self.observation_space, self.observation, (group, self.block.name), space, value
         )
 
 
-def with_part(
+def add_part(
     space: spaces.Space[Any],
     observation: Any,
     keys: tuple[str, str],
     part_space: spaces.Space[Any],
     part: Any,
 ) -> tuple[spaces.Space[Any], Any]:
-    """Return an observation space with one part more, and its buffer; the arrays stay the same.
+    """Return an observation space and its buffer with a part added; the arrays stay the same.
 
     Args:
-        space: Of the observation; one that is no dictionary goes under ``measurement``.
-        observation: The buffer.
-        keys: Where the part goes: the group and the name.
+        space: Space of the observation; if it is not a dictionary, it goes under ``measurement``.
+        observation: Its buffer.
+        keys: Group and name of the part.
         part_space: Space of the part.
-        part: Its buffer.
+        part: Buffer of the part.
     """
     if not isinstance(space, spaces.Dict):
         space, observation = spaces.Dict({"measurement": space}), {"measurement": observation}
     group, name = keys
     inner = space.spaces.get(group, spaces.Dict({}))
     if not isinstance(inner, spaces.Dict) or name in inner.spaces:
-        raise ConfigError(f'The observation has "{group}.{name}" already.')
+        raise ConfigError(f'The observation already has "{group}.{name}".')
     grown = spaces.Dict({**inner.spaces, name: part_space})
     parts = {**observation.get(group, {}), name: part}
     return spaces.Dict({**space.spaces, group: grown}), {**observation, group: parts}

@@ -1,4 +1,4 @@
-"""A layer of rewards and terminations."""
+"""Layers of rewards and terminations."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from physx_core.errors import ConfigError
-from physx_gym.env.layers.layer import Info, Layer, PipelineEnv
+from physx_gym.env.layers.layer import Layer
+from physx_gym.env.pipeline_env import Info, PipelineEnv
 from physx_gym.tasks.rewards import Reward
 from physx_gym.tasks.terminations import Termination
 from physx_gym.tasks.trajectory import Trajectory
@@ -15,9 +16,9 @@ from physx_gym.tasks.trajectory import Trajectory
 class ComposedEnv(Layer):
     """Adds a reward and terminations to an environment.
 
-    The reward is added to that of the layers below; ``info["reward"]`` has its parts by name. An
-    episode ends where the layers below or one of the terminations say so;
-    ``info["terminations"]`` names those that did.
+    The reward is added to that of the layers below; ``info["reward"]`` contains its parts by name.
+    An episode ends when the layers below or one of the terminations end it;
+    ``info["terminations"]`` names the terminations that did.
 
     Attributes:
         reward: The reward; None: none is added.
@@ -36,14 +37,14 @@ class ComposedEnv(Layer):
 
         Args:
             env: The environment.
-            reward: What to add to the reward.
-            terminations: What else ends an episode: one or several, whose names differ.
-            trajectory: The reference that quantities may be compared to; None: there is none, or
-                that of a layer below.
+            reward: The reward to add.
+            terminations: One or several further terminations, with different names.
+            trajectory: The reference that quantities may be compared to; None: that of a layer
+                below, if there is one.
 
         Raises:
-            ConfigError: Something is no reward or termination, two terminations have one name, or
-                the trajectory is of another robot.
+            ConfigError: If a reward or termination is not one, two terminations have the same name,
+                or the trajectory is of another robot.
         """
         if isinstance(terminations, Termination):
             terminations = (terminations,)
@@ -53,13 +54,13 @@ class ComposedEnv(Layer):
         quantities = env.quantities
         if trajectory is not None:
             if not isinstance(trajectory, Trajectory):
-                raise ConfigError(f"ComposedEnv.trajectory is {trajectory!r}, which is none.")
+                raise ConfigError(f"ComposedEnv.trajectory is {trajectory!r}, not a Trajectory.")
             state = env.robot_state
             shapes = (trajectory.positions.shape[1], trajectory.velocities.shape[1])
             if shapes != (len(state.q), len(state.v)):
                 raise ConfigError(
                     f"The trajectory has {shapes[0]} positions and {shapes[1]} velocities, but the "
-                    f"robot {len(state.q)} and {len(state.v)}."
+                    f"robot has {len(state.q)} and {len(state.v)}."
                 )
             quantities.trajectory = trajectory
         for part in (*terminations, *(() if reward is None else (reward,))):
@@ -83,7 +84,7 @@ class ComposedEnv(Layer):
         return terminated, truncated | any(each.is_truncation for each in fired)
 
     def compute_reward(self, terminated: bool, info: Info) -> float:
-        """Return the reward of the layers below plus the own one."""
+        """Return the reward of the layers below plus that of this layer."""
         total = self.env.compute_reward(terminated, info)
         if self.reward is not None:
             parts = info.setdefault("reward", {})
@@ -94,16 +95,11 @@ class ComposedEnv(Layer):
 
 
 def _check(reward: Any, terminations: Sequence[Any]) -> None:
-    """Check what is added to an environment.
-
-    Raises:
-        ConfigError: Something is no reward or termination, or two terminations have one name.
-    """
     if reward is not None and not isinstance(reward, Reward):
-        raise ConfigError(f"ComposedEnv.reward is {reward!r}, which is no Reward.")
+        raise ConfigError(f"ComposedEnv.reward is {reward!r}, which is not a Reward.")
     for each in terminations:
         if not isinstance(each, Termination):
-            raise ConfigError(f"{each!r} is no Termination.")
+            raise ConfigError(f"{each!r} is not a Termination.")
     names = [each.name for each in terminations]
     if len(set(names)) < len(names):
-        raise ConfigError(f"Two terminations have one name: {sorted(names)}.")
+        raise ConfigError(f"Two terminations have the same name: {sorted(names)}.")

@@ -1,4 +1,4 @@
-"""A layer that controls."""
+"""Layers that control."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from physx_core.errors import ConfigError
 from physx_core.typing import Vector
 from physx_gym.blocks.block import ControllerBlock
 from physx_gym.env.layers.block_layer import BlockLayer
-from physx_gym.env.layers.layer import PipelineEnv
+from physx_gym.env.pipeline_env import PipelineEnv
 from physx_gym.spaces import neutral
 
 
 class ControlledEnv(BlockLayer):
     """Takes a controller's actions instead of those of the environment below.
 
-    The controller's state, if it has one, is added to the observation as ``states.<block>``, and
-    with `augment_observation` its action as ``actions.<block>``.
+    The controller's state, if it has one, is added to the observation as ``states.<block>``, and,
+    with `augment_observation`, its action as ``actions.<block>``.
 
     Attributes:
         controller: The block.
@@ -26,10 +26,11 @@ class ControlledEnv(BlockLayer):
     def __init__(
         self, env: PipelineEnv, controller: ControllerBlock, augment_observation: bool = False
     ) -> None:
-        """Put a controller on the environment that it was made for.
+        """Put a controller on the environment that it was created for.
 
         Raises:
-            ConfigError: It is no controller, was made for another one, or its name is taken.
+            ConfigError: If it is not a controller, was created for another environment, or its name
+                is taken.
         """
         if not isinstance(controller, ControllerBlock):
             raise ConfigError(f"ControlledEnv needs a ControllerBlock, not {controller!r}.")
@@ -54,10 +55,10 @@ class ControlledEnv(BlockLayer):
             self._add_part("actions", self.action_space, self.action)
 
     def compute_command(self, action: Any, command: Vector) -> None:
-        """Let the block, if it is due, act on the layer below, and that on the motors."""
-        rhythm = self._rhythm
-        target, frame = rhythm.target, rhythm.stepper.iter
-        if frame != rhythm.last and frame % rhythm.every == 0:
-            rhythm.last = frame
-            rhythm.run(action, target)
-        rhythm.act(target, command)
+        """Run the block, if it is due, then let the layer below command the motors."""
+        schedule = self._schedule
+        target, frame = schedule.target, schedule.stepper.iter
+        if frame != schedule.last and frame % schedule.every == 0:
+            schedule.last = frame
+            schedule.run(action, target)
+        schedule.act(target, command)

@@ -1,27 +1,23 @@
-"""Layers: environments on top of another one."""
+"""Layers: environments on top of others."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from physx_core.errors import ConfigError
 from physx_core.typing import Vector
 from physx_gym.env.pipeline_env import Info, PipelineEnv, Step
-
-if TYPE_CHECKING:
-    from physx_gym.env.robot_env import RobotEnv
-
-__all__ = ["Info", "Layer", "PipelineEnv", "Step"]
+from physx_gym.env.robot_env import RobotEnv
 
 
 class Layer(PipelineEnv):
     """An environment on top of another one; it forwards what it does not override.
 
     Attributes that it does not have are those of the layer below. Subclasses with memory override
-    `_memory` and `_recall`; those with an own action or observation set their space in
+    `_memory` and `_recall`; those with their own action or observation set the space in
     `_initialize_action_space` or `_initialize_observation_space`, and the buffer there too.
 
     Attributes:
@@ -29,30 +25,23 @@ class Layer(PipelineEnv):
     """
 
     def __init__(self, env: PipelineEnv) -> None:
-        """Put a layer on an environment, and make it the top of the pipeline."""
+        """Put a layer on an environment, and make it the outermost of the pipeline."""
         if not isinstance(env, PipelineEnv):
             raise ConfigError(
                 f"{type(self).__name__} goes on a RobotEnv or a layer of one, not on {env!r}. "
                 "Wrappers of gymnasium go around the whole pipeline."
             )
         self.env = env
+        self._base: RobotEnv = env.unwrapped
         self._initialize_action_space()
         self._initialize_observation_space()
-        env.unwrapped._update_pipeline(self)
+        self._base._update_pipeline(self)
 
     def __getattr__(self, name: str) -> Any:
         """Return a public attribute of the layer below."""
         if name.startswith("_") or "env" not in self.__dict__:
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
         return getattr(self.env, name)
-
-    @property
-    def unwrapped(self) -> RobotEnv:
-        """The base environment of the pipeline."""
-        return self.env.unwrapped
-
-    def _below(self) -> PipelineEnv:
-        return self.env
 
     def _initialize_action_space(self) -> None:
         self.action_space, self.action = self.env.action_space, self.env.action
@@ -61,7 +50,7 @@ class Layer(PipelineEnv):
         self.observation_space, self.observation = self.env.observation_space, self.env.observation
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Let the layer below observe."""
+        """Update the observation of the layer below."""
         self.env.refresh_observation(measurement)
 
     def compute_command(self, action: Any, command: Vector) -> None:
@@ -69,7 +58,7 @@ class Layer(PipelineEnv):
         self.env.compute_command(action, command)
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
-        """Return what the layer below says."""
+        """Return whether the layer below is terminated or truncated."""
         return self.env.has_terminated(info)
 
     def compute_reward(self, terminated: bool, info: Info) -> float:
@@ -81,6 +70,37 @@ class Layer(PipelineEnv):
 
     def _refresh_buffers(self) -> None:
         self.env._refresh_buffers()
+
+    # The pipeline is run by its base -----------------------------------------------------------
+
+    @property
+    def unwrapped(self) -> RobotEnv:
+        """The base environment of the pipeline."""
+        return self._base
+
+    @property
+    def outermost(self) -> PipelineEnv:
+        """The outermost environment of the pipeline."""
+        return self._base.outermost
+
+    @property
+    def layers(self) -> tuple[PipelineEnv, ...]:
+        """This environment and all below it, the base first."""
+        return (*self.env.layers, self)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, Info]:
+        """Start an episode with this layer as the outermost; see `PipelineEnv.reset`."""
+        return self._base.run_reset(self, seed, options)
+
+    def step(self, action: Any) -> Step:
+        """Simulate `step_dt` under an action; see `PipelineEnv.step`."""
+        return self._base.run_step(self, action)
+
+    def restore(self, state: Any) -> None:
+        """Return to a snapshot; see `PipelineEnv.restore`."""
+        self._base.run_restore(self, state)
 
     def stop(self) -> None:
         """End the episode; see `RobotEnv.stop`."""
@@ -94,50 +114,57 @@ class Layer(PipelineEnv):
         """Return a picture; see `RobotEnv.render`."""
         return self.env.render()
 
-    # What gymnasium gives every environment is the base's --------------------------------------
+    @property
+    def training(self) -> bool:
+        """Whether this is for training; see `PipelineEnv.training`."""
+        return self._base.training
+
+    def train(self, mode: bool = True) -> None:
+        """Switch between training and evaluation; see `PipelineEnv.train`."""
+        self._base.train(mode)
 
     @property
     def np_random(self) -> np.random.Generator:
-        """What the environment draws from."""
-        return self.env.np_random
+        """The random generator of the environment."""
+        return self._base.np_random
 
     @np_random.setter
     def np_random(self, value: np.random.Generator) -> None:
-        self.env.np_random = value
+        self._base.np_random = value
 
     @property
     def np_random_seed(self) -> int:
         """Seed of `np_random`."""
-        return self.env.np_random_seed
+        return self._base.np_random_seed
 
     @property
     def render_mode(self) -> str | None:  # type: ignore[override]
         """How `render` shows the world."""
-        return self.env.render_mode
+        return self._base.render_mode
 
     @property
     def metadata(self) -> dict[str, Any]:  # type: ignore[override]
-        """What the environment can do."""
-        return self.env.metadata
+        """Gymnasium's metadata of the environment."""
+        return self._base.metadata
 
     @property
     def spec(self) -> Any:
-        """How gymnasium's registry makes the environment, if it did."""
-        return self.env.spec
+        """The environment's specification in gymnasium's registry, if it has one."""
+        return self._base.spec
 
     @spec.setter
     def spec(self, value: Any) -> None:
-        self.env.spec = value
+        self._base.spec = value
 
-    # Pickling --------------------------------------------------------------------------------
+    # Pickling ----------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes, and whether this is the top of the pipeline."""
-        return super().__getstate__() | {"_is_top": self.derived is self}
+        """Return the attributes, and whether this is the outermost layer."""
+        return super().__getstate__() | {"_is_outermost": self.outermost is self}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take up the attributes, and the top of the pipeline."""
-        is_top = state.pop("_is_top")
+        """Restore the attributes, and the outermost layer of the pipeline."""
+        is_outermost = state.pop("_is_outermost")
         super().__setstate__(state)
-        if is_top:
-            self.unwrapped.resume(self)
+        if is_outermost:
+            self._base.adopt(self)

@@ -1,4 +1,4 @@
-"""A layer that observes."""
+"""Layers that observe."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from physx_core.errors import ConfigError
 from physx_gym.blocks.block import ObserverBlock
 from physx_gym.env.layers.block_layer import BlockLayer
-from physx_gym.env.layers.layer import PipelineEnv
+from physx_gym.env.pipeline_env import PipelineEnv
 
 
 class ObservedEnv(BlockLayer):
@@ -21,10 +21,11 @@ class ObservedEnv(BlockLayer):
     """
 
     def __init__(self, env: PipelineEnv, observer: ObserverBlock) -> None:
-        """Put an observer on the environment that it was made for.
+        """Put an observer on the environment that it was created for.
 
         Raises:
-            ConfigError: It is no observer, was made for another one, or its name is taken.
+            ConfigError: If it is not an observer, was created for another environment, or its name
+                is taken.
         """
         if not isinstance(observer, ObserverBlock):
             raise ConfigError(f"ObservedEnv needs an ObserverBlock, not {observer!r}.")
@@ -42,10 +43,10 @@ class ObservedEnv(BlockLayer):
         self.register_variable("feature", observer.observation, observer.fieldnames, observer.name)
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Let the layers below observe, then the block, if it is due."""
-        rhythm = self._rhythm
-        rhythm.observe(measurement)
-        frame = rhythm.stepper.iter
-        if frame != rhythm.last and frame % rhythm.every == 0:
-            rhythm.last = frame
-            rhythm.run(measurement)
+        """Update the observation of the layers below, then run the block, if it is due."""
+        schedule = self._schedule
+        schedule.observe(measurement)
+        frame = schedule.stepper.iter
+        if frame != schedule.last and frame % schedule.every == 0:
+            schedule.last = frame
+            schedule.run(measurement)

@@ -6,18 +6,16 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from physx_core.errors import ComponentNotFoundError, ConfigError, FeatureNotSupportedError
 from physx_core.simulation import Part, Simulation
 from physx_core.typing import Records, Vector
+from physx_gym.simulator.simulator import Simulator
 from physx_gym.spaces import copy_tree
-
-if TYPE_CHECKING:
-    from physx_gym.env.layers.layer import PipelineEnv
-    from physx_gym.tasks.trajectory import Trajectory
+from physx_gym.tasks.trajectory import Trajectory
 
 
 class Quantity(ABC):
@@ -198,13 +196,14 @@ class Quantities(Mapping[str, Any]):
     asked for. Without a name: ``env.quantities.get_value(BaseHeight())``.
     """
 
-    def __init__(self, env: PipelineEnv) -> None:
-        """Begin without quantities.
+    def __init__(self, simulator: Simulator, step_dt: float) -> None:
+        """Start without quantities.
 
         Args:
-            env: What they are of.
+            simulator: The simulator of the environment.
+            step_dt: Time of a step of the environment, in s.
         """
-        self.simulator, self.step_dt = env.simulator, env.step_dt
+        self.simulator, self.step_dt = simulator, step_dt
         self.trajectory: Trajectory | None = None
         self._named: dict[str, Quantity] = {}
         self._watched: dict[Quantity, None] = {}

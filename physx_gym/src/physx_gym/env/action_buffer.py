@@ -1,4 +1,4 @@
-"""Taking over actions: each checked, brought into its bounds, and written into a buffer."""
+"""Actions: each is checked, clipped, and written into a buffer."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from physx_gym.shared_arrays import SharedArrays
 from physx_gym.spaces import Path, fill, format_path
 
 
-class Actions(SharedArrays):
-    """Writes actions of a space into a buffer."""
+class ActionBuffer(SharedArrays):
+    """A buffer that actions of a space are written into."""
 
     def __init__(self, space: spaces.Space[Any], buffer: Any) -> None:
         self._space, self._buffer = space, buffer
@@ -25,11 +25,11 @@ class Actions(SharedArrays):
         if isinstance(space, spaces.Discrete):
             self._first, self._end = int(space.start), int(space.start + space.n)
 
-    def take(self, action: Any) -> None:
-        """Check an action and write it, cut at the bounds of its space, into the buffer.
+    def write(self, action: Any) -> None:
+        """Check an action, and write it into the buffer, clipped to the bounds of its space.
 
         Raises:
-            ActionError: Its form is wrong, or an entry is no number.
+            ActionError: If its form is wrong, or an entry is not finite.
         """
         buffer = self._buffer
         kind = type(action)
@@ -51,53 +51,58 @@ class Actions(SharedArrays):
                     np.maximum(action, self._bounds[0], out=buffer)
                     np.minimum(buffer, self._bounds[1], out=buffer)
                 return
-        self._buffer = _take(self._space, buffer, action, ())
+        self._buffer = _write(self._space, buffer, action, ())
 
 
-def _take(space: spaces.Space[Any], buffer: Any, action: Any, path: Path) -> Any:
-    """Write an action into a buffer; return the buffer, or the action of what has none."""
+def _write(space: spaces.Space[Any], buffer: Any, action: Any, path: Path) -> Any:
+    """Write an action into a buffer; return the buffer, or the action if it has none."""
     if isinstance(space, spaces.Dict):
         if not isinstance(action, dict) or set(action) != set(space.spaces):
             keys = list(action) if isinstance(action, dict) else repr(action)
-            raise _wrong(path, f"needs the keys {list(space.spaces)}, not {keys}")
+            raise _error(path, f"needs the keys {list(space.spaces)}, not {keys}")
         for key, each in space.spaces.items():
-            buffer[key] = _take(each, buffer[key], action[key], (*path, key))
+            buffer[key] = _write(each, buffer[key], action[key], (*path, key))
         return buffer
     if isinstance(space, spaces.Tuple):
         if not isinstance(action, (tuple, list)) or len(action) != len(space.spaces):
-            raise _wrong(path, f"needs {len(space.spaces)} parts, not {action!r}")
+            raise _error(path, f"needs {len(space.spaces)} parts, not {action!r}")
         parts = zip(space.spaces, buffer, action, strict=True)
-        return tuple(_take(*part, (*path, i)) for i, part in enumerate(parts))
+        return tuple(_write(*part, (*path, i)) for i, part in enumerate(parts))
     if isinstance(space, spaces.Box):
-        _take_box(space, buffer, action, path)
+        _write_box(space, buffer, action, path)
         return buffer
     try:
         known = space.contains(action)
-    except Exception:  # a space may choke on what is far from its elements
+    except Exception:  # a space may raise anything for what is not one of its elements
         known = False
     if not known:
-        raise _wrong(path, f"is {action!r}, which is no element of {space}")
+        raise _error(path, f"is {action!r}, which is not an element of {space}")
     return fill(buffer, action)
 
 
-def _take_box(space: spaces.Box, buffer: Any, action: Any, path: Path) -> None:
+def _write_box(space: spaces.Box, buffer: Any, action: Any, path: Path) -> None:
     try:
         given = np.asarray(action)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise _wrong(path, f"is no array of numbers: {error}") from error
+        raise _error(path, f"is not an array of numbers: {error}") from error
     if given.shape != space.shape:
-        raise _wrong(path, f"has the shape {given.shape} but needs {space.shape}")
+        raise _error(path, f"has the shape {given.shape} but needs {space.shape}")
     kinds = "fiu" if np.issubdtype(space.dtype, np.floating) else "iu"
     if given.dtype.kind not in kinds:
-        raise _wrong(path, f"has the type {given.dtype}, which {space.dtype} cannot hold")
+        raise _error(path, f"has the type {given.dtype}, which {space.dtype} cannot hold")
     if given.dtype.kind == "f":
         broken = np.isnan(given) | (
             np.isinf(given) & np.isinf(np.where(given > 0, space.high, space.low))
         )
         if broken.any():
             place = tuple(np.argwhere(broken)[0].tolist())
-            raise _wrong((*path, *place), f"is {given[place]}, not a finite number")
-    _cut(given, _bounds(space), buffer)
+            raise _error((*path, *place), f"is {given[place]}, not a finite number")
+    bounds = _bounds(space)
+    if bounds is None:
+        np.copyto(buffer, given, "same_kind")
+    else:
+        np.maximum(given, bounds[0], out=buffer, casting="same_kind")
+        np.minimum(buffer, bounds[1], out=buffer)
 
 
 def _bounds(space: spaces.Box) -> tuple[Any, Any] | None:
@@ -105,15 +110,6 @@ def _bounds(space: spaces.Box) -> tuple[Any, Any] | None:
     return (space.low, space.high) if limited else None
 
 
-def _cut(action: Any, bounds: tuple[Any, Any] | None, out: Any) -> None:
-    """Write an action, cut at its bounds."""
-    if bounds is None:
-        np.copyto(out, action, "same_kind")
-        return
-    np.maximum(action, bounds[0], out=out, casting="same_kind")
-    np.minimum(out, bounds[1], out=out)
-
-
-def _wrong(path: Path, what: str) -> ActionError:
+def _error(path: Path, what: str) -> ActionError:
     entry = format_path(path)
     return ActionError(f"The action{entry and ' at '}{entry} {what}. See env.action_space.", entry)

@@ -1,4 +1,4 @@
-"""The spaces and buffers that a simulator's motors and measurements have by themselves."""
+"""Default spaces and observation of an environment: the motors' torques and all measurements."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from physx_gym.simulator.simulator import Simulator
 from physx_gym.spaces import leaves, neutral, value_at
 
 _MARGIN = 0.01
-"""How far beyond their limits positions are still within the space, as a share of the range."""
+"""How far positions may exceed their limits within the space, as a fraction of the range."""
 _FAR = 1e9
-"""What stands for no limit: beyond it the engines give up. Gymnasium warns of infinite bounds."""
+"""Bound of unlimited values: engines fail beyond it, and Gymnasium warns of infinite bounds."""
 
 
 def action_space_of(simulator: Simulator) -> spaces.Box:
-    """Return the torques that the motors can give."""
+    """Return the space of the torques that the motors can exert."""
     most = np.minimum(simulator.max_commands(), _FAR)
     return spaces.Box(-most, most, dtype=np.float64)
 
@@ -27,7 +27,7 @@ def observation_space_of(simulator: Simulator, longest: float) -> spaces.Dict:
     """Return the space of the measurements: time, state of the robot, sensors by kind.
 
     Args:
-        simulator: What is measured.
+        simulator: The simulator.
         longest: Time at which every episode is over, in s.
     """
     inside: dict[str, spaces.Space[Any]] = {
@@ -57,12 +57,12 @@ def _unbounded(array: Vector) -> spaces.Space[Any]:
     return spaces.Box(-_FAR, _FAR, array.shape, np.float64)
 
 
-def observed(simulator: Simulator) -> tuple[Any, Vector, dict[str, Any]]:
-    """Return the default observation as a buffer.
+def allocate_observation(simulator: Simulator) -> tuple[Any, Vector, dict[str, Any]]:
+    """Return a buffer of the default observation.
 
     Returns:
-        The place of each observed number in the simulator's values; the memory of the observation,
-        in the order of its space; and the observation, whose arrays are parts of that.
+        The index of each observed number in the simulator's values; the memory of the observation,
+        flat and in the order of its space; and the observation, which consists of views of it.
     """
     space = observation_space_of(simulator, 1.0)
     numbers = simulator.views_of(np.arange(len(simulator.values), dtype=np.float64))

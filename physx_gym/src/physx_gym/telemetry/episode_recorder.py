@@ -1,0 +1,107 @@
+"""Recording of the episodes of an environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.errors import ConfigError
+from physx_gym.simulator.simulator import Simulator
+from physx_gym.telemetry.log_folder import LogFolder
+from physx_gym.telemetry.standard_columns import describe_simulator, register_simulator
+from physx_gym.telemetry.telemetry import Telemetry
+
+
+class EpisodeRecorder:
+    """Records episodes: registered variables, and in evaluation the simulator and the action.
+
+    Files whose path is not given lie in a temporary folder that is removed by `close`.
+
+    Attributes:
+        telemetry: The registered variables and the recorded rows.
+    """
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.telemetry = Telemetry()
+        self._simulator = simulator
+        self._folder = LogFolder()
+        self._action: tuple[Any, Any] | None = None  # of another type, and its recorded copy
+
+    def begin_training(self) -> bool:
+        """Start an episode of which only what was registered for training is recorded.
+
+        Returns:
+            Whether anything is recorded.
+        """
+        self._action = None
+        self.telemetry.begin(training=True)
+        return self.telemetry.is_recording
+
+    def begin(self, name: str, action: Any, path: Any, constants: Mapping[str, Any]) -> str:
+        """Start an episode of which everything is recorded, and written to a file at its end.
+
+        Args:
+            name: Name of the environment.
+            action: Buffer of the action; recorded if it is a single array of numbers.
+            path: Path of the file; None: one in the temporary folder.
+            constants: Description of the environment, beside that of its simulator.
+
+        Returns:
+            The path of the file.
+
+        Raises:
+            ConfigError: If the path is not a path.
+        """
+        if path is not None and not isinstance(path, (str, Path)):
+            raise ConfigError(f'The option "log_path" is {path!r} but must be a path.')
+        register_simulator(self.telemetry, self._simulator)
+        self._register_action(action)
+        file = self._folder.new_path(name) if path is None else Path(path)
+        described = {"environment": name, **describe_simulator(self._simulator), **constants}
+        self.telemetry.begin(file, described)
+        return str(file)
+
+    def _register_action(self, action: Any) -> None:
+        self.telemetry.unregister("action")
+        self._action = None
+        if not isinstance(action, np.ndarray) or action.dtype.kind not in "fiub":
+            return
+        is_recordable = action.dtype in (np.float64, np.int64)
+        recorded = action if is_recordable else np.array(action, np.float64)
+        self._action = None if is_recordable else (action, recorded)
+        joints = [motor.joint for motor in self._simulator.motors]
+        self.telemetry.register(
+            "action", recorded, joints if action.shape == (len(joints),) else None
+        )
+
+    def record(self) -> None:
+        """Record a row of the present values."""
+        self._simulator.robot_state.refresh()
+        if self._action is not None:
+            self._action[1][...] = self._action[0]
+        self.telemetry.record(self._simulator.stepper_state.t)
+
+    def data(self) -> dict[str, Any]:
+        """Return what was recorded, the present state included; see `Telemetry.log_data`."""
+        if self.telemetry.is_recording:
+            self.record()
+        return self.telemetry.log_data
+
+    def end(self, *, keep: bool) -> None:
+        """End the episode, if one is recorded.
+
+        Args:
+            keep: Whether to record the last state and write the file.
+        """
+        if not keep:
+            self.telemetry.discard()
+        elif self.telemetry.is_recording:
+            self.record()
+            self.telemetry.end()
+
+    def close(self) -> None:
+        """Remove the files in the temporary folder."""
+        self._folder.close()
