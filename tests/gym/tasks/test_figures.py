@@ -1,4 +1,4 @@
-"""Behaviour of environments, blocks, quantities and logs in figures, with their tolerances."""
+"""Measured behavior of environments, blocks, quantities and logs, with tolerances."""
 
 import itertools
 import runpy
@@ -99,7 +99,7 @@ def test_standing_for_9_s():
 
 
 @pytest.mark.slow
-def test_a_picture_of_a_robot_that_stands_stays(monkeypatch):
+def test_pictures_of_a_standing_robot_do_not_change(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     env = with_pd(a1(Exact, step_dt=0.05), kp=200.0, kd=0.02)
@@ -232,7 +232,7 @@ def fastest_near_limits(env):
         (unsafe_joints(0.1, 2.0), lambda env: fastest_near_limits(env) > 2.0),
     ],
 )
-def test_flags_are_those_recomputed(backend, termination, truth):
+def test_flags_agree_with_recomputed_ones(backend, termination, truth):
     flags = [(termination.holds(env.quantities), truth(env)) for env in thrown(backend)]
     assert all(found == wanted for found, wanted in flags)
     assert {found for found, _ in flags} == {True, False}
@@ -260,7 +260,7 @@ def test_differences_of_poses_agree_with_pinocchio():
 # What must not happen ---------------------------------------------------------------------------
 
 
-def test_what_is_drawn_anew_in_each_episode_acts_and_repeats(backend):
+def test_sampled_options_take_effect_and_repeat(backend):
     """Friction, errors of sensors and pushes, drawn when an episode begins."""
 
     class Varied(RobotEnv):
@@ -303,7 +303,7 @@ def test_what_is_drawn_anew_in_each_episode_acts_and_repeats(backend):
     assert gone[0] > gone[1] + 0.05
 
 
-def test_slow_code_is_no_error():
+def test_slow_code_is_not_an_error():
     class Slow(RobotEnv):
         def compute_command(self, action, command):
             time.sleep(0.06)
@@ -314,7 +314,7 @@ def test_slow_code_is_no_error():
     assert env.step([0.0, 0.0])[2:4] == (False, False)
 
 
-def test_what_is_no_number_at_the_beginning_is_named():
+def test_nan_in_the_first_observation_is_reported():
     class Broken(RobotEnv):
         def refresh_observation(self, measurement):
             super().refresh_observation(measurement)
@@ -324,7 +324,7 @@ def test_what_is_no_number_at_the_beginning_is_named():
         Broken("cartpole", 0.02).reset()
 
 
-def test_observations_and_rewards_after_the_end_are_true(backend):
+def test_observations_and_rewards_after_the_end_are_correct(backend):
     """What is out of bounds is observed as it is, and the reward is of the action that was cut."""
 
     class Narrow(RobotEnv):
@@ -349,7 +349,7 @@ def test_observations_and_rewards_after_the_end_are_true(backend):
     assert observation[0] == env.robot_state.q[0] > 0.01
 
 
-def test_quantities_are_of_objects_and_links_alike(backend):
+def test_quantities_work_for_objects_and_links(backend):
     env = ant(backend=backend)
     env.reset(seed=0)
     poses = env.quantities.get_value(BodyPoses(("torso",)))[0]

@@ -1,4 +1,4 @@
-"""Rewards and terminations of a composed environment, against values that are recomputed."""
+"""Rewards and terminations of a composed environment, compared with recomputed values."""
 
 import math
 
@@ -51,7 +51,7 @@ def still(env, seconds, beyond="clip", **moves):
     return Trajectory(np.array([0.0, seconds]), np.array([q, last]), np.array([v, v]), beyond)
 
 
-def test_rewards_are_the_formulas():
+def test_rewards_follow_their_formulas():
     env = ant()
     path = still(env, 1.0, up=(2, 0.5))
     reward = Sum(
@@ -103,7 +103,7 @@ def test_normalized_sums_stay_within_0_and_1_and_rewards_add_up_over_layers():
     assert total == pytest.approx(info["reward"]["total"] + 1.0)
 
 
-def test_terminations_end_episodes_as_they_say():
+def test_terminations_end_episodes():
     env = ant()
     top = ComposedEnv(
         env,
@@ -143,7 +143,7 @@ def test_terminations_end_episodes_as_they_say():
     assert later.step(np.zeros(8))[2:4] == (False, True)
 
 
-def test_drift_and_shift_are_those_of_the_reference():
+def test_drift_and_shift_are_relative_to_the_reference():
     env = ant()
     path = still(env, 10.0, forward=(0, 1.0))  # the reference walks off at 1 m/s
     drift = Drift(Odometry(), 5, -0.09, 0.09, difference=odometry_difference)
@@ -163,7 +163,7 @@ def test_drift_and_shift_are_those_of_the_reference():
     assert steps in (4, 5, 6)
 
 
-def test_what_touches_slips_and_strains():
+def test_contact_slip_and_power_terminations():
     env = ant()
     feet = tuple(env.simulator.layout.bodies)
     watched = [
@@ -193,7 +193,7 @@ def test_what_touches_slips_and_strains():
     assert "terminations" not in top.step(np.full(8, 5.0))[-1]
 
 
-def test_mistakes_are_named():
+def test_mistakes_are_reported():
     env = ant()
     with pytest.raises(ConfigError, match="not a Reward"):
         ComposedEnv(env, reward=1.0)
@@ -201,7 +201,7 @@ def test_mistakes_are_named():
         ComposedEnv(env, terminations=[1.0])
     with pytest.raises(ConfigError, match="same name"):
         ComposedEnv(env, terminations=[base_height(0.1), base_height(0.2)])
-    with pytest.raises(ConfigError, match="one name"):
+    with pytest.raises(ConfigError, match="same name"):
         Sum([Survival(), Survival()])
     with pytest.raises(ConfigError, match="cannot be normalized"):
         Product([Sum([Survival()])])
@@ -218,7 +218,7 @@ def test_mistakes_are_named():
         ComposedEnv(env, trajectory=short)
 
 
-def test_trajectories_are_interpolated_and_kept(tmp_path):
+def test_trajectories_are_interpolated_and_saved(tmp_path):
     quarter = [0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4)]
     q = np.array([[0, 0, 1, 0, 0, 0, 1, 0.0], [1, 0, 1, *(-np.array(quarter)), 1.0]])
     v = np.array([[0.0] * 7, [2.0] * 7])

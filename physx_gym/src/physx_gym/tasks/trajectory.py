@@ -10,6 +10,7 @@ import numpy as np
 
 from physx_core.errors import ConfigError, LogError
 from physx_core.fields import is_finite
+from physx_core.rotations import interpolate_rows
 from physx_core.typing import Vector
 
 Beyond = Literal["raise", "wrap", "clip"]
@@ -84,15 +85,14 @@ class Trajectory:
         span = float(self.times[after] - self.times[row])
         share = (t - float(self.times[row])) / span if span > 0 else 0.0
         q = _interpolate(self.positions[row], self.positions[after], share)
-        if self._floats:
+        if self._has_floating_base:
             here, there = self.positions[row, 3:7], self.positions[after, 3:7]
-            turn = _interpolate(here, there if here @ there >= 0 else -there, share)
-            q[3:7] = turn / np.linalg.norm(turn)
+            q[3:7] = interpolate_rows(here, there, np.asarray(share))
             q[:2] += laps * (self.positions[-1, :2] - self.positions[0, :2])
         return q, _interpolate(self.velocities[row], self.velocities[after], share)
 
     @property
-    def _floats(self) -> bool:
+    def _has_floating_base(self) -> bool:
         """Whether it is of a robot whose base floats."""
         more = self.positions.shape[1] - self.velocities.shape[1]
         if more > 1:

@@ -1,4 +1,4 @@
-"""Rewards that are put together from parts."""
+"""Rewards, to be composed from parts."""
 
 from __future__ import annotations
 

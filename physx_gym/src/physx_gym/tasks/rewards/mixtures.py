@@ -1,4 +1,4 @@
-"""Rewards that are made of others."""
+"""Rewards that are composed of others."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from physx_gym.tasks.rewards.reward import Reward
 
 
 class _Mixture(Reward):
-    """What sums and products share.
+    """Base class of sums and products.
 
     Attributes:
         rewards: The parts.
-        weights: Of each, as they are used.
+        weights: Weights of the parts, normalized if asked for.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class _Mixture(Reward):
             raise ConfigError(f'"{name}" needs rewards, not {list(weighted)}.')
         names = [part for each in weighted for part in each.names]
         if len(set(names)) < len(names):
-            raise ConfigError(f'Two parts of "{name}" have one name: {sorted(names)}.')
+            raise ConfigError(f'Two parts of "{name}" have the same name: {sorted(names)}.')
         for each, weight in weighted.items():
             checks.finite(f'weight of "{each.name}"', weight)
         self.rewards = tuple(weighted)
@@ -43,8 +43,8 @@ class _Mixture(Reward):
             wrong = [each.name for each in self.rewards if not each.is_normalized]
             if wrong or min(self.weights) < 0 or sum(self.weights) <= 0:
                 raise ConfigError(
-                    f'"{name}" cannot be normalized: its parts must be, and have weights of at '
-                    f"least 0. Not normalized: {wrong}; weights: {self.weights}."
+                    f'"{name}" cannot be normalized: its parts must be normalized, with weights of '
+                    f"at least 0. Not normalized: {wrong}; weights: {self.weights}."
                 )
             total = sum(self.weights)
             self.weights = tuple(weight / total for weight in self.weights)
@@ -52,18 +52,18 @@ class _Mixture(Reward):
 
     @property
     def watched(self) -> tuple[Quantity, ...]:
-        """The quantities of all parts."""
+        """Quantities of all parts."""
         return tuple(quantity for each in self.rewards for quantity in each.watched)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of this reward and all parts."""
+        """Names of the reward and all parts."""
         return (self.name, *(name for each in self.rewards for name in each.names))
 
     def _parts(
         self, quantities: Quantities, terminated: bool, info: dict[str, float]
     ) -> list[float]:
-        """Return the parts' rewards, and note them in the info."""
+        """Return the rewards of the parts, and add them to the info."""
         found = []
         for each in self.rewards:
             value = each.compute(quantities, terminated, info)
@@ -76,7 +76,7 @@ def _weighted(name: str, rewards: Any, weights: Sequence[float] | None) -> dict[
     """Return the weight of each reward.
 
     Raises:
-        ConfigError: There are weights for other rewards.
+        ConfigError: If the number of weights is not that of the rewards.
     """
     if weights is None:
         return dict(rewards) if isinstance(rewards, Mapping) else dict.fromkeys(rewards, 1.0)
@@ -89,7 +89,7 @@ def _weighted(name: str, rewards: Any, weights: Sequence[float] | None) -> dict[
 
 
 class Sum(_Mixture):
-    """The weighted sum of rewards."""
+    """Weighted sum of rewards."""
 
     def __init__(
         self,
@@ -103,13 +103,14 @@ class Sum(_Mixture):
 
         Args:
             rewards: Rewards, or the weight of each.
-            name: Of the sum.
-            weights: Of each of a list of rewards, as in a pipeline's file; None: 1.
-            normalize: Divide by the sum of the weights; the sum is then within 0 and 1, as all of
-                its parts must be.
+            name: Name of the sum.
+            weights: Weights of a list of rewards, as in a pipeline's file; None: 1.
+            normalize: Divide by the sum of the weights; the result is then between 0 and 1, like
+                all of its parts, which must be normalized.
 
         Raises:
-            ConfigError: There are none, two have one name, or they cannot be normalized.
+            ConfigError: If there are no rewards, two have the same name, or they cannot be
+                normalized.
         """
         super().__init__(rewards, name, weights, normalize=normalize)
 
@@ -120,7 +121,7 @@ class Sum(_Mixture):
 
 
 class Product(_Mixture):
-    """The weighted geometric mean of rewards within 0 and 1: good only where all of them are."""
+    """Weighted geometric mean of rewards between 0 and 1: high only if all of them are."""
 
     def __init__(
         self,
@@ -133,16 +134,16 @@ class Product(_Mixture):
 
         Args:
             rewards: Normalized rewards, or the weight of each.
-            name: Of the product.
-            weights: Of each of a list of rewards, as in a pipeline's file; None: 1.
+            name: Name of the product.
+            weights: Weights of a list of rewards, as in a pipeline's file; None: 1.
 
         Raises:
-            ConfigError: There are none, two have one name, or one is not normalized.
+            ConfigError: If there are no rewards, two have the same name, or one is not normalized.
         """
         super().__init__(rewards, name, weights, normalize=True)
 
     def compute(self, quantities: Quantities, terminated: bool, info: dict[str, float]) -> float:
-        """Return the product."""
+        """Return the weighted geometric mean."""
         parts = self._parts(quantities, terminated, info)
         pairs = zip(parts, self.weights, strict=True)
         return math.prod([float(part**weight) for part, weight in pairs if weight])

@@ -1,4 +1,4 @@
-"""What a reward is, and those of one quantity."""
+"""Base class of rewards, and rewards of a single quantity."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _AT_CUTOFF = math.log(0.01)
 
 
 class Reward(ABC):
-    """A part of the reward of a step.
+    """A reward, or a part of one.
 
     Attributes:
         name: Its name in the info of a step.
-        is_normalized: Whether it is always within 0 and 1.
+        is_normalized: Whether it is always between 0 and 1.
     """
 
     is_normalized: bool = False
@@ -30,17 +30,17 @@ class Reward(ABC):
     def __init__(self, name: str) -> None:
         """Name the reward."""
         if not isinstance(name, str) or not name:
-            raise ConfigError(f"The name of a reward must be a text, not {name!r}.")
+            raise ConfigError(f"The name of a reward must be a string, not {name!r}.")
         self.name = name
 
     @property
     def watched(self) -> tuple[Quantity, ...]:
-        """The quantities that it is computed from."""
+        """Quantities that the reward is computed from."""
         return ()
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of this reward and its parts."""
+        """Names of the reward and its parts."""
         return (self.name,)
 
     @abstractmethod
@@ -48,14 +48,14 @@ class Reward(ABC):
         """Return the reward of the step.
 
         Args:
-            quantities: Those of the environment.
-            terminated: Whether the step ended the task.
-            info: Parts of a composed reward add themselves, by name.
+            quantities: Quantities of the environment.
+            terminated: Whether the step terminated the episode.
+            info: Composed rewards add their parts to it, by name.
         """
 
 
 class Survival(Reward):
-    """1 for every step that does not end the task, 0 for one that does."""
+    """1 for every step that does not terminate the episode, otherwise 0."""
 
     is_normalized = True
 
@@ -69,9 +69,10 @@ class Survival(Reward):
 
 
 class Minimizing(Reward):
-    """1 where a quantity is 0, and less the larger it is: 0.01 at the cutoff.
+    """1 if a quantity is 0, and less the larger it is: 0.01 at the cutoff.
 
-    It is ``exp(ln(0.01) * (|quantity| / cutoff) ** 2)``, with the Euclidean norm of all entries.
+    The reward is ``exp(ln(0.01) * (|quantity| / cutoff) ** 2)``, with the Euclidean norm of all
+    entries.
     """
 
     is_normalized = True
@@ -82,10 +83,10 @@ class Minimizing(Reward):
         Args:
             quantity: A number or array.
             cutoff: Norm of the quantity, in its unit, at which the reward is 0.01.
-            name: None: that of the quantity's class.
+            name: Name; None: that of the quantity's class.
 
         Raises:
-            ConfigError: It is no quantity, or the cutoff is not positive.
+            ConfigError: If it is not a quantity, or the cutoff is not positive.
         """
         self.quantity = check_quantity(f"{type(self).__name__}.quantity", quantity)
         super().__init__(name or type(quantity).__name__)
@@ -106,7 +107,7 @@ class Minimizing(Reward):
 
 
 class Tracking(Minimizing):
-    """As `Minimizing`, of the difference between a quantity and its target."""
+    """`Minimizing` of the difference between a quantity and its target."""
 
     def __init__(
         self,
@@ -122,8 +123,8 @@ class Tracking(Minimizing):
             quantity: A number or array.
             cutoff: Norm of the difference at which the reward is 0.01.
             target: A quantity or a constant; None: the quantity on the reference trajectory.
-            difference: Takes value and target; for angles, one that goes the short way.
-            name: None: that of the quantity's class.
+            difference: Function of value and target; for angles, one that takes the shorter way.
+            name: Name; None: that of the quantity's class.
         """
         super().__init__(quantity, cutoff, name)
         self.target = Reference(quantity) if target is None else target
@@ -144,7 +145,7 @@ class Tracking(Minimizing):
             error = self.difference(as_array(value), as_array(wanted))
         except ValueError as cause:
             raise ConfigError(
-                f'The reward "{self.name}" compares {np.shape(value)} numbers with a target of '
-                f"{np.shape(wanted)}: {cause}"
+                f'The reward "{self.name}" compares a value of shape {np.shape(value)} with a '
+                f"target of shape {np.shape(wanted)}: {cause}"
             ) from cause
         return self._kernel(error)

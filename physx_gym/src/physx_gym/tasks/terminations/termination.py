@@ -1,4 +1,4 @@
-"""What a termination is, and those of one quantity."""
+"""Base class of terminations, and terminations by a single quantity."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Termination(ABC):
 
     Attributes:
         name: Its name in the info of the step.
-        grace_period: Time from the begin of an episode in which it does not hold, in s.
-        is_truncation: Whether it cuts the episode off, rather than being part of the task.
-        training_only: Whether it does not hold in evaluation.
+        grace_period: Time at the start of an episode in which it does not apply, in s.
+        is_truncation: Whether it truncates the episode instead of terminating it.
+        training_only: Whether it does not apply in evaluation.
     """
 
     def __init__(
@@ -34,23 +34,23 @@ class Termination(ABC):
         training_only: bool = False,
         **unknown: Any,
     ) -> None:
-        """Keep the options.
+        """Store the options.
 
         Raises:
-            UnknownOptionError: There is no option of a name.
+            UnknownOptionError: If there is no option of that name.
         """
         if unknown:
             known = ("grace_period", "is_truncation", "training_only")
             raise UnknownOptionError(f'The termination "{name}"', unknown, known)
         if not isinstance(name, str) or not name:
-            raise ConfigError(f"The name of a termination must be a text, not {name!r}.")
+            raise ConfigError(f"The name of a termination must be a string, not {name!r}.")
         self.name = name
         self.grace_period = checks.not_negative(f'grace_period of "{name}"', grace_period)
         self.is_truncation, self.training_only = bool(is_truncation), bool(training_only)
 
     @property
     def watched(self) -> tuple[Quantity, ...]:
-        """The quantities that it is judged by."""
+        """Quantities that the condition is computed from."""
         return ()
 
     @abstractmethod
@@ -59,7 +59,7 @@ class Termination(ABC):
 
 
 class OutOfBounds(Termination):
-    """Ends the episode where an entry of a quantity leaves its bounds."""
+    """Ends the episode when an entry of a quantity leaves its bounds."""
 
     def __init__(
         self,
@@ -73,13 +73,13 @@ class OutOfBounds(Termination):
 
         Args:
             quantity: A number or array.
-            low: Lowest value, in the quantity's unit, for all entries or for each; None: none.
+            low: Lowest value, in the quantity's unit, for all entries or for each; None: no limit.
             high: Highest value, likewise.
-            name: None: that of the quantity's class.
-            options: Those of `Termination`.
+            name: Name; None: that of the quantity's class.
+            options: Options of `Termination`.
 
         Raises:
-            ConfigError: It is no quantity, there are no bounds, or the lower is above the higher.
+            ConfigError: If it is not a quantity, there are no bounds, or they are reversed.
         """
         self.quantity = check_quantity(f"{type(self).__name__}.quantity", quantity)
         super().__init__(name or type(quantity).__name__, **options)
@@ -91,8 +91,8 @@ class OutOfBounds(Termination):
             fits = False
         if not fits or (low is None and high is None):
             raise ConfigError(
-                f'The bounds of "{self.name}" are {low!r} and {high!r}, but must be numbers, one '
-                "of them at least, the lower one first."
+                f'The bounds of "{self.name}" are {low!r} and {high!r} but must be numbers, at '
+                "least one of them, the lower one first."
             )
 
     @property
@@ -109,15 +109,15 @@ class OutOfBounds(Termination):
             return bool(((value < self.low) | (value > self.high)).any())
         except ValueError as error:
             raise ConfigError(
-                f'The termination "{self.name}" compares {np.shape(value)} numbers with bounds of '
-                f"{self.low.shape} and {self.high.shape}: {error}"
+                f'The termination "{self.name}" compares a value of shape {np.shape(value)} with '
+                f"bounds of shapes {self.low.shape} and {self.high.shape}: {error}"
             ) from error
 
 
 class Drift(OutOfBounds):
-    """Ends the episode where a quantity changes otherwise than its reference.
+    """Ends the episode when a quantity's change differs too much from that of its reference.
 
-    Judged is how much more it changed over a horizon than the reference trajectory does.
+    The bounds apply to how much more it changed over a horizon than on the reference trajectory.
     """
 
     def __init__(
@@ -136,11 +136,11 @@ class Drift(OutOfBounds):
         Args:
             quantity: A number or array.
             steps: The horizon, in steps of the environment.
-            low: Bounds of the excess, as in `OutOfBounds`.
-            high: Likewise.
-            name: None: that of the quantity's class.
-            difference: Takes two values; for angles, one that goes the short way.
-            options: Those of `Termination`.
+            low: Lowest difference of the changes, as in `OutOfBounds`.
+            high: Highest difference of the changes.
+            name: Name; None: that of the quantity's class.
+            difference: Function of two values; for angles, one that takes the shorter way.
+            options: Options of `Termination`.
         """
         own = Delta(quantity, steps, difference)
         wanted = Delta(Reference(quantity), steps, difference)
@@ -149,7 +149,7 @@ class Drift(OutOfBounds):
 
 
 class Shift(Termination):
-    """Ends the episode where a quantity was too far from its reference during a whole horizon."""
+    """Ends the episode when a quantity was too far from its reference for a whole horizon."""
 
     def __init__(
         self,
@@ -167,9 +167,9 @@ class Shift(Termination):
             quantity: A number or array.
             steps: The horizon, in steps of the environment.
             farthest: Largest Euclidean distance, in the quantity's unit.
-            name: None: that of the quantity's class.
-            difference: Takes two values; for angles, one that goes the short way.
-            options: Those of `Termination`.
+            name: Name; None: that of the quantity's class.
+            difference: Function of two values; for angles, one that takes the shorter way.
+            options: Options of `Termination`.
         """
         super().__init__(name or f"{type(quantity).__name__}_shift", **options)
         error = Computed(difference, (quantity, Reference(quantity)))
@@ -178,11 +178,11 @@ class Shift(Termination):
 
     @property
     def watched(self) -> tuple[Quantity, ...]:
-        """The errors of the horizon."""
+        """The errors over the horizon."""
         return (self._errors,)
 
     def holds(self, quantities: Quantities) -> bool:
-        """Return whether every error of a full horizon is too large."""
+        """Return whether all errors of a full horizon are too large."""
         errors = quantities.get_value(self._errors)
         if len(errors) < self.steps:
             return False
