@@ -46,5 +46,5 @@ def test_as_fields_takes_all_forms_and_sets_the_role():
 def test_reserved_and_malformed_fields_are_refused():
     with pytest.raises(ConfigError, match="reserved"):
         as_fields("env_id", "training")
-    with pytest.raises(ConfigError, match="no field"):
+    with pytest.raises(ConfigError, match="not a field"):
         as_fields([42], "training")

@@ -7,6 +7,7 @@ from physx_core.errors import (
     FieldTypeError,
     MissingFieldError,
     NotFiniteError,
+    SampleError,
     UnknownFieldError,
 )
 from physx_core.rows import RowBuffer, infer_shapes
@@ -15,11 +16,11 @@ FIELDS = [Field("x", (2,)), Field("n", (), "int32")]
 
 
 def test_rows_are_copies_with_instance_and_step():
-    columns = RowBuffer(FIELDS, 4)
+    buffer = RowBuffer(FIELDS, 4)
     x = np.array([1.0, 2.0])
-    columns.put(0, {"x": x, "n": 3}, 2, 5, 7)
+    buffer.put({"x": x, "n": 3}, 2, 5, 7)
     x[:] = 0
-    rows, names = columns.rows(1), ("n", "env_id", "episode", "step")
+    rows, names = buffer.take(), ("n", "env_id", "episode", "step")
     assert rows["x"].tolist() == [[1, 2]]
     assert [rows[name].tolist() for name in names] == [[3], [2], [5], [7]]
 
@@ -41,18 +42,46 @@ def test_rows_are_copies_with_instance_and_step():
 )
 def test_what_does_not_fit_is_named(sample, error, field):
     with pytest.raises(error, match=f'Instance 3, step 5: field "{field}"') as caught:
-        RowBuffer(FIELDS, 1).put(0, sample, 3, 0, 5)
+        RowBuffer(FIELDS, 1).put(sample, 3, 0, 5)
     assert (caught.value.field, caught.value.instance_id, caught.value.step) == (field, 3, 5)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_the_first_row_that_is_not_finite_is_named(bad):
-    columns = RowBuffer(FIELDS, 3)
+    buffer = RowBuffer(FIELDS, 3)
     for row in range(3):
-        columns.put(row, {"x": np.array([0, bad if row else 1.0]), "n": 0}, row + 1, 0, 10 + row)
-    assert len(columns.rows(1)["x"]) == 1
+        buffer.put({"x": np.array([0, bad if row else 1.0]), "n": 0}, row + 1, 0, 10 + row)
     with pytest.raises(NotFiniteError, match='Instance 2, step 11: field "x"'):
-        columns.rows(3)
+        buffer.take()
+    assert buffer.take()["env_id"].tolist() == [1]
+    assert buffer.count == 0
+
+
+def test_the_first_row_is_named_whatever_its_field():
+    buffer = RowBuffer([Field("a", ()), Field("b", ())], 3)
+    for row, (a, b) in enumerate([(0, 0), (0, np.nan), (np.nan, np.nan)]):
+        buffer.put({"a": a, "b": b}, 1, 0, row)
+    with pytest.raises(NotFiniteError, match='step 1: field "b"'):
+        buffer.take()
+    assert buffer.take()["step"].tolist() == [0]
+
+
+def test_a_row_that_is_checked_at_once_leaves_the_buffer_as_it_was():
+    buffer = RowBuffer(FIELDS, 3, numbered=False)
+    buffer.put_checked({"x": [1, 2], "n": 1})
+    for x in ([np.nan, 0], [0, np.inf], [0, 0, 0]):
+        with pytest.raises(SampleError):
+            buffer.put_checked({"x": x, "n": 2})
+    buffer.put_checked({"x": [3, 4], "n": 3})
+    assert {name: rows.tolist() for name, rows in buffer.take().items()} == {
+        "x": [[1, 2], [3, 4]],
+        "n": [1, 3],
+    }
+
+
+def test_a_buffer_holds_one_mebibyte_at_most():
+    for width, capacity in ((1, 4096), (64, 2048), (2**18, 1)):
+        assert RowBuffer([Field("x", (width,))], numbered=False).capacity == capacity
 
 
 def test_open_shapes_are_taken_from_the_first_sample():

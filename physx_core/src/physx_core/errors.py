@@ -123,8 +123,9 @@ class SampleError(PhysxError):
         self, message: str, *, field: str = "", instance_id: int = 0, step: int = -1
     ) -> None:
         self.field, self.instance_id, self.step = field, instance_id, step
-        place = f"Instance {instance_id}, step {step}: " if instance_id else ""
-        super().__init__(place + message)
+        if instance_id:
+            message = f"Instance {instance_id}, step {step}: {message}"
+        super().__init__(message[:1].upper() + message[1:])
 
 
 class MissingFieldError(SampleError):

@@ -1,4 +1,4 @@
-"""Fields: the names, shapes, types and units of what a sample holds."""
+"""Fields: the names, shapes, types and units of a sample's values, and which values fit them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import DTypeLike
 
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, FieldShapeError, FieldTypeError, NotFiniteError
 from physx_core.typing import Array
 
 Role: TypeAlias = Literal["training", "additional"]
@@ -19,14 +19,21 @@ Role: TypeAlias = Literal["training", "additional"]
 RESERVED = ("env_id", "episode", "step")
 """Fields that physx adds to each row: number of the instance, its trajectory, and its step."""
 
-_KINDS = "biufc"
+NUMBERS = "biufc"
+"""Kinds of NumPy types that fields may have: boolean, integers, floating, complex."""
+
+_FITTING = {"b": "b", "i": "biu", "u": "biu", "f": "biuf", "c": NUMBERS}
+"""Kind of a field's type to the kinds of values that fit it."""
+
+NO_ARRAY = (ValueError, TypeError, OverflowError, RuntimeError)
+"""What `np.asarray` raises for values that are ragged or otherwise not convertible to an array."""
 
 _SMALL = 8192  # elements
 
 
 @dataclass(frozen=True)
 class Field:
-    """What one entry of a sample is.
+    """Description of one entry of a sample.
 
     Attributes:
         name: Name, a Python identifier.
@@ -43,18 +50,20 @@ class Field:
     role: Role = "training"
 
     def __post_init__(self) -> None:
-        """Check the name, and bring shape and type to their plain form.
+        """Check the name, and normalize shape and type.
 
         Raises:
-            ConfigError: The name is no identifier, the shape is negative, or the type is not plain.
+            ConfigError: If the name is not an identifier, the shape is negative, or the type is
+                not a plain one.
         """
         if not isinstance(self.name, str) or not self.name.isidentifier():
             raise ConfigError(f"A field's name must be a Python identifier, not {self.name!r}.")
         try:
             dtype = np.dtype(self.dtype)
         except TypeError as error:
-            raise ConfigError(f'Field "{self.name}": {self.dtype!r} is no NumPy type.') from error
-        if dtype.kind not in _KINDS:
+            text = f'Field "{self.name}": {self.dtype!r} is not a NumPy type.'
+            raise ConfigError(text) from error
+        if dtype.kind not in NUMBERS:
             raise ConfigError(
                 f'Field "{self.name}" has type {dtype}, which has no fixed plain layout. '
                 "Use a boolean, integer, floating or complex type."
@@ -63,7 +72,7 @@ class Field:
         if self.shape is not None:
             shape = (self.shape,) if isinstance(self.shape, int) else tuple(self.shape)
             if any(not isinstance(n, (int, np.integer)) or n < 0 for n in shape):
-                raise ConfigError(f'Field "{self.name}": {self.shape!r} is no shape.')
+                raise ConfigError(f'Field "{self.name}": {self.shape!r} is not a shape.')
             object.__setattr__(self, "shape", tuple(int(n) for n in shape))
 
     @cached_property
@@ -71,6 +80,81 @@ class Field:
         """Bytes of one sample's value; 0 while the shape is unknown."""
         count = math.prod(self.shape) if self.shape is not None else 0
         return count * np.dtype(self.dtype).itemsize
+
+    def convert(self, values: Any, *, axes: int = 0, instance_id: int = 0, step: int = -1) -> Array:
+        """Return values as an array of the field's shape and type.
+
+        This is the one rule of which values fit a field, whatever way they come into a dataset:
+
+        - Booleans, integers, floating-point and complex numbers fit fields of their own kind and of
+          the kinds after it in this list; a number never becomes a boolean, a complex number never
+          a real one.
+        - An integer field holds each integer exactly: one that is out of its range does not fit.
+        - Floating-point and complex fields round to the nearest value of their type, integers too
+          (float64 holds all of them up to 2**53). A number that is too large for the type becomes
+          infinite, and infinite numbers are rejected where rows are checked: see `is_finite`.
+        - Byte order and memory layout do not matter. Texts, objects and dates do not fit any field.
+
+        Args:
+            values: One value, or an array of them; numbers, sequences and arrays.
+            axes: How many axes come before the field's own.
+            instance_id: Instance that made the values, for the error; 0: unknown.
+            step: The instance's step that made them, for the error.
+
+        Returns:
+            An array of shape (*first axes, *field shape). It shares the memory of `values` if that
+            is an array of the field's type.
+
+        Raises:
+            FieldShapeError: If the values are ragged or have another shape.
+            FieldTypeError: If the field's type cannot hold the values.
+        """
+        place = {"instance_id": instance_id, "step": step}
+        try:
+            array: Array = np.asarray(values)
+        except ValueError as error:
+            text = f'field "{self.name}" is ragged or malformed: {error}.'
+            raise FieldShapeError(text, field=self.name, **place) from error
+        except NO_ARRAY as error:
+            text = f'field "{self.name}" is not convertible to an array: {error}.'
+            raise FieldTypeError(text, field=self.name, **place) from error
+        shape, dtype = array.shape[axes:], np.dtype(self.dtype)
+        if array.ndim < axes or (self.shape is not None and shape != self.shape):
+            text = f"has shape {shape} but is defined as {self.shape}"
+            if array.ndim < axes:
+                text = "is a single value; rows have shape (n, *field shape)"
+            raise FieldShapeError(f'field "{self.name}" {text}.', field=self.name, **place)
+        if array.dtype == dtype:
+            return array
+        if array.dtype.kind not in _FITTING[dtype.kind]:
+            text = f"holds {array.dtype} but is defined as {dtype}, which cannot hold it"
+            raise FieldTypeError(f'field "{self.name}" {text}.', field=self.name, **place)
+        if dtype.kind not in "fc":
+            wrong = _out_of_range(array, dtype)
+            if wrong is not None:
+                text = f"holds {wrong} but is defined as {dtype}, which cannot hold it"
+                raise FieldTypeError(f'field "{self.name}" {text}.', field=self.name, **place)
+            return array.astype(dtype)
+        with np.errstate(over="ignore"):
+            return array.astype(dtype)
+
+    def not_finite(
+        self, *, instance_id: int = 0, step: int = -1, where: str = ""
+    ) -> NotFiniteError:
+        """Return the error for a value that is NaN or infinite.
+
+        Args:
+            instance_id: Instance that made the value; 0: unknown.
+            step: The instance's step that made it.
+            where: Further description of the place, with a leading space.
+        """
+        return NotFiniteError(
+            f'field "{self.name}" holds NaN or an infinite number as '
+            f"{np.dtype(self.dtype)}{where}.",
+            field=self.name,
+            instance_id=instance_id,
+            step=step,
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the field as plain data for JSON or TOML."""
@@ -83,7 +167,7 @@ class Field:
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Field:
-        """Make the field that `to_dict` described."""
+        """Return the field that `to_dict` described."""
         shape = plain.get("shape")
         return cls(
             name=plain["name"],
@@ -95,20 +179,20 @@ class Field:
 
 
 FieldLike: TypeAlias = Field | tuple[str, Any] | str
-"""A field, or ``(name, type)`` with `type` a NumPy type, `float`, `int`, `bool` or `np.ndarray`."""
+"""A field, its name, or ``(name, type)``; `type`: NumPy type, `float`, `int`, `bool`, `ndarray`."""
 
 
 def as_fields(given: FieldLike | Iterable[FieldLike], role: Role) -> list[Field]:
-    """Return what a user gave as fields of one role.
+    """Return a user's description of fields as fields of one role.
 
     Args:
         given: One field or several: a `Field`, a name, or a pair (name, type). The type
-            `np.ndarray` stands for an array of float64 whose shape the first sample tells;
+            `np.ndarray` stands for an array of float64 with the shape of the first sample;
             `float`, `int` and `bool` stand for one number.
         role: Role that all the fields get.
 
     Raises:
-        ConfigError: A name is no identifier, is reserved or given twice, or a type is not plain.
+        ConfigError: If a name is not an identifier or is reserved, or a type is not a plain one.
     """
     single = isinstance(given, (Field, str)) or (
         isinstance(given, tuple) and len(given) == 2 and isinstance(given[0], str)
@@ -133,11 +217,11 @@ def _as_field(item: Any, role: Role) -> Field:
         if kind in (float, int, bool):
             return Field(name, shape=(), dtype=kind, role=role)
         return Field(name, dtype=kind, role=role)
-    raise ConfigError(f'{item!r} is no field. Give Field(...), "name" or ("name", type).')
+    raise ConfigError(f'{item!r} is not a field. Give Field(...), "name" or ("name", type).')
 
 
 def is_finite(array: Array) -> bool:
-    """Return whether no value is NaN or infinite."""
+    """Return whether an array holds neither NaN nor an infinite number."""
     if array.dtype.kind not in "fc":
         return True
     # A sum tells it in one fast pass, unless it overflows. Small arrays take the quicker dot
@@ -148,3 +232,20 @@ def is_finite(array: Array) -> bool:
         with np.errstate(over="ignore", invalid="ignore"):
             total = abs(np.add.reduce(array, axis=None))
     return math.isfinite(total) or bool(np.isfinite(array).all())
+
+
+def first_not_finite(rows: Array) -> int | None:
+    """Return the number of the first row that holds NaN or an infinite number; None: no row."""
+    if is_finite(rows):
+        return None
+    finite = np.isfinite(rows).reshape(len(rows), -1).all(axis=1)
+    return int(np.argmin(finite))
+
+
+def _out_of_range(array: Array, dtype: np.dtype[Any]) -> int | None:
+    """Return an integer of the array that an integer type cannot hold; None: it holds all."""
+    if array.dtype.kind == "b" or not array.size:
+        return None
+    limits = np.iinfo(dtype)
+    extremes = (array.item(),) if array.size == 1 else (int(array.min()), int(array.max()))
+    return next((n for n in extremes if not limits.min <= n <= limits.max), None)

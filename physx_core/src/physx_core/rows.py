@@ -1,170 +1,173 @@
-"""RowBuffer: a block of rows under construction, one preallocated array for each field."""
+"""Rows of samples: buffers that check each row as it is put in, and rejected samples."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from physx_core.errors import (
-    FieldShapeError,
-    FieldTypeError,
     MissingFieldError,
-    NotFiniteError,
     SampleError,
     UnknownFieldError,
     listed,
     nearest,
 )
-from physx_core.fields import Field, is_finite
-from physx_core.typing import Array, Batch, Sample
+from physx_core.fields import NO_ARRAY, Field, first_not_finite, is_finite
+from physx_core.typing import Batch, Sample
 
 ROW_FIELDS = (
     Field("env_id", shape=(), dtype="int32", role="additional"),
     Field("episode", shape=(), dtype="int64", role="additional"),
     Field("step", shape=(), dtype="int64", role="additional"),
 )
-"""What physx adds to each row: the instance that made it, the instance's trajectory and step."""
+"""Fields that physx adds to each row: the instance that made it, the instance's trajectory and
+step."""
 
-
-def infer_shapes(fields: Iterable[Field], sample: Mapping[str, Any]) -> list[Field]:
-    """Return the fields with their shapes, those yet unknown taken from the first sample."""
-    shaped = []
-    for field in fields:
-        if field.shape is None and field.name in sample:
-            with contextlib.suppress(ValueError):  # a ragged value: `RowBuffer.put` names it
-                field = replace(field, shape=np.asarray(sample[field.name]).shape)
-        shaped.append(field)
-    return shaped
-
-
-def copy_row(batch: Batch, row: int) -> Sample:
-    """Return a copy of one row of a batch as a sample, each value an array."""
-    return {name: np.array(values[row]) for name, values in batch.items()}
+_BLOCK_NBYTES = 2**20
+_BLOCK_ROWS = 4096
 
 
 class RowBuffer:
-    """Rows of samples, each checked as it is put in; finiteness is checked a block at a time.
+    """Rows of samples, one preallocated array for each field; each row is checked once.
+
+    Names, shapes and types are checked when a row is put in. Whether its values are finite is
+    checked by `put_checked` at once, or else by `take` for all rows together, which is faster.
 
     Attributes:
         fields: Fields of the rows, those that physx adds at the end.
         capacity: How many rows fit in.
-        arrays: Field name to array of shape (capacity, *field shape).
+        count: How many rows there are.
     """
 
-    def __init__(self, fields: Sequence[Field], capacity: int) -> None:
+    def __init__(
+        self, fields: Sequence[Field], capacity: int | None = None, *, numbered: bool = True
+    ) -> None:
         """Allocate the arrays.
 
         Args:
-            fields: The environment's fields, all with known shapes.
-            capacity: How many rows fit in.
+            fields: Fields of the samples; one with an open shape takes single numbers.
+            capacity: How many rows fit in; None: as many as 1 MiB holds, 4096 at most.
+            numbered: Whether rows get the `ROW_FIELDS` beside those of the samples.
         """
-        self.fields = [*fields, *ROW_FIELDS]
+        self.fields = [*fields, *ROW_FIELDS] if numbered else list(fields)
+        if capacity is None:
+            row_nbytes = sum(field.nbytes for field in self.fields)
+            capacity = max(1, min(_BLOCK_ROWS, _BLOCK_NBYTES // max(1, row_nbytes)))
         self.capacity = capacity
-        self.arrays: Batch = {
+        self.count = 0
+        self._finite = 0  # how many of the rows are known to be finite
+        self._arrays: Batch = {
             field.name: np.empty((capacity, *(field.shape or ())), field.dtype)
             for field in self.fields
         }
         self._names = {field.name for field in fields}
+        known = [field if field.shape is not None else replace(field, shape=()) for field in fields]
         self._slots = [
-            (field.name, self.arrays[field.name], field.shape, np.dtype(field.dtype))
-            for field in fields
+            (field.name, self._arrays[field.name], field.shape, np.dtype(field.dtype), field)
+            for field in known
         ]
-        self._floating = [slot[0] for slot in self._slots if slot[3].kind in "fc"]
-        self._env_id, self._step = self.arrays["env_id"], self.arrays["step"]
-        self._episode = self.arrays["episode"]
+        self._floating = [
+            (field, array) for _, array, _, dtype, field in self._slots if dtype.kind in "fc"
+        ]
+        self._numbers = [self._arrays[field.name] for field in ROW_FIELDS] if numbered else []
+
+    @property
+    def full(self) -> bool:
+        """Whether no further row fits in."""
+        return self.count == self.capacity
 
     def put(
-        self, row: int, sample: Mapping[str, Any], instance_id: int, episode: int, step: int
+        self, sample: Mapping[str, Any], instance_id: int = 0, episode: int = 0, step: int = -1
     ) -> None:
-        """Copy one sample into a row.
+        """Copy a sample into the next row; whether it is finite is checked by `take`.
 
         Args:
-            row: Row to fill, below `capacity`.
-            sample: Field name to value; exactly the environment's fields.
-            instance_id: Instance that made the sample.
+            sample: Field name to value, exactly the fields that the buffer was made with.
+            instance_id: Instance that made the sample; 0: unknown.
             episode: The instance's trajectory that the sample belongs to.
             step: The instance's step that made it.
 
         Raises:
-            MissingFieldError: A field is missing.
-            UnknownFieldError: A field was not defined.
-            FieldShapeError: A value has another shape than its field.
-            FieldTypeError: A value's type cannot be stored in its field without changing it.
+            MissingFieldError: If a field is missing.
+            UnknownFieldError: If a field was not defined.
+            FieldShapeError: If a value has another shape than its field.
+            FieldTypeError: If the field's type cannot hold a value: see `Field.convert`.
         """
+        row = self.count
         if sample.keys() != self._names:
-            raise self._names_error(sample, instance_id, step)
-        for name, array, shape, dtype in self._slots:
+            check_names(self._names, sample, instance_id, step)
+        for name, array, shape, dtype, field in self._slots:
             value = sample[name]
             if type(value) is not np.ndarray or value.shape != shape or value.dtype != dtype:
-                value = _converted(name, value, shape, dtype, instance_id, step)
+                value = field.convert(value, instance_id=instance_id, step=step)
             array[row] = value
-        self._env_id[row] = instance_id
-        self._episode[row] = episode
-        self._step[row] = step
+        if self._numbers:
+            env_ids, episodes, steps = self._numbers
+            env_ids[row] = instance_id
+            episodes[row] = episode
+            steps[row] = step
+        self.count = row + 1
 
-    def rows(self, count: int) -> Batch:
-        """Return the first `count` rows as views, valid until rows are put in again.
+    def put_checked(
+        self, sample: Mapping[str, Any], instance_id: int = 0, episode: int = 0, step: int = -1
+    ) -> None:
+        """Copy a sample into the next row if it is valid and finite: see `put`.
 
         Raises:
-            NotFiniteError: A row holds NaN or an infinite number; names the first one.
+            NotFiniteError: If a value is NaN or infinite, or too large for its field's type.
+            SampleError: If the sample does not fit the fields. The buffer is as it was.
         """
-        for name in self._floating:
-            values = self.arrays[name][:count]
-            if not is_finite(values):
-                self._raise_not_finite(name, values)
-        return {name: array[:count] for name, array in self.arrays.items()}
+        row = self.count
+        self.put(sample, instance_id, episode, step)
+        for field, array in self._floating:
+            if not is_finite(array[row : row + 1]):
+                self.count = row
+                raise field.not_finite(instance_id=instance_id, step=step)
+        if self._finite == row:
+            self._finite = row + 1
 
-    def is_finite(self, row: int) -> bool:
-        """Return whether a row holds neither NaN nor an infinite number."""
-        return all(is_finite(self.arrays[name][row]) for name in self._floating)
+    def take(self) -> Batch:
+        """Return the rows as views, valid until the next `put`, and empty the buffer.
 
-    def _raise_not_finite(self, name: str, values: Array) -> None:
-        bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
-        row = int(np.argmax(bad))
-        raise NotFiniteError(
-            f'field "{name}" holds NaN or an infinite number.',
-            field=name,
-            instance_id=int(self._env_id[row]),
-            step=int(self._step[row]),
-        )
+        Raises:
+            NotFiniteError: If a row holds NaN or an infinite number; names the first such row. The
+                rows before it can be taken then.
+        """
+        count, wrong = self.count, None
+        if self._finite < count:
+            for field, array in self._floating:
+                bad = first_not_finite(array[self._finite : count])
+                if bad is not None:
+                    count, wrong = self._finite + bad, field
+        if wrong is not None:
+            instance_id, step = 0, -1
+            if self._numbers:
+                instance_id, step = int(self._numbers[0][count]), int(self._numbers[2][count])
+            self.count = self._finite = count
+            raise wrong.not_finite(instance_id=instance_id, step=step)
+        self.clear()
+        return {name: array[:count] for name, array in self._arrays.items()}
 
-    def _names_error(
-        self, sample: Mapping[str, Any], instance_id: int, step: int
-    ) -> MissingFieldError | UnknownFieldError:
-        unknown = sorted(sample.keys() - self._names)
-        if unknown:
-            return UnknownFieldError(
-                f'field "{unknown[0]}" was not defined.{nearest(unknown[0], self._names)} '
-                f"Defined: {listed(self._names)}.",
-                field=unknown[0],
-                instance_id=instance_id,
-                step=step,
-            )
-        missing = sorted(self._names - sample.keys())
-        return MissingFieldError(
-            f'field "{missing[0]}" is missing from the step\'s data. Every field must be given '
-            f"in every step: {listed(self._names)}.",
-            field=missing[0],
-            instance_id=instance_id,
-            step=step,
-        )
+    def clear(self) -> None:
+        """Forget all rows."""
+        self.count = self._finite = 0
 
 
 class RejectedSamples:
     """Samples that `check_sample` rejected, in the order of their steps.
 
-    Nothing invalid is ever stored: one that lacks a field, has one of another name, shape or type,
-    or holds NaN or an infinite number, is left out.
+    Nothing invalid is ever stored: a sample that does not fit the fields, or that holds NaN or an
+    infinite number, is left out.
     """
 
     def __init__(self) -> None:
         self._waiting: list[tuple[Sample, int, int]] = []
 
-    def note(self, sample: Mapping[str, Any], episode: int, step: int) -> None:
+    def add(self, sample: Mapping[str, Any], episode: int, step: int) -> None:
         """Keep a copy of a sample.
 
         Args:
@@ -172,12 +175,12 @@ class RejectedSamples:
             episode: The instance's trajectory that it belongs to.
             step: The instance's step that made it.
         """
-        with contextlib.suppress(ValueError, TypeError):  # it is ragged, or no array at all
+        with contextlib.suppress(*NO_ARRAY):
             copies = {name: np.array(value) for name, value in sample.items()}
             self._waiting.append((copies, episode, step))
 
-    def shaped(self, fields: Sequence[Field]) -> list[Field]:
-        """Return fields with shapes that are open taken from the first sample that has them all."""
+    def infer_shapes(self, fields: Sequence[Field]) -> list[Field]:
+        """Return fields with open shapes taken from the first sample that has all the fields."""
         for sample, _, _ in self._waiting:
             if all(field.name in sample for field in fields):
                 return infer_shapes(fields, sample)
@@ -187,52 +190,78 @@ class RejectedSamples:
         """Return the samples as rows, with the fields that physx adds, and forget them.
 
         Args:
-            fields: The environment's fields; where a shape is open no sample fits.
+            fields: The environment's fields; no sample fits while a shape is open.
             instance_id: Instance that made the samples.
         """
         waiting, self._waiting = self._waiting, []
         if any(field.shape is None for field in fields):
             waiting = []
-        columns, count = RowBuffer(fields, len(waiting)), 0
+        buffer = RowBuffer(fields, len(waiting))
         for sample, episode, step in waiting:
             with contextlib.suppress(SampleError):
-                columns.put(count, sample, instance_id, episode, step)
-                count += columns.is_finite(count)
-        return columns.rows(count)
+                buffer.put_checked(sample, instance_id, episode, step)
+        return buffer.take()
 
-    def clear(self) -> None:
-        """Forget all samples."""
-        self._waiting.clear()
+
+def check_names(
+    expected: Collection[str], given: Collection[str], instance_id: int = 0, step: int = -1
+) -> None:
+    """Check that exactly the expected fields are given.
+
+    Args:
+        expected: Names of the defined fields.
+        given: Names of the fields that there are values for.
+        instance_id: Instance that made the values, for the error; 0: unknown.
+        step: The instance's step that made them, for the error.
+
+    Raises:
+        UnknownFieldError: If a field was not defined.
+        MissingFieldError: If a field is missing.
+    """
+    unknown = sorted(str(name) for name in given if name not in expected)
+    if unknown:
+        raise UnknownFieldError(
+            f'field "{unknown[0]}" was not defined.{nearest(unknown[0], expected)} '
+            f"Defined: {listed(expected)}.",
+            field=unknown[0],
+            instance_id=instance_id,
+            step=step,
+        )
+    missing = sorted(name for name in expected if name not in given)
+    if missing:
+        raise MissingFieldError(
+            f'field "{missing[0]}" is missing. Every field must be given: {listed(expected)}.',
+            field=missing[0],
+            instance_id=instance_id,
+            step=step,
+        )
+
+
+def infer_shapes(fields: Iterable[Field], values: Mapping[str, Any], axes: int = 0) -> list[Field]:
+    """Return the fields with their shapes, open ones taken from values.
+
+    Args:
+        fields: The fields.
+        values: Field name to value.
+        axes: How many axes of the values come before the field's own: 1 for rows.
+    """
+    known = []
+    for field in fields:
+        if field.shape is None and field.name in values:
+            with contextlib.suppress(*NO_ARRAY):  # `RowBuffer.put` reports the field
+                field = replace(field, shape=np.asarray(values[field.name]).shape[axes:])
+        known.append(field)
+    return known
+
+
+def copy_row(batch: Batch, row: int) -> Sample:
+    """Return a copy of one row of a batch as a sample, each value an array."""
+    return {name: np.array(values[row]) for name, values in batch.items()}
 
 
 def concatenate(blocks: Sequence[Batch]) -> Batch:
-    """Return blocks of rows of the same fields as one; empty where there are no rows."""
+    """Return blocks of rows of the same fields as one block; empty if there are no rows."""
     blocks = [block for block in blocks if len(next(iter(block.values()), ()))]
     if not blocks:
         return {}
     return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
-
-
-def _converted(
-    name: str,
-    value: Any,
-    shape: tuple[int, ...] | None,
-    dtype: np.dtype[Any],
-    instance_id: int,
-    step: int,
-) -> Array:
-    """Return a value that is no array of the field's shape and type as one, or raise."""
-    error: type[FieldShapeError | FieldTypeError] = FieldShapeError
-    try:
-        array: Array = np.asarray(value)
-    except ValueError:
-        text = "is ragged: its parts have different lengths"
-    else:
-        if array.shape == shape and np.can_cast(array.dtype, dtype, "same_kind"):
-            return array
-        if array.shape != shape:
-            text = f"has shape {array.shape} but is defined as {shape}"
-        else:
-            text = f"holds {array.dtype} but is defined as {dtype}"
-            error = FieldTypeError
-    raise error(f'field "{name}" {text}.', field=name, instance_id=instance_id, step=step)

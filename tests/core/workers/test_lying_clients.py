@@ -135,13 +135,13 @@ LATER = {
     "a spare that is used": (HEADER.pack(0, 8, 1, 0), "no message of physx"),
     "a request out of turn": (pack(Kind.LOAD, number=7), "numbered its requests wrongly"),
     "a damaged request": (pack(Kind.PREDICT, b"x", 1), "damaged"),
-    "a request of no names": (pack(Kind.PREDICT, encode([1]), 1), "no dictionary of names"),
-    "parameters without names": (pack(Kind.SAVE, encode({1: 2}), 1), "no dictionary of names"),
+    "a request of no names": (pack(Kind.PREDICT, encode([1]), 1), "not a dictionary of names"),
+    "parameters without names": (pack(Kind.SAVE, encode({1: 2}), 1), "not a dictionary of names"),
     "a deep request": (pack(Kind.SAVE, b"\x40\x0d\x03\0" + b"[" * 200_000, 1), "damaged"),
-    "drawing nothing": (pack(Kind.SHOW, encode([("add", "mesh")]), 1), "events that are none"),
+    "drawing nothing": (pack(Kind.SHOW, encode([("add", "mesh")]), 1), "malformed drawing events"),
     "drawing otherwise": (
         pack(Kind.SHOW, encode([("eval", "mesh", "a", {})]), 1),
-        "events that are none",
+        "malformed drawing events",
     ),
     "an error that is none": (pack(Kind.ERROR, encode({"classes": ["PhysxError"]})), "as an error"),
     "an error with a strange note": (
@@ -174,16 +174,16 @@ FIRST = {
 BEFORE = {
     "fields before all": (FIELDS, "5 fields, but it defined 3"),
     "no fields": (plain_fields(Kind.READY), "no fields, or one twice"),
-    "fields that are no list": (pack(Kind.READY, encode(1)), "in an unknown way"),
-    "a field that is none": (plain_fields(Kind.READY, 1), "in an unknown way"),
+    "fields that are no list": (pack(Kind.READY, encode(1)), "a description is malformed"),
+    "a field that is none": (plain_fields(Kind.READY, 1), "a description is malformed"),
     "a field twice": (plain_fields(Kind.READY, X, X), "no fields, or one twice"),
     "a field of physx": (plain_fields(Kind.READY, {**X, "name": "step"}), 'field "step"'),
     "a name that is none": (plain_fields(Kind.READY, {**X, "name": "a b"}), "identifier"),
-    "objects": (plain_fields(Kind.READY, {**X, "dtype": "|O"}), "in an unknown way"),
-    "a type in parts": (plain_fields(Kind.READY, {**X, "dtype": "f8,f8"}), "in an unknown way"),
-    "a type that is none": (plain_fields(Kind.READY, {**X, "dtype": "<f5"}), "no NumPy type"),
-    "a negative shape": (plain_fields(Kind.READY, {**X, "shape": [-1]}), "no shape"),
-    "a shape in words": (plain_fields(Kind.READY, {**X, "shape": "2"}), "in an unknown way"),
+    "objects": (plain_fields(Kind.READY, {**X, "dtype": "|O"}), "a description is malformed"),
+    "a type in parts": (plain_fields(Kind.READY, {**X, "dtype": "f8,f8"}), "a description is malformed"),
+    "a type that is none": (plain_fields(Kind.READY, {**X, "dtype": "<f5"}), "not a NumPy type"),
+    "a negative shape": (plain_fields(Kind.READY, {**X, "shape": [-1]}), "not a shape"),
+    "a shape in words": (plain_fields(Kind.READY, {**X, "shape": "2"}), "a description is malformed"),
 }
 
 
@@ -222,7 +222,7 @@ def test_rows_beyond_all_bounds_are_refused_before_anything_is_allocated(lied_to
     open_shape = plain_fields(Kind.READY, {k: v for k, v in X.items() if k != "shape"})
     listed = [{**X, "shape": sizes}, *(field.to_dict() for field in ROW_FIELDS)]
     error, stored = lied_to((0, open_shape), (2, plain_fields(Kind.FIELDS, *listed)))
-    assert "bytes; 1073741824 are taken" in str(error)
+    assert "bytes; the limit is 1073741824" in str(error)
     assert stored == 0
 
 

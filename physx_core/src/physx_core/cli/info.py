@@ -16,20 +16,21 @@ from physx_core.errors import DatasetNotFoundError
 
 @dataclass
 class Info:
-    """Show the contents of a session or dataset."""
+    """Show what a session or dataset holds."""
 
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
-    """A session's or a dataset's folder; give one folder."""
+    """The one folder to look into: a session's or a dataset's."""
     verify: bool = False
-    """Check every byte, not only sizes and headers."""
+    """Read every byte to check that nothing was changed, not only what the files say of
+    themselves."""
 
 
 def run(words: Sequence[str]) -> None:
     """Print the dataset and the checkpoints of a folder.
 
     Raises:
-        DatasetNotFoundError: If the folder contains neither a dataset nor checkpoints.
-        DatasetError: If the dataset's manifest cannot be read.
+        DatasetNotFoundError: The folder holds neither a dataset nor checkpoints.
+        DatasetError: The dataset's manifest cannot be read.
     """
     options = tyro.cli(Info, args=words, prog="physx info")
     place = Path(options.directory)

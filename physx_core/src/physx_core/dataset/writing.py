@@ -49,12 +49,15 @@ class Changes:
         """
         self._writing().define_fields(mode, fields)
 
-    def append(self, mode: str, rows: Mapping[str, Any]) -> None:
+    def append(self, mode: str, rows: Mapping[str, Any], *, checked: bool = False) -> None:
         """Store rows; they are committed when this returns.
 
         Args:
             mode: Name of the mode. If it has no fields yet, they are taken from the rows.
-            rows: Field name to array of shape (n, *field shape), all fields of the mode.
+            rows: Field name to array of shape (n, *field shape), all fields of the mode. What fits
+                is decided by `Field.convert`.
+            checked: Whether the rows are known to be finite, as those of a `Source` are: arrays of
+                the fields' types are then stored without another look at their values.
 
         Raises:
             SampleError: A field is missing, unknown, of another shape, type or length, or holds
@@ -62,7 +65,7 @@ class Changes:
             DatasetError: The disk is full or fails; says how many of the rows are stored.
             UsageError: The dataset is closed or only read.
         """
-        self._writing().append(mode, rows)
+        self._writing().append(mode, rows, checked=checked)
         self._forget_moved()
 
     def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""DataGeneration: environments generate samples, and the dataset stores them."""
+"""DataGeneration: environments make samples, and the dataset keeps them."""
 
 from __future__ import annotations
 
@@ -10,35 +10,41 @@ from typing import ClassVar
 from physx_core.config import MODES, WRONG, DatasetConfig, EnvironmentConfig, at_least, options
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, listed
-from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
+from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
 from physx_core.pipelines.run_description import describe_dataset, describe_environment_config
 from physx_core.pipelines.storage import describe_environment, open_own, record_rejected
+from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 
 
 @options
 @dataclass(eq=False)
-class DataGeneration(NewSessionPipeline):
-    """Generates ``batch_nb`` batches of ``batch_size`` samples and stores them in its session.
+class DataGeneration(Pipeline):
+    """Makes ``batch_nb`` batches of ``batch_size`` samples and stores them in its session.
 
     Attributes:
         dataset: The session's dataset, open for writing.
         source: The environments.
-        batch: The last batch.
-        batch_id: Number of stored batches.
+        batch: The batch that was made last.
+        batch_id: Number of batches that are stored.
     """
 
     environment_config: EnvironmentConfig
     dataset_config: DatasetConfig | None = None
-    _: KW_ONLY
+    session_dir: str = "sessions"
+    """Folder of the sessions, relative to the working directory."""
     session_name: str = "data_generation"
+    """Name of the session's folder."""
+    new_session: bool = True
+    """Leave an existing session of this name alone and number the new one; otherwise add to it."""
+    _: KW_ONLY
     batch_nb: int = at_least(1)
-    """Number of batches to generate."""
+    """Number of batches to make."""
     batch_size: int = at_least(1)
     """Number of samples in a batch."""
     mode: str | None = field(default=None, metadata={"choices": MODES})
-    """Mode to store the samples in; None: that of the dataset's configuration."""
+    """Mode that the samples are stored in; None: that of the dataset's configuration."""
 
     kind: ClassVar[str] = "data_generation"
     dataset: Dataset = field(init=False, repr=False)
@@ -47,11 +53,11 @@ class DataGeneration(NewSessionPipeline):
     batch_id: int = field(init=False, repr=False, default=0)
 
     def execute(self) -> None:
-        """Generate all batches.
+        """Make all batches.
 
         Raises:
-            PhysxError: If an environment fails or sets data that cannot be stored; committed
-                samples are kept.
+            PhysxError: An environment failed or gave data that cannot be stored; what was
+                committed stays.
         """
         with self._running():
             self.data_generation_begin()
@@ -63,28 +69,28 @@ class DataGeneration(NewSessionPipeline):
             self.data_generation_end()
 
     def data_generation_begin(self) -> None:
-        """Called before the first batch."""
+        """The first batch is about to be made."""
         self.batch_id = 0
         self.observers.begin("generation", self.batch_nb * self.batch_size, "samples")
 
     def batch_condition(self) -> bool:
-        """Return whether there are batches left to generate."""
+        """Return whether there are batches left to make."""
         return self.batch_id < self.batch_nb
 
     def batch_begin(self) -> None:
-        """Called before each batch."""
+        """A batch is about to be made."""
 
     def batch_produce(self) -> None:
-        """Generate a batch and store it; the samples are committed when this returns.
+        """Make a batch and store it; the samples are committed when this returns.
 
-        With ``record_wrong_samples`` the samples that `check_sample` rejected meanwhile are stored
-        too, in the mode "wrong".
+        With ``record_wrong_samples`` what `check_sample` rejected meanwhile is stored too, in the
+        mode "wrong".
         """
         with record_rejected(self.source, self.dataset):
             self.batch = self.source.batch(self.batch_size)
             if self.batch_id == 0:
                 self.dataset.define_fields(self._mode, self.source.fields)
-            self.dataset.append(self._mode, self.batch)
+            self.dataset.append(self._mode, self.batch, checked=True)
 
     def batch_count(self) -> None:
         """Count the batch."""
@@ -92,10 +98,10 @@ class DataGeneration(NewSessionPipeline):
         self.observers.advance(self.batch_size)
 
     def batch_end(self) -> None:
-        """Called after each batch."""
+        """A batch is stored."""
 
     def data_generation_end(self) -> None:
-        """Called after the last batch."""
+        """The last batch is stored."""
         self.observers.end()
 
     @property
@@ -106,22 +112,22 @@ class DataGeneration(NewSessionPipeline):
         dataset_config = self.dataset_config or DatasetConfig()
         if dataset_config.existing_dir is not None:
             raise ConfigError(
-                "DataGeneration writes into the dataset of its own session, so existing_dir cannot "
-                "be set. To add to a session, give its name and new_session=False."
+                "DataGeneration writes into the dataset of its own session, so it takes no "
+                "existing_dir. To add to a session, give its name and new_session=False."
             )
         config = self.environment_config
         if config.load_samples:
             raise ConfigError(
-                "DataGeneration generates new samples, so load_samples cannot be set: it works in "
+                "DataGeneration makes new samples, so it takes no load_samples: that works in "
                 "Training, Prediction and Replay."
             )
         if self._mode == WRONG:
             raise ConfigError(
-                'The mode "wrong" is for samples that check_sample rejects. Generate samples for '
-                f"{listed(MODES)}, with record_wrong_samples=True to keep the rejected ones."
+                'The mode "wrong" is that of samples which check_sample rejected. Make samples for '
+                f"{listed(MODES)}, with record_wrong_samples=True to keep those that are rejected."
             )
-        seed = choose_seed(config.seed)
-        self.session = self._create_session()
+        seed = chosen_seed(config.seed)
+        self.session = Session.create(self.session_dir, self.session_name, self.new_session)
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
         offset = self.dataset.num_samples(self._mode) if self._mode in self.dataset.modes else 0
         self.dataset.update_info(**describe_environment(config, seed))
@@ -130,7 +136,7 @@ class DataGeneration(NewSessionPipeline):
         self.source = self._open_source(
             resources,
             config,
-            derive_seed(seed, self._mode, offset),
+            stream_seed(seed, self._mode, offset),
             total=self.batch_nb * self.batch_size,
         )
 

@@ -1,4 +1,4 @@
-"""Defers Ctrl-C until the current step is finished."""
+"""Ctrl-C that waits until the work under way is in order."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ from types import FrameType
 
 @contextlib.contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Defer the first Ctrl-C, and yield a function that tells whether it was pressed.
+    """Hold a first Ctrl-C back, and tell of it; a second one interrupts at once.
 
-    A second one interrupts at once. Outside the main thread, and where Ctrl-C is already handled,
-    nothing changes.
+    Outside of the main thread, and where somebody else handles Ctrl-C, nothing changes.
     """
     pressed = False
 

@@ -1,4 +1,4 @@
-"""References: names of components, and how they are resolved."""
+"""References: how a user names a component, and how it is found."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from physx_core.config import SCRIPT_PREFIX
-from physx_core.config import reference_of as reference_of
+from physx_core.config import SCRIPT_PREFIX, reference_of
 from physx_core.errors import (
     ComponentNotFoundError,
     PhysxError,
@@ -35,31 +34,32 @@ def resolve(kind: str, reference: Any) -> Any:
         The class or factory; for ``backend`` an instance of it, ready to build simulations.
 
     Raises:
-        PluginNotFoundError: If the plugin is not installed.
-        PluginError: If it is installed but broken.
-        ComponentNotFoundError: If the plugin, module or script has no component of that name.
-        ReferenceFormError: If the reference has none of the forms above.
+        PluginNotFoundError: The plugin is not installed.
+        PluginError: It is installed but broken.
+        ComponentNotFoundError: The plugin, module or script has nothing of that name.
+        ReferenceFormError: The reference has none of the forms above.
     """
     if kind not in KINDS:
-        raise ReferenceFormError(f'"{kind}" is not a kind of component: {", ".join(KINDS)}.')
+        raise ReferenceFormError(f'"{kind}" is no kind of component: {", ".join(KINDS)}.')
     component = _find(kind, reference)
     return component() if kind == "backend" and isinstance(component, type) else component
 
 
-def locate(kind: str, reference: Any) -> str:
-    """Return the reference by which another process finds a component without reading metadata.
+def located(kind: str, reference: Any) -> str:
+    """Return the text by which another process finds a component without looking for plugins.
 
-    Reading the metadata of all installed packages takes a good part of a client's start.
+    To look through the metadata of all installed packages takes a good part of a client's start.
 
     Args:
         kind: See `resolve`.
         reference: See `resolve`.
 
     Returns:
-        ``"package.module:Class"`` if possible; otherwise the reference's own text.
+        ``"package.module:Class"`` where a plugin names its component so, or where it can be named
+        so; otherwise the reference's own text.
 
     Raises:
-        UsageError: If it is a class that no other process can find.
+        UsageError: It is a class that no other process can find.
     """
     text = reference_of(reference)
     if ":" in text:
@@ -72,19 +72,19 @@ def locate(kind: str, reference: Any) -> str:
         component = components[name]
         place = reference_of(component)
         return place if place == component or _find(kind, place) is component else text
-    except (PhysxError, LookupError, AttributeError):  # the other process reports the error
+    except (PhysxError, LookupError, AttributeError):  # the other process says what is wrong
         return text
 
 
-def import_component(kind: str, reference: str) -> Any:
-    """Import the object named by ``"package.module:Class"`` or ``"script.py:Class"``.
+def imported(kind: str, reference: str) -> Any:
+    """Return what ``"package.module:Class"`` or ``"script.py:Class"`` names.
 
     Args:
-        kind: Kind of the object, for messages.
-        reference: The object's name.
+        kind: What it is, for errors.
+        reference: Where it is.
 
     Raises:
-        ComponentNotFoundError: If the module or script has no object of that name.
+        ComponentNotFoundError: The module or script has nothing of that name.
     """
     place, _, name = reference.rpartition(":")
     return _attribute(kind, _module(kind, place), name, place)
@@ -94,13 +94,13 @@ def _find(kind: str, reference: Any) -> Any:
     if not isinstance(reference, str):
         if isinstance(reference, type):
             return reference
-        raise ReferenceFormError(f"{reference!r} is neither a class nor a reference to one.")
+        raise ReferenceFormError(f"{reference!r} is neither a class nor the name of one.")
     if ":" in reference:
-        return import_component(kind, reference)
+        return imported(kind, reference)
     plugin_name, _, name = reference.partition("/")
     if not plugin_name:
         raise ReferenceFormError(
-            f'"{reference}" does not name a {kind}: give "plugin/name", "package.module:Class" '
+            f'"{reference}" names no {kind}: give "plugin/name", "package.module:Class" '
             'or "script.py:Class".'
         )
     plugin = load(plugin_name)

@@ -1,7 +1,4 @@
-"""Sources of samples: environments in this process, or in clients over TCP.
-
-For programs that step environments without a pipeline, such as vectorized environments.
-"""
+"""Sources of samples: environments in this process, or in clients over TCP."""
 
 from __future__ import annotations
 

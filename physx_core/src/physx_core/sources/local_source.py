@@ -1,4 +1,4 @@
-"""LocalSource: runs all instances of the environment in this process."""
+"""LocalSource: all instances of the environment in this process."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from physx_core.workers.instance import Instance, instance_arguments
 
 
 class LocalSource(Source):
-    """Steps the instances one after the other, without serialization; one copy, into the row."""
+    """Steps the instances one after the other; no serialization, no copy but that into the row."""
 
     def __init__(
         self,
@@ -25,11 +25,11 @@ class LocalSource(Source):
         *,
         accept_all: bool = False,
     ) -> None:
-        """Prepare the instances.
+        """Keep what the instances are made from.
 
         Args:
-            config: The environment, and the number of instances.
-            services: Serves the environments' requests.
+            config: Which environment, and how many instances.
+            services: What the environments may ask of the run.
             seed: Seed of all instances.
             accept_all: Whether samples that `check_sample` rejects count like the others.
         """
@@ -41,12 +41,12 @@ class LocalSource(Source):
             Instance(**instance_arguments(config, number, seed, accept_all))
             for number in range(1, self.instance_nb + 1)
         ]
-        self._columns: RowBuffer | None = None
+        self._buffer: RowBuffer | None = None
         self._next = 0
         self._last = range(0)
 
     def open(self) -> None:
-        """Create the instances' environments: see `Source.open`."""
+        """Bring the instances to life: see `Source.open`."""
         for instance in self._instances:
             instance.open(self._services, draw=self._config.visualizer is not None)
         self.fields = [*self._instances[0].fields, *ROW_FIELDS]
@@ -57,39 +57,39 @@ class LocalSource(Source):
             check_stored(stored, size)
         if self._config.record_wrong_samples:
             self.pop_rejected()
-        columns = self._columns
-        if columns is not None and columns.capacity < size:
-            columns = self._columns = RowBuffer(columns.fields[: -len(ROW_FIELDS)], size)
+        buffer = self._buffer
+        if buffer is not None:
+            buffer.clear()
+            if buffer.capacity < size:
+                buffer = self._buffer = RowBuffer(buffer.fields[: -len(ROW_FIELDS)], size)
         instances, count = self._instances, self.instance_nb
         self._last = range(self._next, self._next + size)
         for row in range(size):
             instance = instances[self._next % count]
             sample = instance.step(None if stored is None else copy_row(stored, row))
-            if columns is None:
-                columns = self._columns = RowBuffer(infer_shapes(instance.fields, sample), size)
-                self.fields = columns.fields
-            columns.put(
-                row, sample, instance.instance_id, instance.last_episode, instance.last_step
-            )
+            if buffer is None:
+                buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
+                self.fields = buffer.fields
+            buffer.put(sample, instance.instance_id, instance.last_episode, instance.last_step)
             self._next += 1
-        if columns is None:
-            raise UsageError(f"A batch must have at least one row, not {size}.")
-        return columns.rows(size)
+        if buffer is None:
+            raise UsageError(f"A batch has at least one row, not {size}.")
+        return buffer.take()
 
     def pop_rejected(self) -> Batch:
-        """Return the rejected samples: see `Source.pop_rejected`."""
+        """Return what was rejected: see `Source.pop_rejected`."""
         blocks = []
         for instance in self._instances:
             if instance.rejected is not None:
-                if self._columns is None:
-                    fields = instance.rejected.shaped(instance.fields)
+                if self._buffer is None:
+                    fields = instance.rejected.infer_shapes(instance.fields)
                 else:
-                    fields = self._columns.fields[: -len(ROW_FIELDS)]
+                    fields = self._buffer.fields[: -len(ROW_FIELDS)]
                 blocks.append(instance.rejected.take(fields, instance.instance_id))
         return concatenate(blocks)
 
     def apply(self, prediction: Batch) -> None:
-        """Pass predictions to the instances: see `Source.apply`."""
+        """Give predictions to the instances: see `Source.apply`."""
         for row, number in enumerate(self._last):
             sample = {name: values[row] for name, values in prediction.items()}
             self._instances[number % self.instance_nb].apply(sample)

@@ -145,7 +145,7 @@ class Instance:
             if accepted or self._accepts_all:
                 return sample
             if self.rejected is not None:
-                self.rejected.note(sample, self.last_episode, self.last_step)
+                self.rejected.add(sample, self.last_episode, self.last_step)
             wrong += 1
             if wrong > self._max_wrong_samples:
                 raise WrongSamplesError(

@@ -11,7 +11,15 @@ from gymnasium import spaces
 
 from physx_core import Field
 from physx_core.components import Event
-from physx_core.errors import ActionError, ConfigError, EpisodeError, UsageError, listed, nearest
+from physx_core.errors import (
+    ActionError,
+    ConfigError,
+    EpisodeError,
+    SampleError,
+    UsageError,
+    listed,
+    nearest,
+)
 from physx_core.fields import is_finite
 from physx_core.rows import RowBuffer, copy_row, infer_shapes
 from physx_core.typing import Array, Sample
@@ -72,8 +80,8 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         fields = {field.name: field for field in self._row.fields if field.role == "training"}
         self._observed = [n for n in fields if n not in (REWARD, TERMINATED, TRUNCATED)]
         self.observation_space = spaces.Dict({n: _space(fields[n]) for n in self._observed})
-        self._actions = {n: _space(fields[n]) for n in action_fields}
-        self.action_space = spaces.Dict(self._actions)
+        self._actions = {n: fields[n] for n in action_fields}
+        self.action_space = spaces.Dict({n: _space(f) for n, f in self._actions.items()})
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -115,7 +123,7 @@ class SampleEnv(gymnasium.Env[Any, Any]):
                 f"An action has the fields {listed(self._actions)}, not {listed(action)}."
             )
         self._prediction = {
-            name: _to_array(name, space, action[name]) for name, space in self._actions.items()
+            name: _to_array(field, action[name]) for name, field in self._actions.items()
         }
         if self._prediction:
             self._instance.apply(self._prediction)
@@ -204,8 +212,9 @@ class SampleEnv(gymnasium.Env[Any, Any]):
             raise UsageError("The environment is closed.")
         episode = instance.environment.episode_index
         sample = instance.step()
-        self._row.put(0, sample, instance.instance_id, instance.last_episode, instance.last_step)
-        row = copy_row(self._row.rows(1), 0)
+        self._row.clear()
+        self._row.put(sample, instance.instance_id, instance.last_episode, instance.last_step)
+        row = copy_row(self._row.take(), 0)
         observation = {name: row.pop(name) for name in self._observed}
         reward = float(row.pop(REWARD, 0.0))
         terminated = bool(row.pop(TERMINATED, False))
@@ -213,18 +222,15 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         return observation, reward, terminated, bool(row.pop(TRUNCATED, False)) or jumped, row
 
 
-def _to_array(name: str, space: spaces.Space[Any], value: Any) -> Array:
+def _to_array(field: Field, value: Any) -> Array:
     """Return the value of an action's field as a new array."""
-    shape = space.shape or ()
     try:
-        array = np.array(value, space.dtype)
-    except (TypeError, ValueError) as error:
-        raise ActionError(f'The field "{name}" is not an array: {error}.', name) from error
-    if array.shape != shape:
-        raise ActionError(f'The field "{name}" has shape {array.shape}, not {shape}.', name)
+        array = field.convert(value)
+    except SampleError as error:
+        raise ActionError(str(error), field.name) from error
     if not is_finite(array):
-        raise ActionError(f'The field "{name}" holds NaN or an infinite number.', name)
-    return array
+        raise ActionError(str(field.not_finite()), field.name)
+    return array.copy()
 
 
 def _space(field: Field) -> spaces.Space[Any]:

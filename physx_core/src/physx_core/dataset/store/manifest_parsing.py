@@ -140,11 +140,15 @@ def _add_statistics(mode: Mode, plain: Mapping[str, Any]) -> None:
     for name, values in plain.items():
         field = mode.fields[_known(name, mode.fields)]
         whole(values["count"], f"the count of {name!r}")
-        for key, value in values.items():
-            array = np.asarray(value, np.float64)
-            if key != "count" and (array.shape != field.shape or not np.isfinite(array).all()):
+        components = {}
+        for key in values.keys() - {"count"}:
+            array = np.asarray(values[key], np.float64)
+            if field.shape is not None and not array.size and 0 in field.shape:
+                array = array.reshape(field.shape)  # JSON loses the shape of empty arrays
+            if array.shape != field.shape or not np.isfinite(array).all():
                 raise ValueError(f"the normalization of {name!r} has a {key} that cannot be")
-        mode.statistics[name] = RunningStatistics.from_dict(values)
+            components[key] = array
+        mode.statistics[name] = RunningStatistics.from_dict({**values, **components})
     have = (mode.statistics.get(name) for name in mode.counted_fields)
     if any((statistics.count if statistics else 0) != counted for statistics in have):
         mode.forget_statistics()

@@ -7,12 +7,12 @@ from typing import Any
 
 from physx_core import files
 from physx_core.dataset.store.manifest import Mode
-from physx_core.dataset.write.checks import RowBuffer, check_rows, infer_fields
-from physx_core.dataset.write.definitions import compare_fields, complete_shapes, shapes_of_rows
+from physx_core.dataset.write.checks import check_rows, infer_fields
+from physx_core.dataset.write.definitions import compare_fields, complete_shapes
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import ConfigError
 from physx_core.fields import Field
-from physx_core.typing import Batch
+from physx_core.rows import RowBuffer, infer_shapes
 
 
 class Appender:
@@ -40,21 +40,23 @@ class Appender:
             known = manifest.modes.setdefault(mode, Mode(given))
             known.fields = _completed(mode, known, given)
 
-    def append(self, mode: str, rows: Mapping[str, Any]) -> None:
+    def append(self, mode: str, rows: Mapping[str, Any], *, checked: bool = False) -> None:
         """Store and commit rows: see `Dataset.append`."""
         known = self._manifest.modes.get(mode)
         fields = known.fields if known else {field.name: field for field in infer_fields(rows)}
-        checked, count = check_rows(fields, rows)
+        block, count = check_rows(fields, rows, checked=checked)
         self._flush(mode)
-        self._settle(mode, fields, checked)
-        self.writer.append(mode, checked, count)
+        if not self._is_settled(mode):
+            self.define_fields(mode, infer_shapes(fields.values(), block, axes=1))
+        self.writer.append(mode, block, count)
 
     def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
         """Store one sample, soon: see `Dataset.append_sample`."""
         buffer = self._buffers.get(mode)
         if buffer is None:
-            buffer = self._buffer(mode, sample)
-        buffer.put(sample)
+            buffer = self._begin(mode, sample)
+        else:
+            buffer.put_checked(sample)
         if buffer.full:
             self._flush(mode)
 
@@ -63,14 +65,16 @@ class Appender:
         for mode in self._buffers:
             self._flush(mode)
 
-    def _buffer(self, mode: str, sample: Mapping[str, Any]) -> RowBuffer:
-        """Make the buffer of a mode, from whose first sample the fields may become known."""
+    def _begin(self, mode: str, sample: Mapping[str, Any]) -> RowBuffer:
+        """Return a mode's buffer with its first sample, from which open shapes become known."""
         known = self._manifest.modes.get(mode)
-        rows = {name: [value] for name, value in sample.items()}
-        fields = known.fields if known else {field.name: field for field in infer_fields(rows)}
-        checked, _ = check_rows(fields, rows)
-        self._settle(mode, fields, checked)
-        buffer = self._buffers[mode] = RowBuffer(self._manifest.modes[mode].fields)
+        fields = known.fields.values() if known else infer_fields(sample, axes=0)
+        shaped = infer_shapes(fields, sample)
+        buffer = RowBuffer(shaped, numbered=False)
+        buffer.put_checked(sample)
+        if not self._is_settled(mode):
+            self.define_fields(mode, shaped)
+        self._buffers[mode] = buffer
         return buffer
 
     def _flush(self, mode: str) -> None:
@@ -79,11 +83,10 @@ class Appender:
             count = buffer.count
             self.writer.append(mode, buffer.take(), count)
 
-    def _settle(self, mode: str, fields: Mapping[str, Field], rows: Batch) -> None:
-        """Add the mode, if it is new, and complete shapes that the first rows tell."""
+    def _is_settled(self, mode: str) -> bool:
+        """Return whether all fields of a mode are known, with their shapes."""
         known = self._manifest.modes.get(mode)
-        if known is None or any(field.shape is None for field in known.fields.values()):
-            self.define_fields(mode, shapes_of_rows(fields, rows).values())
+        return known is not None and all(f.shape is not None for f in known.fields.values())
 
 
 def _completed(mode: str, known: Mode, given: Mapping[str, Field]) -> dict[str, Field]:

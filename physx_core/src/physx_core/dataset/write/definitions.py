@@ -9,7 +9,6 @@ import numpy as np
 
 from physx_core.errors import FieldsMismatchError
 from physx_core.fields import Field
-from physx_core.typing import Batch
 
 
 def compare_fields(what: str, known: Mapping[str, Field], given: Mapping[str, Field]) -> None:
@@ -38,14 +37,6 @@ def complete_shapes(known: Mapping[str, Field], given: Mapping[str, Field]) -> d
     return {
         name: replace(field, shape=given[name].shape) if field.shape is None else field
         for name, field in known.items()
-    }
-
-
-def shapes_of_rows(fields: Mapping[str, Field], rows: Batch) -> dict[str, Field]:
-    """Return the fields, with shapes that are not known yet taken from rows."""
-    return {
-        name: replace(field, shape=rows[name].shape[1:]) if field.shape is None else field
-        for name, field in fields.items()
     }
 
 

@@ -16,9 +16,10 @@ from physx_core import files
 from physx_core.dataset.store.manifest import Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.partition_format import inspect
-from physx_core.dataset.write.checks import check_names, check_rows
+from physx_core.dataset.write.checks import check_rows
 from physx_core.errors import FieldShapeError, MissingFieldError
 from physx_core.fields import Field
+from physx_core.rows import check_names
 from physx_core.typing import Array, Batch
 
 Index = NDArray[np.intp]
@@ -63,8 +64,10 @@ def checked(
     unknown = [name for name in values if name not in fields]
     if unknown:
         check_names(fields, unknown)
-    given = {name: np.asarray(value)[None] if single else value for name, value in values.items()}
-    rows, count = check_rows({name: fields[name] for name in given}, given)
+    given = {name: fields[name] for name in values}
+    if single:
+        values = {name: field.convert(values[name])[None] for name, field in given.items()}
+    rows, count = check_rows(given, values)
     if count != len(index):
         raise FieldShapeError(f"{count} rows are given for {len(index)} places.")
     return rows

@@ -5,20 +5,15 @@ from __future__ import annotations
 import time
 from collections import deque
 
-import numpy as np
-
 from physx_core.errors import ConnectionRefusedByPeerError, NotFiniteError, PhysxError
-from physx_core.fields import Field
 from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.values import decode, encode
 from physx_core.rows import ROW_FIELDS, RowBuffer, copy_row, infer_shapes
 from physx_core.typing import Sample
 from physx_core.workers.client.link import Link, RunEnded
 from physx_core.workers.instance import Instance
-from physx_core.workers.row_codec import pack_rows, row_bytes
+from physx_core.workers.row_codec import pack_rows
 
-_BLOCK_BYTES = 1 << 20
-_BLOCK_ROWS = 4096
 _BLOCK_TIME = 20e-3
 
 
@@ -44,11 +39,10 @@ class Producer:
         self.failure: PhysxError | None = None
         self._link, self._instance = link, instance
         self._skip, self._skip_rejected = skip, rejected
-        self._columns: RowBuffer | None = None
+        self._buffer: RowBuffer | None = None
         self._announced = False
         self._stored: deque[Sample] = deque()
         self._credit = 0
-        self._filled = 0
         self._sent_at = 0.0
 
     def run(self) -> None:
@@ -84,20 +78,17 @@ class Producer:
             RunEnded: There is a `failure`, or the server is gone. No environment can catch it.
         """
         self._send_rejected()
-        columns, count = self._columns, self._filled
-        self.made -= count
-        while columns is not None and count:
+        buffer = self._buffer
+        if buffer is not None and buffer.count:
+            self.made -= buffer.count
             try:
-                block = columns.rows(count)
+                rows = buffer.take()
             except NotFiniteError as error:
-                # The named row is the first of one field; another field may have an earlier one.
-                self.failure = error
-                count = int(np.argmax(columns.arrays["step"][:count] == error.step))
-            else:
-                self._link.send_parts(pack_rows(block, count))
-                break
-        self.made += count
-        self._filled = 0
+                self.failure, rows = error, buffer.take()
+            count = len(rows["step"])
+            if count:
+                self._link.send_parts(pack_rows(rows, count))
+            self.made += count
         self._sent_at = time.monotonic()
         if self.failure is not None:
             raise RunEnded
@@ -105,33 +96,31 @@ class Producer:
     def _make_row(self) -> None:
         instance = self._instance
         sample = instance.step(self._stored.popleft() if self._stored else None)
-        columns = self._columns
-        if columns is None:
-            columns = self._columns = _columns(infer_shapes(instance.fields, sample))
+        buffer = self._buffer
+        if buffer is None:
+            buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample))
         if self.made >= self._skip:
-            number, episode, step = instance.instance_id, instance.last_episode, instance.last_step
-            columns.put(self._filled, sample, number, episode, step)
-            self._filled += 1
-        self._announce(columns)
+            buffer.put(sample, instance.instance_id, instance.last_episode, instance.last_step)
+        self._announce(buffer)
         self.made += 1
 
-    def _announce(self, columns: RowBuffer) -> None:
+    def _announce(self, buffer: RowBuffer) -> None:
         """Tell the fields of the rows, once."""
         if not self._announced:
             self._announced = True
-            table = [field.to_dict() for field in columns.fields]
+            table = [field.to_dict() for field in buffer.fields]
             self._link.send(pack(Kind.FIELDS, encode(table)))
 
     def _send_rejected(self) -> None:
         """Send what `check_sample` rejected, once the fields' shapes are known."""
-        rejected, columns = self._instance.rejected, self._columns
-        if rejected is None or columns is None or not self._announced:
+        rejected, buffer = self._instance.rejected, self._buffer
+        if rejected is None or buffer is None or not self._announced:
             return
-        rows = rejected.take(columns.fields[: -len(ROW_FIELDS)], self._instance.instance_id)
+        rows = rejected.take(buffer.fields[: -len(ROW_FIELDS)], self._instance.instance_id)
         skipped = min(self._skip_rejected, len(rows["step"]))
         self._skip_rejected -= skipped
-        for start in range(skipped, len(rows["step"]), columns.capacity):
-            part = {name: values[start : start + columns.capacity] for name, values in rows.items()}
+        for start in range(skipped, len(rows["step"]), buffer.capacity):
+            part = {name: values[start : start + buffer.capacity] for name, values in rows.items()}
             self._link.send_parts(pack_rows(part, len(part["step"]), Kind.WRONG))
 
     def _send_last_rejected(self) -> None:
@@ -139,17 +128,17 @@ class Producer:
         rejected = self._instance.rejected
         if rejected is None or self._announced:
             return
-        fields = rejected.shaped(self._instance.fields)
+        fields = rejected.infer_shapes(self._instance.fields)
         if all(field.shape is not None for field in fields):
-            self._columns = _columns(fields)
-            self._announce(self._columns)
+            self._buffer = RowBuffer(fields)
+            self._announce(self._buffer)
             self._send_rejected()
 
     def _is_due(self) -> bool:
-        columns = self._columns
+        buffer = self._buffer
         return (
             self.made >= self._credit
-            or (columns is not None and self._filled == columns.capacity)
+            or (buffer is not None and buffer.full)
             or time.monotonic() - self._sent_at >= _BLOCK_TIME
         )
 
@@ -181,9 +170,3 @@ class Producer:
             raise ConnectionRefusedByPeerError(
                 f"The server sent {frame.kind.name}, which only a client sends."
             )
-
-
-def _columns(fields: list[Field]) -> RowBuffer:
-    """Return columns for one block of rows."""
-    size = max(1, row_bytes([*fields, *ROW_FIELDS]))
-    return RowBuffer(fields, min(max(1, _BLOCK_BYTES // size), _BLOCK_ROWS))

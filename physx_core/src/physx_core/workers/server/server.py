@@ -355,7 +355,7 @@ def _rows(peer: Peer, frame: Frame) -> None:
     if not peer.row_fields or not 0 < count <= peer.granted - peer.received:
         raise ConnectionRefusedByPeerError(f"It sent {count} rows that nobody asked for.")
     block = unpack_rows(frame.payload, peer.row_fields, count)
-    peer.last_step = check_rows(block, peer.instance_id, peer.last_step)
+    peer.last_step = check_rows(block, peer.row_fields, peer.instance_id, peer.last_step)
     peer.rows.append(block, count)
     peer.received += count
 
@@ -365,7 +365,7 @@ def _wrong(peer: Peer, frame: Frame) -> None:
     if not peer.row_fields or not 0 < count <= peer.rejected_limit - peer.rejected.count:
         raise ConnectionRefusedByPeerError(f"It sent {count} rejected rows that nobody asked for.")
     block = unpack_rows(frame.payload, peer.row_fields, count)
-    check_rows(block, peer.instance_id, peer.last_step)
+    check_rows(block, peer.row_fields, peer.instance_id, peer.last_step)
     peer.rejected.append(block, count)
 
 

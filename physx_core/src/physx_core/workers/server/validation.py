@@ -1,7 +1,7 @@
-"""Claims: what a client says about its rows, checked before any of it is believed.
+"""Validation of client messages.
 
-A client knows the token, but it may be broken or of another make: what it sends is taken only
-where it fits what it said before.
+A client knows the token, but it may be broken or a different implementation: its messages are
+accepted only if they are consistent with those before them.
 """
 
 from __future__ import annotations
@@ -11,11 +11,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from physx_core.components.scene import Event
-from physx_core.errors import ConfigError, ConnectionRefusedByPeerError, NotFiniteError
-from physx_core.fields import RESERVED, Field, is_finite
+from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
+from physx_core.fields import RESERVED, Field, first_not_finite
 from physx_core.net.frames import MAX_PAYLOAD
 from physx_core.net.values import decode
 from physx_core.rows import ROW_FIELDS
@@ -30,15 +28,15 @@ def declared_fields(payload: bytes | bytearray) -> list[Field]:
     """Return the fields that a message lists.
 
     Raises:
-        ConnectionRefusedByPeerError: It lists something else, no fields, or a name twice.
+        ConnectionRefusedByPeerError: If it lists something else, no fields, or a name twice.
     """
     plain = decode(payload)
     try:
         if not isinstance(plain, list) or not all(map(_is_field, plain)):
-            raise ConfigError("one is described in an unknown way.")
+            raise ConfigError("a description is malformed.")
         fields = [Field.from_dict(one) for one in plain]
     except ConfigError as error:
-        raise ConnectionRefusedByPeerError(f"Its fields are none: {error}") from error
+        raise ConnectionRefusedByPeerError(f"It does not list valid fields: {error}") from error
     if not fields or len({field.name for field in fields}) < len(fields):
         raise ConnectionRefusedByPeerError("It listed no fields, or one twice.")
     return fields
@@ -62,7 +60,7 @@ def check_environment_fields(fields: Sequence[Field]) -> None:
     """Check the fields that an environment is said to define.
 
     Raises:
-        ConnectionRefusedByPeerError: One has a name that physx fills itself.
+        ConnectionRefusedByPeerError: If one has a name that physx fills itself.
     """
     reserved = [field.name for field in fields if field.name in RESERVED]
     if reserved:
@@ -77,7 +75,7 @@ def check_row_fields(fields: Sequence[Field], environment: Sequence[Field]) -> N
         environment: Fields that the environment defined before; open shapes may be known now.
 
     Raises:
-        ConnectionRefusedByPeerError: They are others, have an open shape, or a row of them is
+        ConnectionRefusedByPeerError: If they are others, have an open shape, or a row of them is
             longer than a message may be.
     """
     expected = [*environment, *ROW_FIELDS]
@@ -91,18 +89,20 @@ def check_row_fields(fields: Sequence[Field], environment: Sequence[Field]) -> N
             raise ConnectionRefusedByPeerError(f"Its rows have {field}, but it defined {known}.")
     size = sum(field.nbytes for field in fields)
     if size > MAX_PAYLOAD:
-        raise ConnectionRefusedByPeerError(f"Its rows have {size} bytes; {MAX_PAYLOAD} are taken.")
+        raise ConnectionRefusedByPeerError(
+            f"Its rows have {size} bytes; the limit is {MAX_PAYLOAD}."
+        )
 
 
 def named_values(payload: bytes | bytearray) -> dict[str, Any]:
     """Return the values of a request, by name.
 
     Raises:
-        ConnectionRefusedByPeerError: The message holds something else.
+        ConnectionRefusedByPeerError: If the message holds something else.
     """
     values = decode(payload)
     if not isinstance(values, dict) or not {*map(type, values)} <= {str}:
-        raise ConnectionRefusedByPeerError("It sent a request that is no dictionary of names.")
+        raise ConnectionRefusedByPeerError("It sent a request that is not a dictionary of names.")
     return values
 
 
@@ -110,11 +110,11 @@ def drawing_events(payload: bytes | bytearray) -> list[Event]:
     """Return the drawing events of a message.
 
     Raises:
-        ConnectionRefusedByPeerError: It holds something else.
+        ConnectionRefusedByPeerError: If it holds something else.
     """
     plain = decode(payload)
     if not isinstance(plain, list) or not all(map(_is_event, plain)):
-        raise ConnectionRefusedByPeerError("It sent drawing events that are none.")
+        raise ConnectionRefusedByPeerError("It sent malformed drawing events.")
     return [Event(*parts) for parts in plain]
 
 
@@ -127,11 +127,12 @@ def _is_event(parts: Any) -> bool:
     )
 
 
-def check_rows(block: Batch, instance_id: int, last_step: int) -> int:
+def check_rows(block: Batch, fields: Sequence[Field], instance_id: int, last_step: int) -> int:
     """Check rows that arrived, as the client must have done before it sent them.
 
     Args:
         block: Rows of a client, at least one.
+        fields: Fields of the rows.
         instance_id: The client's instance.
         last_step: Step of its last row before these, -1 for none.
 
@@ -139,8 +140,8 @@ def check_rows(block: Batch, instance_id: int, last_step: int) -> int:
         Step of the last row.
 
     Raises:
-        ConnectionRefusedByPeerError: They are not of this instance, or their steps do not rise.
-        NotFiniteError: One holds NaN or an infinite number.
+        ConnectionRefusedByPeerError: If they are not of this instance, or their steps do not rise.
+        NotFiniteError: If one holds NaN or an infinite number.
     """
     steps, numbers = block["step"], block["env_id"]
     several = len(steps) > 1
@@ -148,18 +149,14 @@ def check_rows(block: Batch, instance_id: int, last_step: int) -> int:
         raise ConnectionRefusedByPeerError("It sent rows of another instance.")
     if steps[0] <= last_step or (several and (steps[1:] <= steps[:-1]).any()):
         raise ConnectionRefusedByPeerError("It sent rows whose steps do not rise.")
-    for name, values in block.items():
+    for field in fields:
+        values = block[field.name]
         kind = values.dtype.kind
         if kind == "b" and values.tobytes().translate(None, b"\0\1"):
             raise ConnectionRefusedByPeerError(
-                f'It sent rows whose field "{name}" is neither true nor false.'
+                f'It sent rows whose field "{field.name}" is neither true nor false.'
             )
-        if kind in "fc" and not is_finite(values):
-            row = int(np.argmin(np.isfinite(values).reshape(len(values), -1).all(axis=1)))
-            raise NotFiniteError(
-                f'field "{name}" holds NaN or an infinite number.',
-                field=name,
-                instance_id=instance_id,
-                step=int(steps[row]),
-            )
+        bad = first_not_finite(values) if kind in "fc" else None
+        if bad is not None:
+            raise field.not_finite(instance_id=instance_id, step=int(steps[bad]))
     return int(steps[-1])

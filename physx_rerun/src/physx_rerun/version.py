@@ -1,5 +1,0 @@
-"""Version of the installed distribution."""
-
-from importlib.metadata import version
-
-__version__ = version("physx-rerun")
