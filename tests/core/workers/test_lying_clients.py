@@ -174,16 +174,16 @@ FIRST = {
 BEFORE = {
     "fields before all": (FIELDS, "5 fields, but it defined 3"),
     "no fields": (plain_fields(Kind.READY), "no fields, or one twice"),
-    "fields that are no list": (pack(Kind.READY, encode(1)), "a description is malformed"),
-    "a field that is none": (plain_fields(Kind.READY, 1), "a description is malformed"),
+    "fields that are no list": (pack(Kind.READY, encode(1)), "is malformed"),
+    "a field that is none": (plain_fields(Kind.READY, 1), "is malformed"),
     "a field twice": (plain_fields(Kind.READY, X, X), "no fields, or one twice"),
     "a field of physx": (plain_fields(Kind.READY, {**X, "name": "step"}), 'field "step"'),
     "a name that is none": (plain_fields(Kind.READY, {**X, "name": "a b"}), "identifier"),
-    "objects": (plain_fields(Kind.READY, {**X, "dtype": "|O"}), "a description is malformed"),
-    "a type in parts": (plain_fields(Kind.READY, {**X, "dtype": "f8,f8"}), "a description is malformed"),
+    "objects": (plain_fields(Kind.READY, {**X, "dtype": "|O"}), "is malformed"),
+    "a type in parts": (plain_fields(Kind.READY, {**X, "dtype": "f8,f8"}), "is malformed"),
     "a type that is none": (plain_fields(Kind.READY, {**X, "dtype": "<f5"}), "not a NumPy type"),
     "a negative shape": (plain_fields(Kind.READY, {**X, "shape": [-1]}), "not a shape"),
-    "a shape in words": (plain_fields(Kind.READY, {**X, "shape": "2"}), "a description is malformed"),
+    "a shape in words": (plain_fields(Kind.READY, {**X, "shape": "2"}), "is malformed"),
 }
 
 
