@@ -18,7 +18,7 @@ from physx_gym import (
     RobotEnv,
     Simulator,
 )
-from physx_gym.tasks.quantities import BaseHeight, Touching
+from physx_gym.tasks.quantities import BaseHeight, BodiesInContact
 
 DT = 0.005
 TILTED = (0.1, -0.2, 0.3, 0.927361849549570)
@@ -164,14 +164,14 @@ def test_quantities_as_features():
     base = RobotEnv(Simulator.build("ant", fixed_base=False, control_period=DT), 0.02)
     bodies = base.simulator.layout.bodies[-2:]
     env = ObservedEnv(base, QuantityObserver("height", base, quantity=BaseHeight()))
-    env = ObservedEnv(env, QuantityObserver("touching", env, quantity=Touching(bodies)))
+    env = ObservedEnv(env, QuantityObserver("touching", env, quantity=BodiesInContact(bodies)))
     env.reset(seed=0)
     for _ in range(5):
         features = env.step(np.zeros(8))[0]["features"]
         assert features["height"].shape == ()
         np.testing.assert_array_equal(features["height"], env.quantities.get_value(BaseHeight()))
         np.testing.assert_array_equal(
-            features["touching"], env.quantities.get_value(Touching(bodies))
+            features["touching"], env.quantities.get_value(BodiesInContact(bodies))
         )
 
 

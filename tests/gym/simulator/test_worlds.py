@@ -246,10 +246,10 @@ def test_methods_that_return_something_else_are_named(method, returned, message)
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda env: Tracking(JointPositions, 1.0), r"make one, as in JointPositions\(\.\.\.\)"),
+        (lambda env: Tracking(JointPositions, 1.0), r"create one, as in JointPositions\(\.\.\.\)"),
         (lambda env: Minimizing("power", 1.0), "Minimizing.quantity is 'power'"),
         (lambda env: Stacked("power", 2), "Stacked.quantity is 'power'"),
-        (lambda env: BodyPositions("cart"), 'is the text "cart" but must be a list'),
+        (lambda env: BodyPositions("cart"), 'is the string "cart" but must be a list'),
         (lambda env: OutOfBounds(JointPositions(), "a"), "must be numbers"),
         (lambda env: OutOfBounds(JointPositions(), 1, 0), "the lower one first"),
         (lambda env: OutOfBounds(JointPositions(), 0, grace=1), 'Did you mean "grace_period"'),

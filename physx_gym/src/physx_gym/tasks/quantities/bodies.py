@@ -1,4 +1,4 @@
-"""Where bodies are and how they move."""
+"""Quantities of the poses and velocities of bodies."""
 
 from __future__ import annotations
 
@@ -18,14 +18,19 @@ Form = Literal["quaternion", "roll_pitch_yaw", "matrix"]
 
 
 @dataclass(frozen=True)
-class BodyPoses(Quantity):
-    """Poses of bodies in the world, shape (bodies, 7): position in m, quaternion x, y, z, w.
+class BodiesQuantity(Quantity):
+    """A quantity of some bodies.
 
     Attributes:
         bodies: Names in the layout.
     """
 
     bodies: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class BodyPoses(BodiesQuantity):
+    """Poses of bodies in the world, shape (bodies, 7): position in m, quaternion x, y, z, w."""
 
     def compute(self, moment: Moment) -> Vector:
         """Return the poses."""
@@ -33,14 +38,8 @@ class BodyPoses(Quantity):
 
 
 @dataclass(frozen=True)
-class BodyPositions(Quantity):
-    """Positions of bodies in the world, shape (bodies, 3), in m.
-
-    Attributes:
-        bodies: Names in the layout.
-    """
-
-    bodies: tuple[str, ...]
+class BodyPositions(BodiesQuantity):
+    """Positions of bodies in the world, shape (bodies, 3), in m."""
 
     def compute(self, moment: Moment) -> Vector:
         """Return the positions."""
@@ -48,16 +47,14 @@ class BodyPositions(Quantity):
 
 
 @dataclass(frozen=True)
-class BodyOrientations(Quantity):
+class BodyOrientations(BodiesQuantity):
     """Orientations of bodies in the world.
 
     Attributes:
-        bodies: Names in the layout.
         form: ``"quaternion"``, shape (bodies, 4); ``"roll_pitch_yaw"``, (bodies, 3), in rad; or
             ``"matrix"``, (bodies, 3, 3).
     """
 
-    bodies: tuple[str, ...]
     form: Form = "quaternion"
 
     def compute(self, moment: Moment) -> Vector:
@@ -71,15 +68,13 @@ class BodyOrientations(Quantity):
 
 
 @dataclass(frozen=True)
-class BodyVelocities(Quantity):
+class BodyVelocities(BodiesQuantity):
     """Velocities of bodies' origins, shape (bodies, 6): linear in m/s, then angular in rad/s.
 
     Attributes:
-        bodies: Names in the layout.
         frame: ``"world"``: along the world's axes; ``"body"``: along each body's own.
     """
 
-    bodies: tuple[str, ...]
     frame: Literal["world", "body"] = "world"
 
     def compute(self, moment: Moment) -> Vector:
@@ -88,37 +83,22 @@ class BodyVelocities(Quantity):
         if self.frame == "world":
             return velocities
         turn = moment.get(BodyPoses(self.bodies))[:, 3:]
-        parts = [
-            rotations.rotate_back_rows(turn, velocities[:, :3]),
-            rotations.rotate_back_rows(turn, velocities[:, 3:]),
-        ]
+        parts = [rotations.rotate_back_rows(turn, v) for v in np.hsplit(velocities, 2)]
         return np.concatenate(parts, axis=1)
 
 
 @dataclass(frozen=True)
-class MeanBodyVelocities(Quantity):
-    """Velocities of bodies over the last step, shape (bodies, 6), along the world's axes.
-
-    Attributes:
-        bodies: Names in the layout.
-    """
-
-    bodies: tuple[str, ...]
+class MeanBodyVelocities(BodiesQuantity):
+    """Velocities of bodies over the last step, shape (bodies, 6), along the world's axes."""
 
     def compute(self, moment: Moment) -> Vector:
-        """Return displacement and rotation of the step by its duration."""
+        """Return displacement and rotation over the step, divided by its duration."""
         return np.asarray(moment.get(Rate(BodyPoses(self.bodies), geometry.pose_difference)))
 
 
 @dataclass(frozen=True)
-class MeanPose(Quantity):
-    """The mean of several bodies' poses, shape (7,), for example of all feet.
-
-    Attributes:
-        bodies: Names in the layout.
-    """
-
-    bodies: tuple[str, ...]
+class MeanPose(BodiesQuantity):
+    """The mean of several bodies' poses, shape (7,), for example of all feet."""
 
     def compute(self, moment: Moment) -> Vector:
         """Return mean position and mean orientation."""
@@ -127,17 +107,11 @@ class MeanPose(Quantity):
 
 
 @dataclass(frozen=True)
-class RelativePoses(Quantity):
-    """Poses of bodies as seen from their mean pose, shape (bodies, 7).
-
-    Attributes:
-        bodies: At least two names in the layout.
-    """
-
-    bodies: tuple[str, ...]
+class RelativePoses(BodiesQuantity):
+    """Poses of at least two bodies relative to their mean pose, shape (bodies, 7)."""
 
     def __post_init__(self) -> None:
-        """Check that there is something to compare."""
+        """Check the number of bodies."""
         super().__post_init__()
         if len(self.bodies) < 2:
             raise ConfigError(f"RelativePoses needs at least two bodies, not {self.bodies}.")
@@ -149,25 +123,22 @@ class RelativePoses(Quantity):
 
 
 @dataclass(frozen=True)
-class MeanOdometry(Quantity):
-    """Mean position on the ground and heading of bodies: x and y in m, yaw in rad, shape (3,).
-
-    Attributes:
-        bodies: Names in the layout.
-    """
-
-    bodies: tuple[str, ...]
+class MeanOdometry(BodiesQuantity):
+    """Mean position on the ground and heading of bodies: x and y in m, yaw in rad, shape (3,)."""
 
     def compute(self, moment: Moment) -> Vector:
         """Return the planar pose."""
-        pose = moment.get(MeanPose(self.bodies))
-        return np.array([pose[0], pose[1], rotations.to_roll_pitch_yaw(pose[3:].tolist())[2]])
+        return _planar(moment.get(MeanPose(self.bodies)))
 
 
-def root_of(moment: Moment) -> str:
-    """Return the root link of the robot that acts."""
-    root: str = moment.simulator.layout.bodies[moment.robot.bodies][0]
-    return root
+def _planar(pose: Vector) -> Vector:
+    """Return x, y and yaw of a pose."""
+    return np.array([pose[0], pose[1], rotations.to_roll_pitch_yaw(pose[3:].tolist())[2]])
+
+
+def _root(moment: Moment) -> tuple[str]:
+    """Return the root link of the controlled robot."""
+    return (moment.simulator.layout.bodies[moment.robot.bodies][0],)
 
 
 @dataclass(frozen=True)
@@ -176,12 +147,12 @@ class RollPitch(Quantity):
 
     def compute(self, moment: Moment) -> Vector:
         """Return the angles."""
-        return np.asarray(moment.get(BodyOrientations((root_of(moment),), "roll_pitch_yaw"))[0, :2])
+        return np.asarray(moment.get(BodyOrientations(_root(moment), "roll_pitch_yaw"))[0, :2])
 
 
 @dataclass(frozen=True)
 class BaseHeight(Quantity):
-    """Height of the robot's root link, in m: over z = 0, or over the lowest of some bodies.
+    """Height of the robot's root link, in m: above z = 0, or above the lowest of some bodies.
 
     Attributes:
         over: Names in the layout, for example the feet; none: z = 0.
@@ -191,7 +162,7 @@ class BaseHeight(Quantity):
 
     def compute(self, moment: Moment) -> float:
         """Return the height."""
-        height = float(moment.get(BodyPoses((root_of(moment),)))[0, 2])
+        height = float(moment.get(BodyPoses(_root(moment)))[0, 2])
         if self.over:
             height -= float(moment.get(BodyPositions(self.over))[:, 2].min())
         return height
@@ -203,8 +174,7 @@ class Odometry(Quantity):
 
     def compute(self, moment: Moment) -> Vector:
         """Return the planar pose."""
-        pose = moment.get(BodyPoses((root_of(moment),)))[0]
-        return np.array([pose[0], pose[1], rotations.to_roll_pitch_yaw(pose[3:].tolist())[2]])
+        return _planar(moment.get(BodyPoses(_root(moment)))[0])
 
 
 @dataclass(frozen=True)
@@ -213,14 +183,14 @@ class BaseVelocity(Quantity):
 
     def compute(self, moment: Moment) -> Vector:
         """Return the velocity."""
-        return np.asarray(moment.get(BodyVelocities((root_of(moment),), "body"))[0])
+        return np.asarray(moment.get(BodyVelocities(_root(moment), "body"))[0])
 
 
 @dataclass(frozen=True)
 class OdometryVelocity(Quantity):
     """Velocity over the last step: forward and to the left in m/s, yaw rate in rad/s, shape (3,).
 
-    Along the heading half way between begin and end of the step.
+    Along the heading halfway between start and end of the step.
     """
 
     def compute(self, moment: Moment) -> Vector:

@@ -1,4 +1,4 @@
-"""Quantities that are made of others."""
+"""Quantities that are computed from others."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from physx_core.errors import ConfigError
+from physx_core.typing import Vector
 from physx_gym.tasks.quantities.quantity import Moment, Quantity, Remembering, as_array
 
 
@@ -18,7 +19,7 @@ class Masked(Quantity):
 
     Attributes:
         quantity: An array.
-        entries: Places in the flat array.
+        entries: Indices in the flat array.
     """
 
     quantity: Quantity
@@ -31,7 +32,7 @@ class Masked(Quantity):
 
 @dataclass(frozen=True)
 class Joined(Quantity):
-    """Several quantities as one flat array, one after the other.
+    """Several quantities, concatenated to one flat array.
 
     Attributes:
         quantities: Numbers or arrays.
@@ -49,7 +50,7 @@ class Computed(Quantity):
     """A function of other quantities.
 
     Attributes:
-        function: Called with their values; a named function, so that equal ones are one.
+        function: Called with their values; a named function, so that equal quantities are shared.
         quantities: Its arguments.
     """
 
@@ -57,7 +58,7 @@ class Computed(Quantity):
     quantities: tuple[Quantity, ...]
 
     def compute(self, moment: Moment) -> Any:
-        """Return what the function gives."""
+        """Return the value of the function."""
         return self.function(*(moment.get(each) for each in self.quantities))
 
 
@@ -67,7 +68,7 @@ class Stacked(Remembering):
 
     Attributes:
         quantity: A number or array.
-        steps: How many; at the begin there are fewer.
+        steps: Number of steps; at the start of an episode there are fewer.
     """
 
     quantity: Quantity
@@ -81,19 +82,18 @@ class Stacked(Remembering):
 
     def advance(self, memory: Any, moment: Moment) -> tuple[Any, Any]:
         """Add the present value: shape (steps so far, *shape)."""
-        value = as_array(moment.get(self.quantity))[np.newaxis].copy()
-        stack = value if memory is None else np.concatenate([memory, value])[-self.steps :]
+        stack = _push(memory, moment.get(self.quantity), self.steps)
         return stack, stack
 
 
 @dataclass(frozen=True)
 class Delta(Remembering):
-    """How much another quantity changed over the last steps; 0 at the begin.
+    """The change of another quantity over the last steps; 0 at the start of an episode.
 
     Attributes:
         quantity: A number or array.
-        steps: Over how many steps, or as many as there were.
-        difference: Takes the later and the earlier value; for angles, one that goes the short way.
+        steps: Number of steps, or all that there were.
+        difference: Takes the later and the earlier value; for angles, one along the shorter arc.
     """
 
     quantity: Quantity
@@ -102,14 +102,13 @@ class Delta(Remembering):
 
     def advance(self, memory: Any, moment: Moment) -> tuple[Any, Any]:
         """Return the change."""
-        value = as_array(moment.get(self.quantity))[np.newaxis].copy()
-        stack = value if memory is None else np.concatenate([memory, value])[-self.steps - 1 :]
+        stack = _push(memory, moment.get(self.quantity), self.steps + 1)
         return as_array(self.difference(stack[-1], stack[0])), stack
 
 
 @dataclass(frozen=True)
 class Rate(Quantity):
-    """How fast another quantity changed in the last step, per second.
+    """The rate of change of another quantity over the last step, per second.
 
     Attributes:
         quantity: A number or array.
@@ -120,7 +119,7 @@ class Rate(Quantity):
     difference: Callable[[Any, Any], Any] = np.subtract
 
     def compute(self, moment: Moment) -> Any:
-        """Return the mean velocity of the step."""
+        """Return the mean rate over the step."""
         return moment.get(Delta(self.quantity, 1, self.difference)) / moment.step_dt
 
 
@@ -130,7 +129,7 @@ class Mean(Quantity):
 
     Attributes:
         quantity: A number or array.
-        steps: Over how many steps, or as many as there were.
+        steps: Number of steps, or all that there were.
     """
 
     quantity: Quantity
@@ -139,3 +138,9 @@ class Mean(Quantity):
     def compute(self, moment: Moment) -> Any:
         """Return the mean."""
         return moment.get(Stacked(self.quantity, self.steps)).mean(axis=0)
+
+
+def _push(stack: Any, value: Any, size: int) -> Vector:
+    """Return the newest values of a stack, with one more."""
+    new = as_array(value)[np.newaxis].copy()
+    return new if stack is None else np.concatenate([stack, new])[-size:]

@@ -1,4 +1,4 @@
-"""What touches what, and with which forces, in the last physics step."""
+"""Quantities of the contacts in the last physics step."""
 
 from __future__ import annotations
 
@@ -8,19 +8,14 @@ import numpy as np
 
 from physx_core.errors import ComponentNotFoundError
 from physx_core.typing import Vector
-from physx_gym.tasks.quantities.bodies import BodyPoses, BodyVelocities
-from physx_gym.tasks.quantities.quantity import Moment, Quantity
+from physx_gym.tasks.quantities.bodies import BodiesQuantity, BodyPoses, BodyVelocities
+from physx_gym.tasks.quantities.dynamics import MassAndMomentum
+from physx_gym.tasks.quantities.quantity import Moment
 
 
 @dataclass(frozen=True)
-class ContactForces(Quantity):
-    """Sum of the contact forces on each of some bodies, shape (bodies, 3), in N, in the world.
-
-    Attributes:
-        bodies: Names in the layout.
-    """
-
-    bodies: tuple[str, ...]
+class ContactForces(BodiesQuantity):
+    """Sum of the contact forces on each of some bodies, shape (bodies, 3), in N, in the world."""
 
     def compute(self, moment: Moment) -> Vector:
         """Return the forces."""
@@ -35,35 +30,22 @@ class ContactForces(Quantity):
 
 
 @dataclass(frozen=True)
-class VerticalForceShares(Quantity):
-    """Which share of the robot's weight each of some bodies carries, shape (bodies,).
+class VerticalForceShares(BodiesQuantity):
+    """Fraction of the robot's weight that each of some bodies carries, shape (bodies,).
 
-    They sum to 1 where a robot stands still on these bodies alone.
-
-    Attributes:
-        bodies: Names in the layout, for example the feet.
+    They sum to 1 if the robot stands still on these bodies alone.
     """
 
-    bodies: tuple[str, ...]
-
     def compute(self, moment: Moment) -> Vector:
-        """Return the shares."""
-        from physx_gym.tasks.quantities.dynamics import MassAndMomentum
-
+        """Return the fractions."""
         mass = float(moment.get(MassAndMomentum())[0])
         weight = mass * float(np.linalg.norm(moment.simulator.world.gravity))
         return np.asarray(moment.get(ContactForces(self.bodies))[:, 2] / weight)
 
 
 @dataclass(frozen=True)
-class Touching(Quantity):
-    """Whether two of some bodies touch each other.
-
-    Attributes:
-        bodies: Names in the layout, for example the feet; those of a static object too.
-    """
-
-    bodies: tuple[str, ...]
+class BodiesInContact(BodiesQuantity):
+    """Whether two of some bodies, including static objects, touch each other."""
 
     def compute(self, moment: Moment) -> bool:
         """Return whether there is a contact between two of them."""
@@ -76,14 +58,8 @@ class Touching(Quantity):
 
 
 @dataclass(frozen=True)
-class HighestContactForce(Quantity):
-    """The largest contact force on any of some bodies, in N.
-
-    Attributes:
-        bodies: Names in the layout.
-    """
-
-    bodies: tuple[str, ...]
+class HighestContactForce(BodiesQuantity):
+    """The largest contact force on any of some bodies, in N."""
 
     def compute(self, moment: Moment) -> float:
         """Return the force."""
@@ -91,16 +67,11 @@ class HighestContactForce(Quantity):
 
 
 @dataclass(frozen=True)
-class SlipVelocity(Quantity):
-    """How fast the fastest contact of some bodies slides along the surface it touches, in m/s.
+class SlipVelocity(BodiesQuantity):
+    """Speed, in m/s, of the fastest contact of some bodies along the surface that it touches.
 
-    Contacts with what never moves count; 0 without any.
-
-    Attributes:
-        bodies: Names in the layout.
+    The touched surfaces count as resting; 0 without contacts.
     """
-
-    bodies: tuple[str, ...]
 
     def compute(self, moment: Moment) -> float:
         """Return the velocity."""

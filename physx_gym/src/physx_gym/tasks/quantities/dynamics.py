@@ -19,7 +19,7 @@ from physx_gym.tasks.quantities.quantity import Moment, Quantity
 
 @dataclass(frozen=True)
 class MassAndMomentum(Quantity):
-    """What the mass matrix of a floating base tells of the whole robot, shape (10,).
+    """Mass and momentum of a robot whose base floats, shape (10,), from its mass matrix.
 
     Mass in kg; center of mass in m, in the world; linear momentum in kg m/s; angular momentum about
     the center of mass in kg m²/s, both along the world's axes.
@@ -31,7 +31,7 @@ class MassAndMomentum(Quantity):
         """Return the numbers.
 
         Raises:
-            FeatureNotSupportedError: The robot's base does not float.
+            FeatureNotSupportedError: If the robot's base does not float.
         """
         if not moment.robot.floating:
             raise FeatureNotSupportedError(
@@ -80,13 +80,13 @@ class Momentum(Quantity):
 
 @dataclass(frozen=True)
 class CapturePoint(Quantity):
-    """Where a robot would have to step to come to rest, on the ground, shape (2,), in m.
+    """Point on the ground where the robot would have to step to come to rest, shape (2,), in m.
 
-    That of the linear inverted pendulum: position of the center of mass plus its velocity by
-    sqrt(gravity / height) (Pratt et al., "Capture Point", 2006).
+    That of the linear inverted pendulum: position of the center of mass plus its velocity divided
+    by sqrt(gravity / height) (Pratt et al., "Capture Point", 2006).
 
     Attributes:
-        feet: Bodies on which it stands: the height is that over the lowest; none: over z = 0.
+        feet: Bodies on which it stands: the height is above the lowest; none: above z = 0.
     """
 
     feet: tuple[str, ...] = ()
@@ -101,17 +101,18 @@ class CapturePoint(Quantity):
 
 @dataclass(frozen=True)
 class ZeroMomentPoint(Quantity):
-    """Where the ground pushes as if at one point, on z = 0, shape (2,), in m.
+    """Point on z = 0 at which the total ground reaction force acts, shape (2,), in m.
 
-    From the change of the momentum in the last step; the center of mass, while nothing carries.
+    From the change of the momentum over the last step; below the center of mass if the ground
+    carries nothing.
     """
 
     def compute(self, moment: Moment) -> Vector:
         """Return the point."""
         found = moment.get(MassAndMomentum())
         mass, center = found[0], found[1:4]
-        force_x, force_y, rise, turn_x, turn_y, _ = moment.get(Rate(Momentum())).tolist()
-        carried = rise + mass * _gravity(moment)
+        force_x, force_y, force_z, turn_x, turn_y, _ = moment.get(Rate(Momentum())).tolist()
+        carried = force_z + mass * _gravity(moment)
         if carried <= 1e-6 * mass * _gravity(moment):
             return np.asarray(center[:2].copy())
         height = float(center[2])
@@ -122,12 +123,12 @@ class ZeroMomentPoint(Quantity):
 
 @dataclass(frozen=True)
 class MechanicalPower(Quantity):
-    """Power that the motors take, in W.
+    """Power consumed by the motors, in W.
 
     Attributes:
-        braking: What braking gives. ``"regained"``: it all comes back; ``"lost"``: each motor's own
-            is lost; ``"shared"``: other motors use it, what they leave is lost; ``"penalized"``: it
-            costs as much as driving.
+        braking: Use of the power of braking. ``"regained"``: all of it is regained; ``"lost"``: all
+            of it is lost; ``"shared"``: other motors use it, the rest is lost; ``"penalized"``:
+            braking costs as much as driving.
     """
 
     braking: Literal["regained", "lost", "shared", "penalized"] = "lost"
@@ -137,8 +138,8 @@ class MechanicalPower(Quantity):
         super().__post_init__()
         if self.braking not in ("regained", "lost", "shared", "penalized"):
             raise ConfigError(
-                f'MechanicalPower.braking is "{self.braking}": "regained", "lost", "shared" or '
-                '"penalized".'
+                f'MechanicalPower.braking is "{self.braking}" but must be "regained", "lost", '
+                '"shared" or "penalized".'
             )
 
     def compute(self, moment: Moment) -> float:

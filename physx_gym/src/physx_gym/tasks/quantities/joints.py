@@ -1,4 +1,4 @@
-"""Joints of the robot that acts."""
+"""Quantities of the joints of the controlled robot."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class JointTorques(Quantity):
         """Return the torques in N m or N.
 
         Raises:
-            FeatureNotSupportedError: This is the moment of a trajectory.
+            FeatureNotSupportedError: If the moment is on a trajectory.
         """
         if not moment.is_present:
             raise FeatureNotSupportedError("A trajectory", "torques", ())
@@ -61,7 +61,7 @@ class JointTorques(Quantity):
 
 @dataclass(frozen=True)
 class LimitDistances(Quantity):
-    """How far the motors' joints are from the nearer of their limits, shape (motors,).
+    """Distances of the motors' joints to the nearer of their limits, shape (motors,).
 
     In rad or m; negative beyond a limit; infinite without limits.
     """

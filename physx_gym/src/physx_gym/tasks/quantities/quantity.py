@@ -1,4 +1,4 @@
-"""What a quantity is, and the quantities of an environment."""
+"""Quantities, the moments that they are computed for, and the quantities of an environment."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from physx_gym.tasks.trajectory import Trajectory
 class Quantity(ABC):
     """A value of the present moment that rewards, terminations and observers share.
 
-    Subclasses are frozen dataclasses whose options can be hashed: equal quantities are one, and are
-    computed at most once for each state of the simulation. What another quantity says is asked for
-    with `Moment.get`.
+    Subclasses are frozen dataclasses whose options are hashable: equal quantities are computed at
+    most once for each state of the simulation. The values of other quantities are obtained with
+    `Moment.get`.
     """
 
     def __post_init__(self) -> None:
-        """Take lists as tuples, and check that what it is made of are quantities.
+        """Convert lists to tuples, and check that its parts are quantities.
 
         Raises:
-            ConfigError: They are not, or a text is given for a list.
+            ConfigError: If they are not, or a string is given instead of a list.
         """
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
             value, where = getattr(self, field.name), f"{type(self).__name__}.{field.name}"
@@ -38,7 +38,7 @@ class Quantity(ABC):
                 value = tuple(value)
                 object.__setattr__(self, field.name, value)
             if isinstance(value, str) and str(field.type).startswith("tuple"):
-                raise ConfigError(f'{where} is the text "{value}" but must be a list.')
+                raise ConfigError(f'{where} is the string "{value}" but must be a list.')
             if field.name in ("quantity", "quantities"):
                 for each in value if isinstance(value, tuple) else (value,):
                     check_quantity(where, each)
@@ -53,9 +53,9 @@ class Quantity(ABC):
 
 
 class Remembering(Quantity):
-    """A quantity of the present and of the steps before; it counts in steps of the environment.
+    """A quantity of the present and of previous steps of the environment.
 
-    Its value changes once a step, whether anybody asks for it or not.
+    Its value is updated once a step, whether it is used or not.
     """
 
     @abstractmethod
@@ -63,7 +63,7 @@ class Remembering(Quantity):
         """Return the value after this step, and what to remember for the next.
 
         Args:
-            memory: What was remembered in the step before; None: there is none, this is the begin.
+            memory: What was remembered in the step before; None: this is the start of an episode.
             moment: The state after this step.
         """
 
@@ -74,10 +74,10 @@ class Remembering(Quantity):
 
 @dataclass(frozen=True)
 class Reference(Quantity):
-    """Another quantity where the reference trajectory is at this time.
+    """Another quantity, at the state of the reference trajectory at this time.
 
     Attributes:
-        quantity: One of positions and velocities.
+        quantity: A quantity that depends on positions and velocities only.
     """
 
     quantity: Quantity
@@ -91,15 +91,15 @@ class Moment:
     """A state that quantities are computed for: the present one, or that of a trajectory.
 
     Attributes:
-        simulator: What runs.
+        simulator: The simulator.
         t: Time of the episode, in s.
-        q: Positions of the robot that acts, shape (nq,).
+        q: Positions of the controlled robot, shape (nq,).
         v: Its velocities, shape (nv,).
         is_present: Whether it is the simulation's state, so that contacts and torques are known.
     """
 
     def __init__(self, owner: Quantities, t: float, state: tuple[Vector, Vector] | None) -> None:
-        """Keep what the state is.
+        """Keep the state.
 
         Args:
             owner: The quantities of the environment.
@@ -130,7 +130,7 @@ class Moment:
         return self._owner.step_dt
 
     def get(self, quantity: Quantity) -> Any:
-        """Return the value of a quantity; to be read, not to be written to."""
+        """Return the value of a quantity, which must not be modified."""
         try:
             return self._values[quantity]
         except KeyError:
@@ -142,10 +142,11 @@ class Moment:
         return self._owner.moment_of_reference(self.t)
 
     def remembered(self, quantity: Remembering) -> Any:
-        """Return the value that a quantity with a memory had after the last step."""
+        """Return the value that a quantity with memory had after the last step."""
         if not self.is_present:
             raise ConfigError(
-                f"{quantity} looks back, which Reference cannot: give Reference to what it is of."
+                f"{quantity} depends on previous steps, which Reference cannot provide: apply "
+                "Reference to the quantity in it."
             )
         return self._owner.remembered(quantity)
 
@@ -164,7 +165,7 @@ class Moment:
         return self.simulation.body_velocities(names, *self._state())
 
     def mass_matrix(self) -> Vector:
-        """Return the mass matrix of the robot that acts, shape (nv, nv)."""
+        """Return the mass matrix of the controlled robot, shape (nv, nv)."""
         own = self.robot.velocities
         whole = self.simulation.positions() if self.is_present else self._state()[0]
         return self.simulation.mass_matrix(whole)[own, own]
@@ -173,14 +174,14 @@ class Moment:
         """Return the contacts of the last physics step.
 
         Raises:
-            FeatureNotSupportedError: This is the moment of a trajectory, which has none.
+            FeatureNotSupportedError: If the moment is on a trajectory.
         """
         if not self.is_present:
             raise FeatureNotSupportedError("A trajectory", "contacts", ())
         return self.simulation.contacts()
 
     def _state(self) -> tuple[Vector, Vector]:
-        """Return positions and velocities of the whole world, with the robot's in their place."""
+        """Return positions and velocities of the whole world, including those of the robot."""
         if self._whole is None:
             positions, velocities = self.simulation.positions(), self.simulation.velocities()
             positions[self.robot.positions] = self.q
@@ -190,10 +191,10 @@ class Moment:
 
 
 class Quantities(Mapping[str, Any]):
-    """The quantities of an environment, as `RobotEnv.quantities`.
+    """The quantities of an environment; see `RobotEnv.quantities`.
 
-    By name, those that were added: ``env.quantities["height"]`` is the value, computed when it is
-    asked for. Without a name: ``env.quantities.get_value(BaseHeight())``.
+    As a mapping it contains the named ones: ``env.quantities["height"]`` is the present value.
+    Without a name: ``env.quantities.get_value(BaseHeight())``.
     """
 
     def __init__(self, simulator: Simulator, step_dt: float) -> None:
@@ -219,20 +220,19 @@ class Quantities(Mapping[str, Any]):
         """Name a quantity.
 
         Raises:
-            ConfigError: Another one has the name, or it is no quantity.
+            ConfigError: If the name is taken, or the quantity is not a `Quantity`.
         """
-        if not isinstance(quantity, Quantity):
-            raise ConfigError(f'The quantity "{name}" is {quantity!r}, which is no Quantity.')
+        check_quantity(f'The quantity "{name}"', quantity)
         if self._named.get(name, quantity) != quantity:
-            raise ConfigError(f'There is another quantity "{name}": {self._named[name]}.')
+            raise ConfigError(f'There already is a quantity "{name}": {self._named[name]}.')
         self._named[name] = quantity
         self.watch(quantity)
 
     def remove(self, name: str) -> None:
-        """Forget a name.
+        """Remove a name.
 
         Raises:
-            ComponentNotFoundError: There is no quantity of that name.
+            ComponentNotFoundError: If there is no quantity of that name.
         """
         self._quantity(name)
         del self._named[name]
@@ -250,7 +250,7 @@ class Quantities(Mapping[str, Any]):
         return iter(self._named)
 
     def __len__(self) -> int:
-        """Return how many have names."""
+        """Return the number of names."""
         return len(self._named)
 
     def _quantity(self, name: str) -> Quantity:
@@ -265,7 +265,7 @@ class Quantities(Mapping[str, Any]):
         return self.moment().get(quantity)
 
     def moment(self) -> Moment:
-        """Return the present moment; it stays the same until the simulation goes on."""
+        """Return the present moment; it stays the same until the simulation continues."""
         state = self.simulator.stepper_state
         if self._present is None or self._frame != state.iter:
             self._frame = state.iter
@@ -276,11 +276,11 @@ class Quantities(Mapping[str, Any]):
         """Return the moment of the reference trajectory.
 
         Raises:
-            ConfigError: There is none.
+            ConfigError: If there is no trajectory.
         """
         if self.trajectory is None:
             raise ConfigError(
-                "A quantity asks for the reference, but there is no trajectory: give "
+                "A quantity needs the reference, but there is no trajectory: pass "
                 "ComposedEnv(..., trajectory=...)."
             )
         if self._on_reference is None or self._on_reference.t != t:
@@ -288,11 +288,11 @@ class Quantities(Mapping[str, Any]):
         return self._on_reference
 
     def watch(self, quantity: Quantity) -> None:
-        """Compute a quantity at the begin of each episode, so that its memories begin there."""
+        """Compute a quantity at the start of each episode, so that its memories start there."""
         self._watched.setdefault(quantity)
 
     def remembered(self, quantity: Remembering) -> Any:
-        """Return the value of a quantity with a memory as of the last step."""
+        """Return the value of a quantity with memory as of the last step."""
         if quantity not in self._memories:
             self._memories[quantity] = quantity.advance(None, self.moment())
         return self._memories[quantity][0]
@@ -300,15 +300,15 @@ class Quantities(Mapping[str, Any]):
     # Episodes -------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Forget all values and memories: an episode begins."""
+        """Discard all values and memories at the start of an episode."""
         self._present = self._on_reference = None
         self._frame = -1
         self._memories, self._begins = {}, True
 
     def clear(self) -> None:
-        """Forget the values, and let memories take up the step that was made.
+        """Discard the values, and update the memories after a step.
 
-        The first time after `reset` they begin, with the state that the episode begins with.
+        The first time after `reset` the memories start, with the first state of the episode.
         """
         self._present = self._on_reference = None
         if self._begins:
@@ -317,7 +317,7 @@ class Quantities(Mapping[str, Any]):
                 self.get_value(watched)
         elif self._memories:
             moment = self.moment()
-            # In the order in which they were met: what one is made of comes before it.
+            # In the order of their creation: the parts of a quantity come before it.
             for quantity, (_, memory) in [*self._memories.items()]:
                 self._memories[quantity] = quantity.advance(memory, moment)
 
@@ -326,7 +326,7 @@ class Quantities(Mapping[str, Any]):
         return [(quantity, copy_tree(kept)) for quantity, kept in self._memories.items()]
 
     def restore(self, state: Any) -> None:
-        """Take up what `snapshot` returned."""
+        """Restore what `snapshot` returned."""
         self.reset()
         self._begins = False
         self._memories = {quantity: copy_tree(kept) for quantity, kept in state}
@@ -336,12 +336,12 @@ def check_quantity(where: str, value: Any) -> Quantity:
     """Return a value that is a quantity.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: If it is not.
     """
     if not isinstance(value, Quantity):
-        made = isinstance(value, type) and issubclass(value, Quantity)
-        hint = f": make one, as in {value.__name__}(...)" if made else ""
-        raise ConfigError(f"{where} is {value!r}, which is no Quantity{hint}.")
+        is_class = isinstance(value, type) and issubclass(value, Quantity)
+        hint = f": create one, as in {value.__name__}(...)" if is_class else ""
+        raise ConfigError(f"{where} is {value!r}, which is not a Quantity{hint}.")
     return value
 
 

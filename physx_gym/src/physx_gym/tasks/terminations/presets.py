@@ -11,6 +11,7 @@ import numpy as np
 from physx_core.typing import Vector
 from physx_gym.tasks.quantities import (
     BaseHeight,
+    BodiesInContact,
     HighestContactForce,
     JointVelocities,
     LimitDistances,
@@ -20,7 +21,6 @@ from physx_gym.tasks.quantities import (
     Quantity,
     RollPitch,
     SlipVelocity,
-    Touching,
 )
 from physx_gym.tasks.terminations.termination import OutOfBounds
 
@@ -48,7 +48,7 @@ def lost_ground(
 
 def collision(bodies: Sequence[str], name: str = "collision", **options: Any) -> OutOfBounds:
     """End the episode when two of the bodies touch each other."""
-    return OutOfBounds(Touching(tuple(bodies)), None, 0.5, name, **options)
+    return OutOfBounds(BodiesInContact(tuple(bodies)), None, 0.5, name, **options)
 
 
 def high_contact_force(
