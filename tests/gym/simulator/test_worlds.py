@@ -255,7 +255,7 @@ def test_methods_that_return_something_else_are_named(method, returned, message)
         (lambda env: OutOfBounds(JointPositions(), 0, grace=1), 'Did you mean "grace_period"'),
         (lambda env: Sum([Survival()], weights=[1, 2]), "1 rewards and 2 weights"),
         (lambda env: ComposedEnv(env, trajectory=3), "trajectory is 3"),
-        (lambda env: PDController("pd", 3, kp=1, kd=1), "is for a RobotEnv"),
+        (lambda env: PDController("pd", 3, kp=1, kd=1), "needs a RobotEnv"),
     ],
 )
 def test_wrong_parts_are_named(make, message):
