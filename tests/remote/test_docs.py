@@ -20,7 +20,7 @@ from physx_remote import serve
 from physx_remote.godot_gym.communication import Communication
 from physx_remote.godot_rl.protocol import GodotRL
 from physx_remote.physx.protocol import Physx
-from physx_remote.serving.client_link import Link
+from physx_remote.serving.client_link import RequestLink
 from physx_remote.serving.protocol import find_protocol
 
 PAGE = Path(__file__).parents[2] / "docs" / "remote.md"
@@ -148,7 +148,12 @@ def test_a_real_godot_application(tmp_path):
 
 def test_the_table_of_options_is_complete():
     told = dict(re.findall(r"`?(\w+)=([^,`]*)`", TEXT.split("## Options")[1]))
-    kinds = {"godot-gym": Communication, "godot-rl": GodotRL, "physx": Physx, "clients": Link}
+    kinds = {
+        "godot-gym": Communication,
+        "godot-rl": GodotRL,
+        "physx": Physx,
+        "clients": RequestLink,
+    }
     for kind in kinds.values():
         for name, default in kind.__init__.__kwdefaults__.items():
             assert name in told, name

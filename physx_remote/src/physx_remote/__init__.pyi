@@ -19,7 +19,7 @@ from .physx.client import PhysxClient as PhysxClient
 from .physx.client import PhysxEnv as PhysxEnv
 from .physx.observer import PhysxObserver as PhysxObserver
 from .physx.vector_env import PhysxVectorEnv as PhysxVectorEnv
-from .serving.connection import Connection as Connection
+from .serving.connection import RequestConnection as RequestConnection
 from .serving.protocol import Protocol as Protocol
 from .serving.sample_env import SampleEnv as SampleEnv
 from .serving.service import Service as Service

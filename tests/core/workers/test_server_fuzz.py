@@ -151,9 +151,9 @@ class Attacked:
         self.longest = max(self.longest, time.monotonic() - began)
         for number, peer in list(self.server.peers.items()):
             if number in self.honest:
-                assert peer.finished or not peer.gone, peer.offense
+                assert peer.finished or not peer.closed, peer.offense
             self.take_rows(number, peer)
-            if peer.gone or peer.failure or peer.finished:
+            if peer.closed or peer.failure or peer.finished:
                 self.lose(number, peer)
             elif peer.fields and peer.granted - peer.received < 5:
                 peer.granted = peer.received + 20

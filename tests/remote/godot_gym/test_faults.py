@@ -226,10 +226,10 @@ def test_a_client_that_does_not_read_keeps_nobody_else_waiting(start, scene, pee
     deaf, other = (peer_class(service.address, service) for _ in range(2))
     scene.agent.get_data = lambda request, storage: setattr(storage, "frame", bytes(1 << 20))
     deaf.send(message({"observation": SEE}) * 40)
-    while not any(connection.unsent for connection in scene.communication.connections):
+    while not any(connection.outgoing for connection in scene.communication.connections):
         service.poll(0.05)
     assert other.ask(LIVES) == ALIVE
-    assert sum(connection.unsent for connection in scene.communication.connections) < 2 << 20
+    assert sum(len(connection.outgoing) for connection in scene.communication.connections) < 2 << 20
     for _ in range(40):
         assert len(deaf.answer()) > 1 << 20
     deaf.leave()

@@ -155,7 +155,7 @@ def test_silent_strangers_are_closed(serving, env):
         half.sendall(HELLO)
         slow.sendall(HELLO[:5])
         assert all(_is_closed(stranger) for stranger in (silent, half, slow))
-    service._timeout = PATIENCE  # the next one may be slow, but is no stranger
+    service._strangers.patience = PATIENCE  # the next one may be slow, but is no stranger
     assert lives(service)
 
 

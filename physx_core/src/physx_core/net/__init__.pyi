@@ -4,6 +4,8 @@ from .addresses import check_address as check_address
 from .addresses import format_address as format_address
 from .addresses import parse_address as parse_address
 from .addresses import retry as retry
+from .connection import Connection as Connection
+from .connection import Reader as Reader
 from .flat import flat_prefix as flat_prefix
 from .frames import HEADER as HEADER
 from .frames import MAX_PAYLOAD as MAX_PAYLOAD
@@ -16,8 +18,11 @@ from .handshake import HANDSHAKE_LIMIT as HANDSHAKE_LIMIT
 from .handshake import TOKEN_VARIABLE as TOKEN_VARIABLE
 from .handshake import ServerHandshake as ServerHandshake
 from .handshake import introduce as introduce
+from .listener import Listener as Listener
 from .remote_errors import decode_error as decode_error
 from .remote_errors import encode_error as encode_error
+from .spin_wait import yield_core as yield_core
+from .strangers import Strangers as Strangers
 from .tokens import checked_token as checked_token
 from .tokens import given_token as given_token
 from .values import decode as decode

@@ -8,6 +8,7 @@ import struct
 from typing import NamedTuple
 
 from physx_core.errors import ConnectionRefusedByPeerError, UsageError
+from physx_core.net.connection import Reader
 
 HEADER = struct.Struct("<IHHQ")
 """Length of the payload in bytes, kind, spare (0), number."""
@@ -116,7 +117,7 @@ def header(kind: Kind, length: int, number: int = 0) -> bytes:
     return HEADER.pack(length, kind, 0, number)
 
 
-class FrameReader:
+class FrameReader(Reader):
     """Reads frames from a socket, blocking or not.
 
     Frames come several to a system call through a buffer; what a long one still lacks then goes
@@ -171,35 +172,67 @@ class FrameReader:
         return self._socket_may_have_more or self.has_buffered
 
     def read(self, connection: socket.socket) -> Frame | None:
-        """Return the next frame, or None where a socket that does not block has no more for now.
+        """Return the next frame, or None if a non-blocking socket has no whole one yet.
 
         Raises:
-            EOFError: The peer is gone.
-            ConnectionRefusedByPeerError: The peer sent what is no frame, or too long a one.
+            EOFError: If the peer is gone.
+            ConnectionRefusedByPeerError: If the peer sent something that is not a frame, or one
+                that is too long.
         """
         while True:
-            if self._large is not None:
-                if not self._large.missing:
-                    frame, self._large = self._large.frame, None
-                    return frame
-            elif self._start < self._end:
-                buffered = self._buffered()
-                if buffered is not None:
-                    return buffered
-            target = self._room()
+            frame = self.take()
+            if frame is not None:
+                return frame
             try:
-                count = connection.recv_into(target)
+                count = self.receive(connection)
             except BlockingIOError:
                 return None
             except OSError as error:
                 raise EOFError(str(error)) from error
             if not count:
                 raise EOFError("end of stream")
-            self._socket_may_have_more = count == len(target)
-            if self._large is None:
-                self._end += count
-            else:
-                self._large.filled(target, count)
+
+    def take(self) -> Frame | None:
+        """Return the next whole frame that was received, or None until more has arrived.
+
+        Raises:
+            ConnectionRefusedByPeerError: If the peer sent something that is not a frame, or one
+                that is too long.
+        """
+        if self._large is not None:
+            if self._large.missing:
+                return None
+            frame, self._large = self._large.frame, None
+            return frame
+        return self._buffered() if self._start < self._end else None
+
+    def receive(self, connection: socket.socket) -> int:
+        """Take what has arrived and return how many bytes it is, 0 at the end of the stream.
+
+        Raises:
+            BlockingIOError: If nothing has arrived.
+            OSError: If the connection is broken.
+        """
+        target = self._room()
+        count = connection.recv_into(target)
+        self._socket_may_have_more = count == len(target)
+        if self._large is None:
+            self._end += count
+        else:
+            self._large.filled(target, count)
+        return count
+
+    @property
+    def waiting(self) -> int:
+        """How many bytes have arrived and were not taken."""
+        return self._end - self._start + self.arrived
+
+    @property
+    def has_room(self) -> bool:
+        """Whether more may be received before a frame is taken."""
+        if self._large is not None:
+            return self._large.missing > 0
+        return self._end - self._start < len(self._bytes)
 
     def _buffered(self) -> Frame | None:
         """Return the frame at the begin of the buffer if it is whole; make room for a long one."""

@@ -11,6 +11,7 @@ import hmac
 import secrets
 import socket
 import struct
+import time
 
 from physx_core.errors import ConnectionRefusedByPeerError, UnansweredError
 from physx_core.net.frames import MAX_PAYLOAD, Frame, FrameReader, Kind, pack
@@ -39,6 +40,7 @@ class ServerHandshake:
 
     Attributes:
         instance_id: Instance that the client wants to run, 0 for any; None until it is trusted.
+        since: When the server began to wait for the client, in monotonic s.
     """
 
     def __init__(self, token: str) -> None:
@@ -48,6 +50,7 @@ class ServerHandshake:
             token: What the client must know.
         """
         self.instance_id: int | None = None
+        self.since = time.monotonic()
         self._token = token
         self._own = secrets.token_bytes(32)
         self._other: bytes | None = None
@@ -60,6 +63,7 @@ class ServerHandshake:
         """
         if frame.kind is Kind.HELLO and self._other is None:
             magic, version, self._other = _opening(frame.payload)
+            self.since = time.monotonic()
             if magic != _MAGIC:
                 raise ConnectionRefusedByPeerError("A stranger connected that is no physx client.")
             opening = _OPENING.pack(_MAGIC, VERSION, self._own)

@@ -1,4 +1,4 @@
-"""Waiting awake: a processor core that sleeps takes longer to wake than an answer takes to come."""
+"""Busy-wait briefly for a reply, because waking a sleeping processor core takes longer."""
 
 from __future__ import annotations
 
@@ -8,25 +8,27 @@ from collections.abc import Callable
 from typing import TypeVar
 
 Found = TypeVar("Found")
-_let_others: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
+
+yield_core: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
+"""Let another process that waits for this processor core run."""
 
 
 def has_core_for_each(clients: int) -> bool:
-    """Return whether waiting awake takes no core from a client that could compute."""
+    """Return whether spinning takes no core from a client that could compute."""
     if hasattr(os, "sched_getaffinity"):
         return clients <= len(os.sched_getaffinity(0))
     return clients <= (os.cpu_count() or 1)
 
 
-def awaited(look: Callable[[], Found], seconds: float) -> Found:
-    """Return what there is; look for it again and again as long as there is nothing.
+def spin_until(look: Callable[[], Found], seconds: float) -> Found:
+    """Call a function again and again until it finds something, and return its last result.
 
     Args:
-        look: Returns at once what is there; what is false is nothing.
-        seconds: How long to look. Other processes may use the core meanwhile.
+        look: Returns at once; a false result means that nothing was found.
+        seconds: How long to go on. Other processes may use the core meanwhile.
     """
     found, until = look(), time.monotonic() + seconds
     while not found and time.monotonic() < until:
-        _let_others()
+        yield_core()
         found = look()
     return found

@@ -14,7 +14,7 @@ from physx_core import Closeable, Field
 from physx_core.errors import ConfigError, RemoteError, RemoteProtocolError, RequestError
 from physx_remote.godot_gym.messages import DESCRIPTION, Messages, read_extension
 from physx_remote.godot_gym.wire import OUTCOME, observation_fields
-from physx_remote.serving.client_link import Link
+from physx_remote.serving.client_link import RequestLink
 from physx_remote.serving.connect_options import ConnectOptions
 from physx_remote.serving.spaces import Space, SpaceTree, build_space, to_json
 
@@ -48,7 +48,7 @@ class GodotGymClient(Closeable):
             RemoteError: If nothing answers at the address.
         """
         self.messages = None if messages is None else Messages(messages)
-        self._link = Link(address, **options)
+        self._link = RequestLink(address, **options)
 
     def request(self, request: Mapping[str, Any]) -> Parts:
         """Send a request and return its answer.

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any, Literal, get_args
 
 from physx_core.errors import ConfigError, RequestError, UsageError
-from physx_core.net import check_address
+from physx_core.net import Reader, check_address
 from physx_remote.godot_gym.frames_timer import Signal
 from physx_remote.godot_gym.messages import ERROR, encode_extension
 from physx_remote.godot_gym.requests import JsonReader, parse_request
-from physx_remote.serving.connection import Connection
-from physx_remote.serving.framing import MAX_REQUEST, FrameReader, Reader, framed
+from physx_remote.serving.connection import RequestConnection
+from physx_remote.serving.framing import MAX_REQUEST, PrefixReader, add_prefix
 from physx_remote.serving.service import LOG
 from physx_remote.serving.socket_service import SocketService, Work
 
@@ -82,8 +82,8 @@ class Communication(SocketService):
         self.got_connection = Signal()
         self._clients, self._reply, self._errors = clients, reply, errors
         self._framing, self._max_request, self._patience = request_framing, max_request, patience
-        self._served: Connection | None = None
-        self._asking: Connection | None = None
+        self._served: RequestConnection | None = None
+        self._asking: RequestConnection | None = None
         self._answered = False
 
     @property
@@ -101,11 +101,6 @@ class Communication(SocketService):
         if asking is None or not asking.ended:
             return asking is not None and asking.closed
         return any(other.body is not None for other in self.connections if other is not asking)
-
-    @property
-    def is_listening(self) -> bool:
-        """Whether `start_server` was called."""
-        return self._listener is not None
 
     def start_server(self, port: int, address: str = "127.0.0.1") -> None:
         """Begin to listen.
@@ -153,16 +148,16 @@ class Communication(SocketService):
                 return
             message = b""
         body = message if isinstance(message, bytes) else message.SerializeToString()
-        self.send(self._asking, framed(body))
+        self.send(self._asking, add_prefix(body))
 
     # What the loop calls --------------------------------------------------------------------
 
     def new_reader(self) -> Reader:
         """Return what cuts requests out of a stream."""
-        kind = JsonReader if self._framing == "bare-json" else FrameReader
+        kind = JsonReader if self._framing == "bare-json" else PrefixReader
         return kind(self._max_request)
 
-    def opened(self, connection: Connection) -> None:
+    def opened(self, connection: RequestConnection) -> None:
         """Turn a client away, or tell the log that it waits."""
         if self._served is None or self._clients == "serve":
             LOG.info("%s connected", connection.name)
@@ -171,17 +166,17 @@ class Communication(SocketService):
         else:
             LOG.info("%s waits until %s leaves", connection.name, self._served.name)
 
-    def closed(self, connection: Connection) -> None:
+    def closed(self, connection: RequestConnection) -> None:
         """Make room for the next client."""
         if connection is self._served:
             LOG.info("%s left", connection.name)
             self._served = None
 
-    def admits(self, connection: Connection) -> bool:
+    def admits(self, connection: RequestConnection) -> bool:
         """Return whether it is this client's turn."""
         return self._clients == "serve" or self._served in (None, connection)
 
-    def received(self, connection: Connection, body: bytes) -> Work:
+    def received(self, connection: RequestConnection, body: bytes) -> Work:
         """Carry out one request."""
         if self._served is None:
             self._serve_only(connection)
@@ -198,7 +193,7 @@ class Communication(SocketService):
         finally:
             self._asking = None
 
-    def _serve_only(self, connection: Connection) -> None:
+    def _serve_only(self, connection: RequestConnection) -> None:
         if self._clients == "serve":
             return
         self._served = connection
@@ -207,7 +202,7 @@ class Communication(SocketService):
                 if other is not connection:
                     self.drop(other, f"turned away while {connection.name} is served")
 
-    def _report(self, connection: Connection, error: Exception) -> None:
+    def _report(self, connection: RequestConnection, error: Exception) -> None:
         """Say what went wrong, here and to the client."""
         expected = isinstance(error, RequestError)
         text = str(error) if expected else f"{type(error).__name__}: {error}"

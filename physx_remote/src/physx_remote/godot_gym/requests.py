@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from physx_core.errors import RemoteProtocolError, RequestError
-from physx_remote.serving.framing import Reader
+from physx_remote.serving.framing import BufferReader
 
 _DECODER = json.JSONDecoder()
 _BLANKS = " \t\r\n"
@@ -92,7 +92,7 @@ def _is_number(value: Any) -> bool:
     return is_number and math.isfinite(value)
 
 
-class JsonReader(Reader):
+class JsonReader(BufferReader):
     """Cuts objects of JSON that follow each other without anything that tells their lengths."""
 
     def __init__(self, limit: int) -> None:

@@ -22,16 +22,16 @@ from physx_remote.godot_rl.json_spaces import (
     observation_space_of,
     read_observation,
 )
-from physx_remote.serving.client_link import Link
+from physx_remote.serving.client_link import RequestLink
 from physx_remote.serving.connect_options import ConnectOptions
-from physx_remote.serving.framing import framed
+from physx_remote.serving.framing import add_prefix
 from physx_remote.serving.spaces import Space
 
 VERSION = {"major_version": "0", "minor_version": "7"}
 """Version of the protocol in the handshake."""
 
 
-class _Incoming(Link):
+class _Incoming(RequestLink):
     """The connection of an application that connects to an address."""
 
     def _connected(self, address: tuple[str, int], patience: float) -> socket.socket:
@@ -54,7 +54,7 @@ class _Incoming(Link):
 
     def tell(self, body: bytes) -> None:
         """Send a message that has no answer."""
-        self._socket.sendall(framed(body))
+        self._socket.sendall(add_prefix(body))
 
 
 class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):

@@ -23,8 +23,8 @@ from physx_core.errors import (
 from physx_remote.godot_rl.agents import Agents, Answer
 from physx_remote.godot_rl.client import GodotRLEnv, GodotRLVectorEnv
 from physx_remote.serving.connect_options import ConnectOptions, check_names
-from physx_remote.serving.connection import Connection
-from physx_remote.serving.framing import MAX_REQUEST, FrameReader, framed
+from physx_remote.serving.connection import RequestConnection
+from physx_remote.serving.framing import MAX_REQUEST, PrefixReader, add_prefix
 from physx_remote.serving.protocol import Protocol, Scene
 from physx_remote.serving.service import LOG, Service
 from physx_remote.serving.socket_service import SocketService, Work
@@ -168,9 +168,9 @@ class _GodotRLService(SocketService):
         self.adopt(trainer)
         self.address = trainer.getpeername()[:2]
 
-    def new_reader(self) -> FrameReader:
+    def new_reader(self) -> PrefixReader:
         """Return a reader with this protocol's limit."""
-        return FrameReader(self._max_request)
+        return PrefixReader(self._max_request)
 
     def poll(self, timeout: float | None = 0.0) -> bool:
         """Handle what has arrived; see `Service.poll`."""
@@ -185,12 +185,12 @@ class _GodotRLService(SocketService):
         if self._released:
             self._worlds.close()
 
-    def closed(self, connection: Connection) -> None:
+    def closed(self, connection: RequestConnection) -> None:
         """End with the trainer."""
         LOG.info("The trainer at %s is gone", connection.name)
         self.close()
 
-    def received(self, connection: Connection, body: bytes) -> Work | None:
+    def received(self, connection: RequestConnection, body: bytes) -> Work | None:
         """Answer one message."""
         try:
             message = _message(body)
@@ -211,7 +211,7 @@ class _GodotRLService(SocketService):
             return None
         return self._worked(connection, request(message))
 
-    def _worked(self, connection: Connection, answer: Answer) -> Work:
+    def _worked(self, connection: RequestConnection, answer: Answer) -> Work:
         """Send the answer to a request once it is there, or what went wrong."""
         try:
             told = yield from answer
@@ -220,7 +220,7 @@ class _GodotRLService(SocketService):
         else:
             self._send(connection, told)
 
-    def _refuse(self, connection: Connection, error: Exception) -> None:
+    def _refuse(self, connection: RequestConnection, error: Exception) -> None:
         """Say what went wrong, here and to the trainer, which knows no such answer and ends."""
         text = "; ".join([str(error), *getattr(error, "__notes__", [])])
         is_foreign = not isinstance(error, (RemoteError, ActionError))
@@ -228,8 +228,8 @@ class _GodotRLService(SocketService):
         name = type(error).__name__
         self._send(connection, {"type": "error", "error": name, "message": text})
 
-    def _send(self, connection: Connection, answer: dict[str, Any]) -> None:
-        self.send(connection, framed(_JSON.encode(answer).encode("utf-8")))
+    def _send(self, connection: RequestConnection, answer: dict[str, Any]) -> None:
+        self.send(connection, add_prefix(_JSON.encode(answer).encode("utf-8")))
 
 
 def _message(body: bytes) -> dict[str, Any]:

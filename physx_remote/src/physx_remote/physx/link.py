@@ -28,13 +28,13 @@ from physx_core.net import (
     introduce,
 )
 from physx_remote.physx.wire import OBSERVE, SERVICE, VERSION
-from physx_remote.serving.client_connection import Connection
+from physx_remote.serving.client_connection import ClientConnection
 from physx_remote.serving.framing import MAX_ANSWER
 
 _BACKLOG = 1 << 16
 
 
-class PhysxLink(Connection):
+class PhysxLink(ClientConnection):
     """A connection to a service of the protocol physx.
 
     After any failure it is closed, so that a late answer is not taken for that of another request.
@@ -82,9 +82,7 @@ class PhysxLink(Connection):
                 "give token_file=, the file that holds it, or token=."
             )
         until = time.monotonic() + connect_timeout
-        self._socket = self._reached(
-            lambda left: _open_socket(address, role, left), connect_timeout
-        )
+        self._socket = self._reach(lambda left: _open_socket(address, role, left), connect_timeout)
         try:
             self._reader = self._handshake(found, role, max(until - time.monotonic(), 1.0))
             self._reader.limit = max_answer

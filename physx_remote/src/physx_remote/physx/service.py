@@ -11,10 +11,12 @@ import numpy as np
 from physx_core import PhysxError
 from physx_core.errors import ConnectionRefusedByPeerError, RemoteError, RequestError
 from physx_core.net import (
-    HEADER,
+    HANDSHAKE_LIMIT,
     Frame,
+    FrameReader,
     Kind,
-    ServerHandshake,
+    Reader,
+    Strangers,
     decode,
     encode_error,
     flat_prefix,
@@ -31,12 +33,10 @@ from physx_remote.physx.wire import (
     SERVICE,
     VERSION,
     WORLDS,
-    PhysxReader,
     encode_infos,
 )
 from physx_remote.physx.world_requests import Change, WorldRequests, wrap_error
-from physx_remote.serving.connection import Connection
-from physx_remote.serving.framing import Reader
+from physx_remote.serving.connection import RequestConnection
 from physx_remote.serving.service import LOG
 from physx_remote.serving.socket_service import SocketService, Work
 from physx_remote.serving.spaces import describe_space
@@ -74,12 +74,14 @@ class PhysxService(SocketService):
         self._worlds = worlds
         self._requests = WorldRequests(worlds, max_snapshots)
         self._introduction = self._introduced()
-        self._timeout, self._max_request = handshake_timeout, max_request
-        self._strangers: dict[Connection, ServerHandshake] = {}
-        self._actor: Connection | None = None
-        self._observers: dict[Connection, bool] = {}  # whether something was not sent
+        self._max_request = max_request
+        self._open()
+        self._strangers: Strangers[RequestConnection] = Strangers(
+            token, handshake_timeout, max_clients, self.drop, self._listener.timers
+        )
+        self._actor: RequestConnection | None = None
+        self._observers: dict[RequestConnection, bool] = {}  # whether something was not sent
         self._seen = 0
-        self._is_watching = False
 
     def _release(self) -> None:
         """Close the worlds too, once no request is being carried out."""
@@ -107,42 +109,38 @@ class PhysxService(SocketService):
 
     def new_reader(self) -> Reader:
         """Return what cuts frames out of a stream."""
-        return PhysxReader()
+        return FrameReader(HANDSHAKE_LIMIT)
 
-    def opened(self, connection: Connection) -> None:
+    def opened(self, connection: RequestConnection) -> None:
         """Give a stranger some time to prove that it knows the token."""
-        self._strangers[connection] = ServerHandshake(self.token)
-        if not self._is_watching:
-            self._is_watching = True
-            self.after(self._timeout, self._look_for_silence)
+        self._strangers.add(connection)
 
-    def closed(self, connection: Connection) -> None:
+    def closed(self, connection: RequestConnection) -> None:
         """Forget a client; the worlds stay as they are."""
-        self._strangers.pop(connection, None)
+        self._strangers.forget(connection)
         self._observers.pop(connection, None)
         if connection is self._actor:
             LOG.info("%s acts no longer", connection.name)
             self._actor = None
             self._requests.forget_snapshots()
 
-    def drained(self, connection: Connection) -> None:
+    def drained(self, connection: RequestConnection) -> None:
         """Bring an observer to the present that could not follow."""
         if self._observers.get(connection):
             self._observers[connection] = False
             self.send(connection, self._present(Kind.SEEN, self._seen))
 
-    def received(self, connection: Connection, body: bytes) -> Work | None:
+    def received(self, connection: RequestConnection, body: Frame) -> Work | None:
         """Handle one frame."""
-        _, kind, _, number = HEADER.unpack_from(body)
-        payload = memoryview(body)[HEADER.size :]
+        kind, number, payload = body
         if connection in self._strangers:
-            self._greet(connection, Frame(Kind(kind), number, bytearray(payload)))
+            self._greet(connection, body)
             return None
         try:
-            if kind == Kind.ACTIONS and connection is self._actor:
+            if kind is Kind.ACTIONS and connection is self._actor:
                 steps = self._requests.steps(_arrays(decode(payload)))
                 return self._done(connection, number, steps)
-            if kind != Kind.REQUEST:
+            if kind is not Kind.REQUEST:
                 raise RequestError("Only the client that acts may step.")
             return self._asked(connection, number, decode(payload))
         except ConnectionRefusedByPeerError as error:
@@ -153,29 +151,27 @@ class PhysxService(SocketService):
 
     # Handshake ------------------------------------------------------------------------------
 
-    def _greet(self, connection: Connection, frame: Frame) -> None:
+    def _greet(self, connection: RequestConnection, frame: Frame) -> None:
         """Go on with the handshake."""
-        handshake = self._strangers[connection]
         try:
-            answer = handshake.answer(frame)
+            answer, role = self._strangers.greet(connection, frame)
         except ConnectionRefusedByPeerError as error:
             self.drop(connection, str(error))
             return
-        if handshake.instance_id is None:
+        if role is None:
             self.send(connection, answer)
             return
-        del self._strangers[connection]
-        if isinstance(connection.reader, PhysxReader):
+        if isinstance(connection.reader, FrameReader):
             connection.reader.limit = self._max_request
         try:
-            self._admit(connection, handshake.instance_id)
+            self._admit(connection, role)
         except RemoteError as error:
             self.send(connection, pack(Kind.ERROR, encode_error(error)))
             self.drop(connection, f"turned away: {error}")
             return
         self.send(connection, pack_value(Kind.SETUP, self._introduction, "introduction"))
 
-    def _admit(self, connection: Connection, role: int) -> None:
+    def _admit(self, connection: RequestConnection, role: int) -> None:
         """Give a client its place.
 
         Raises:
@@ -202,18 +198,9 @@ class PhysxService(SocketService):
         LOG.info("%s acts", connection.name)
         self._actor = connection
 
-    def _look_for_silence(self) -> None:
-        """Close strangers that take too long."""
-        for connection in [*self._strangers]:
-            if connection.age > self._timeout:
-                self.drop(connection, f"no handshake within {self._timeout:g} s")
-        self._is_watching = bool(self._strangers)
-        if self._is_watching:
-            self.after(self._timeout / 4, self._look_for_silence)
-
     # Requests -------------------------------------------------------------------------------
 
-    def _asked(self, connection: Connection, number: int, request: Any) -> Work | None:
+    def _asked(self, connection: RequestConnection, number: int, request: Any) -> Work | None:
         """Do what is asked for; return the rest of the work if it is not done at once.
 
         Raises:
@@ -237,7 +224,7 @@ class PhysxService(SocketService):
         self.send(connection, pack_value(Kind.ANSWER, answer, f'The answer to "{what}"', number))
         return None
 
-    def _done(self, connection: Connection, number: int, change: Change) -> Work:
+    def _done(self, connection: RequestConnection, number: int, change: Change) -> Work:
         """Carry out what changes worlds, and answer."""
         try:
             for wait in change.work:
@@ -249,7 +236,7 @@ class PhysxService(SocketService):
         except Exception as error:
             self._refuse(connection, number, error)
 
-    def _refuse(self, connection: Connection, number: int, error: Exception) -> None:
+    def _refuse(self, connection: RequestConnection, number: int, error: Exception) -> None:
         """Say what went wrong, here and to the client."""
         told = error if isinstance(error, PhysxError) else wrap_error(error)
         is_own_fault = not isinstance(error, RequestError)
@@ -261,7 +248,7 @@ class PhysxService(SocketService):
 
     # Answers --------------------------------------------------------------------------------
 
-    def _tell(self, connection: Connection, number: int, change: Change) -> None:
+    def _tell(self, connection: RequestConnection, number: int, change: Change) -> None:
         """Answer with what became of worlds, and show it to those who look on."""
         latest = self._requests.latest
         rows = latest.rows(change.worlds)

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from physx_core.errors import RemoteProtocolError, UsageError
-from physx_core.net import HANDSHAKE_LIMIT, HEADER, Kind, encode
-from physx_remote.serving.framing import Reader
+from physx_core.net import encode
 
 VERSION = 1
 """Version of the messages after the handshake."""
@@ -21,45 +20,6 @@ ACT, OBSERVE = 1, 2
 WORLDS, IS_RESET, COUNT = "worlds", "is_reset", "count"
 REWARD, TERMINATED, TRUNCATED = "reward", "terminated", "truncated"
 """Names of the arrays besides those of observations and actions."""
-
-_KINDS = frozenset(int(kind) for kind in Kind)
-
-
-class PhysxReader(Reader):
-    """Cuts frames of physx, header and payload together.
-
-    Attributes:
-        limit: Longest payload in bytes that is taken, that of a stranger's at first.
-    """
-
-    def __init__(self) -> None:
-        """Begin in front of a header."""
-        super().__init__()
-        self.limit = HANDSHAKE_LIMIT
-
-    def take(self) -> bytes | None:
-        """Return the next whole frame, or None until more has arrived.
-
-        Raises:
-            RemoteProtocolError: What has arrived is no frame, or one that is too long.
-        """
-        buffer = self.buffer
-        if len(buffer) < HEADER.size:
-            return None
-        length, kind, spare, _ = HEADER.unpack_from(buffer)
-        if spare or kind not in _KINDS:
-            raise RemoteProtocolError("The other side sent what is no message of physx.")
-        if length > self.limit:
-            raise RemoteProtocolError(
-                f"The other side announced a message of {length} bytes; at most {self.limit} are "
-                "taken here."
-            )
-        end = HEADER.size + length
-        if len(buffer) < end:
-            return None
-        frame = bytes(buffer) if len(buffer) == end else bytes(memoryview(buffer)[:end])
-        del buffer[:end]
-        return frame
 
 
 def encode_infos(infos: Sequence[Mapping[str, Any]]) -> bytes:

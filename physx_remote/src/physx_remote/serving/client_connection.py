@@ -1,4 +1,4 @@
-"""Connection: what links of clients have in common, whatever they send."""
+"""ClientConnection: base of the clients' connections, whatever they send."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from physx_core.net import retry
 _RETRY = 0.1
 
 
-class Connection:
-    """A connection to a server, which stays closed once it is.
+class ClientConnection:
+    """A connection to a server, which cannot be opened again.
 
     Attributes:
         name: The server as ``host:port``.
     """
 
     _server: ClassVar[str] = "server"
-    """What the other side is called."""
+    """What the other side is called in messages."""
     _socket: socket.socket
 
     def __init__(self, address: tuple[str, int]) -> None:
@@ -28,16 +28,16 @@ class Connection:
         self.name = "{}:{}".format(*address)
         self._why_closed = ""
 
-    def _reached(self, connect: Callable[[float], socket.socket], patience: float) -> socket.socket:
-        """Return a connected socket; as long as nobody listens it is tried again.
+    def _reach(self, connect: Callable[[float], socket.socket], patience: float) -> socket.socket:
+        """Return a connected socket; try again as long as nothing listens.
 
         Args:
             connect: Connects within a time in s.
             patience: How long to try, in s.
 
         Raises:
-            RemoteTimeoutError: Nothing listens at the address in time.
-            RemoteError: The address does not exist.
+            RemoteTimeoutError: If nothing listens at the address in time.
+            RemoteError: If the address does not exist.
         """
         try:
             return retry(connect, patience, _RETRY, ConnectionRefusedError, TimeoutError)
@@ -53,7 +53,7 @@ class Connection:
         """Check that the connection is not closed.
 
         Raises:
-            RemoteClosedError: It is; the error says why.
+            RemoteClosedError: If it is; the message says why.
         """
         if self._why_closed:
             raise RemoteClosedError(f"The connection to {self.name} is closed: {self._why_closed}.")
@@ -62,7 +62,7 @@ class Connection:
         """End the connection; calling it again does nothing.
 
         Args:
-            why: What later calls say.
+            why: The reason that later calls name.
         """
         self._why_closed = self._why_closed or why
         self._socket.close()

@@ -1,4 +1,4 @@
-"""Link: a client's connection; every wait has an end."""
+"""RequestLink: a client's connection on which each message is answered by one message."""
 
 from __future__ import annotations
 
@@ -7,15 +7,14 @@ import time
 from typing import Any
 
 from physx_core.errors import ConfigError, RemoteClosedError, RemoteTimeoutError
-from physx_remote.serving.client_connection import Connection
-from physx_remote.serving.framing import MAX_ANSWER, FrameReader, framed
+from physx_remote.serving.client_connection import ClientConnection
+from physx_remote.serving.framing import MAX_ANSWER, PrefixReader, add_prefix
 
-_PIECE = 1 << 16
 _LONGEST = 1e9
 
 
-class Link(Connection):
-    """A connection on which one message is answered by one message.
+class RequestLink(ClientConnection):
+    """A connection on which each message is answered by one message; every wait has an end.
 
     After any failure it is closed: a late answer must not be taken for that of another message.
     """
@@ -28,51 +27,53 @@ class Link(Connection):
         connect_timeout: float = 10.0,
         max_answer: int = MAX_ANSWER,
     ) -> None:
-        """Connect; as long as nobody listens it is tried again.
+        """Connect, and try again as long as nothing listens.
 
         Args:
             address: Host and port.
             timeout: How long an answer may take, in s; None: for ever.
             connect_timeout: How long to try to connect, in s.
-            max_answer: Longest answer in bytes that is taken.
+            max_answer: Longest answer in bytes that is accepted.
 
         Raises:
-            ConfigError: A time or size is none.
-            RemoteTimeoutError: Nothing listens at the address in time.
-            RemoteError: The address does not exist.
+            ConfigError: If a time or size is not a positive number.
+            RemoteTimeoutError: If nothing listens at the address in time.
+            RemoteError: If the address does not exist.
         """
         if timeout is not None:
             _check_time("timeout", timeout)
         _check_time("connect_timeout", connect_timeout)
         if type(max_answer) is not int or max_answer < 1:
-            raise ConfigError(f"max_answer is {max_answer!r} but must be a whole number of bytes.")
+            raise ConfigError(
+                f"max_answer is {max_answer!r} but must be a positive integer (bytes)."
+            )
         super().__init__(address)
         self._timeout = timeout
-        self._reader = FrameReader(max_answer)
+        self._reader = PrefixReader(max_answer)
         self._socket = self._connected(address, connect_timeout)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.settimeout(timeout)
 
     def _connected(self, address: tuple[str, int], patience: float) -> socket.socket:
-        return self._reached(lambda left: socket.create_connection(address, left), patience)
+        return self._reach(lambda left: socket.create_connection(address, left), patience)
 
     def exchange(self, body: bytes) -> bytes:
         """Send a message and return the answer to it.
 
         Raises:
-            RemoteTimeoutError: There is no answer in time.
-            RemoteClosedError: The other side ended the connection, or it is closed already.
-            RemoteProtocolError: The answer is too long.
+            RemoteTimeoutError: If there is no answer in time.
+            RemoteClosedError: If the other side ended the connection, or it is closed already.
+            RemoteProtocolError: If the answer is too long.
         """
         self._check_open()
         try:
-            self._socket.sendall(framed(body))
+            self._socket.sendall(add_prefix(body))
             return self._answer()
         except TimeoutError as error:
             self.close(f"an answer took longer than {self._timeout} s")
             raise RemoteTimeoutError(
                 f"{self.name} did not answer within {self._timeout} s; it may be busy with another "
-                "client, or wait for it. The connection is closed."
+                "client, or be waiting for it. The connection is closed."
             ) from error
         except OSError as error:
             self.close(str(error))
@@ -84,11 +85,9 @@ class Link(Connection):
     def _answer(self) -> bytes:
         until = None if self._timeout is None else time.monotonic() + self._timeout
         while True:
-            data = self._socket.recv(_PIECE)
-            if not data:
+            if not self._reader.receive(self._socket):
                 place = f" within an answer, after {n} bytes" if (n := self._reader.waiting) else ""
                 raise RemoteClosedError(f"{self.name} ended the connection{place}.")
-            self._reader.feed(data)
             body = self._reader.take()
             if body is not None:
                 break
@@ -104,4 +103,4 @@ class Link(Connection):
 
 def _check_time(name: str, seconds: Any) -> None:
     if type(seconds) not in (int, float) or not 0 < seconds < _LONGEST:
-        raise ConfigError(f"{name} is {seconds!r} but must be a number of s above 0.")
+        raise ConfigError(f"{name} is {seconds!r} but must be a positive number of seconds.")

@@ -1,73 +1,76 @@
-"""Framing: each message is its length, 4 bytes with the lowest first, and then its body."""
+"""Framing: each message is a length prefix of 4 bytes, little-endian, and its body."""
 
 from __future__ import annotations
 
+import socket
 import struct
-from abc import ABC, abstractmethod
 
 from physx_core.errors import RemoteProtocolError
+from physx_core.net import Reader
 
 PREFIX = struct.Struct("<I")
 """Length of the body in bytes."""
 
 MAX_REQUEST = 1 << 24
-"""Longest body in bytes that a service takes unless told otherwise."""
+"""Longest body in bytes that a service accepts by default."""
 
 MAX_ANSWER = 1 << 28
-"""Longest body in bytes that a client takes unless told otherwise."""
+"""Longest body in bytes that a client accepts by default."""
+
+_PIECE = 1 << 16
+_MOST_UNREAD = 1 << 20
 
 
-def framed(body: bytes) -> bytes:
+def add_prefix(body: bytes) -> bytes:
     """Return prefix and body as one piece: some clients read the prefix with one plain call.
 
     Raises:
-        RemoteProtocolError: The body is longer than 4 bytes can tell.
+        RemoteProtocolError: If the length of the body does not fit into 4 bytes.
     """
     try:
         return PREFIX.pack(len(body)) + body
     except struct.error:
         raise RemoteProtocolError(
-            f"A message of {len(body)} bytes is too long: its length is told in 4 bytes."
+            f"A message of {len(body)} bytes is too long: its length has to fit into 4 bytes."
         ) from None
 
 
-class Reader(ABC):
-    """Cuts bodies out of a stream that arrives in pieces of any size.
+class BufferReader(Reader):
+    """Keeps what arrives in one buffer.
 
     Attributes:
         buffer: What has arrived and was not taken.
     """
 
     def __init__(self) -> None:
+        """Start with nothing."""
         self.buffer = bytearray()
 
-    def feed(self, data: bytes) -> None:
-        """Add what has arrived."""
+    def receive(self, connection: socket.socket) -> int:
+        """Take what has arrived; see `Reader.receive`."""
+        data = connection.recv(_PIECE)
         self.buffer += data
-
-    @abstractmethod
-    def take(self) -> bytes | None:
-        """Return the next whole body, or None until more has arrived.
-
-        Raises:
-            RemoteProtocolError: What has arrived is no message, or one that is too long. The stream
-                cannot be read on.
-        """
+        return len(data)
 
     @property
     def waiting(self) -> int:
         """How many bytes have arrived and were not taken."""
         return len(self.buffer)
 
+    @property
+    def has_room(self) -> bool:
+        """Whether more may be received before a message is taken."""
+        return len(self.buffer) < _MOST_UNREAD
 
-class FrameReader(Reader):
-    """Cuts framed bodies; only what has arrived takes memory, whatever a prefix announces."""
+
+class PrefixReader(BufferReader):
+    """Cuts bodies behind prefixes. Only what has arrived takes memory, whatever is announced."""
 
     def __init__(self, limit: int = MAX_REQUEST) -> None:
-        """Begin in front of a prefix.
+        """Start in front of a prefix.
 
         Args:
-            limit: Longest body in bytes that is taken.
+            limit: Longest body in bytes that is accepted.
         """
         super().__init__()
         self.limit = limit
@@ -76,7 +79,7 @@ class FrameReader(Reader):
         """Return the next whole body, or None until more has arrived.
 
         Raises:
-            RemoteProtocolError: The next body is longer than the limit.
+            RemoteProtocolError: If the next body is longer than the limit.
         """
         buffer = self.buffer
         if len(buffer) < PREFIX.size:
@@ -85,7 +88,7 @@ class FrameReader(Reader):
         if length > self.limit:
             raise RemoteProtocolError(
                 f"The other side announced a message of {length} bytes; at most {self.limit} are "
-                "taken here."
+                "accepted here."
             )
         end = PREFIX.size + length
         if len(buffer) < end:

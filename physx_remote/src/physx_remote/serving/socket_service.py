@@ -1,8 +1,7 @@
-"""SocketService: one thread and one selector serve all connections, one request at a time."""
+"""SocketService: serves all its connections in one thread, one request at a time."""
 
 from __future__ import annotations
 
-import contextlib
 import math
 import selectors
 import socket
@@ -11,17 +10,16 @@ import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
+from typing import Any
 
-from physx_core.errors import RemoteProtocolError
-from physx_remote.serving.connection import MOMENT, Connection, listening_socket
-from physx_remote.serving.framing import FrameReader, Reader
+from physx_core.errors import PhysxError, RemoteError
+from physx_core.net import Listener, Reader
+from physx_remote.serving.connection import MOMENT, RequestConnection
+from physx_remote.serving.framing import PrefixReader
 from physx_remote.serving.service import LOG, Service
-from physx_remote.serving.timers import Timers
 
-_ACCEPTED_AT_ONCE = 16
 _READ = selectors.EVENT_READ
 _SLICE = 0.02
-_PAUSE = 0.5
 
 Work = Iterator[float]
 """A request in progress: yields how long it wants to be left alone, in s."""
@@ -43,16 +41,12 @@ class SocketService(Service):
             max_clients: How many connections are open at most; who comes then is closed at once.
         """
         self.address = ("", 0)
-        self.connections: list[Connection] = []
+        self.connections: list[RequestConnection] = []
         self._max_clients = max_clients
-        self._selector: selectors.BaseSelector
-        self._waker: socket.socket
-        self._wakes: socket.socket
-        self._listener: socket.socket | None = None
-        self._ready: deque[Connection] = deque()
-        self._timers = Timers()
-        self._work: tuple[Connection, Work] | None = None
-        self._recent: Connection | None = None
+        self._listener: Listener[RequestConnection]
+        self._ready: deque[RequestConnection] = deque()
+        self._work: tuple[RequestConnection, Work] | None = None
+        self._recent: RequestConnection | None = None
         self._resume_at = self._looked = 0.0
         self._lock = threading.RLock()
         self._is_open = self._is_polling = self._has_more = self._over = self._released = False
@@ -60,25 +54,30 @@ class SocketService(Service):
     # What a subclass implements ---------------------------------------------------------------
 
     @abstractmethod
-    def received(self, connection: Connection, body: bytes) -> Work | None:
+    def received(self, connection: RequestConnection, body: Any) -> Work | None:
         """Handle one message; return the rest of the work if it is not done at once."""
 
-    def opened(self, connection: Connection) -> None:
+    def opened(self, connection: RequestConnection) -> None:
         """Handle a new connection."""
 
-    def closed(self, connection: Connection) -> None:
+    def closed(self, connection: RequestConnection) -> None:
         """Handle the end of a connection; nothing can be sent on it."""
 
-    def drained(self, connection: Connection) -> None:
+    def drained(self, connection: RequestConnection) -> None:
         """Handle that all is sent which had to wait."""
 
-    def admits(self, connection: Connection) -> bool:
+    def admits(self, connection: RequestConnection) -> bool:
         """Return whether a message of this connection may be handled now."""
         return True
 
     def new_reader(self) -> Reader:
         """Return what cuts the messages out of a new connection's stream."""
-        return FrameReader()
+        return PrefixReader()
+
+    @property
+    def is_listening(self) -> bool:
+        """Whether `listen` was called."""
+        return self._is_open and self._listener.address[1] > 0
 
     # What a subclass calls ----------------------------------------------------------------------
 
@@ -90,36 +89,38 @@ class SocketService(Service):
             port: Port, 0 for any that is free.
 
         Raises:
-            RemoteError: The address is not one of this machine, or the port is in use.
+            RemoteError: If the address is not one of this machine, or the port is in use.
         """
         self._open()
-        self._listener = listening_socket(address, port)
-        self.address = self._listener.getsockname()[:2]
-        self._selector.register(self._listener, selectors.EVENT_READ)
+        try:
+            self._listener.listen(address, port)
+        except OSError as error:
+            raise RemoteError(
+                f"Nothing can be served at {address} port {port}: {error}. Choose port 0 for any "
+                "free port, or an address of this machine; one that another program uses is taken."
+            ) from error
+        self.address = self._listener.address
 
-    def adopt(self, connected: socket.socket) -> Connection:
+    def adopt(self, connected: socket.socket) -> RequestConnection:
         """Serve a socket that is connected already."""
         self._open()
         host, port = connected.getpeername()[:2]
-        connection = Connection(connected, self.new_reader(), f"{host}:{port}")
+        connection = RequestConnection(connected, self.new_reader(), f"{host}:{port}")
         self.connections.append(connection)
-        connection.watch(self._selector)
+        self._listener.add(connection)
         self.opened(connection)
         return connection
 
-    def send(self, connection: Connection, *parts: bytes | memoryview) -> None:
+    def send(self, connection: RequestConnection, *parts: bytes | memoryview) -> None:
         """Send parts as one piece; a broken connection is dropped and nothing else happens."""
         if connection.closed:
             return
         try:
-            connection.send(parts)
+            connection.write(*parts)
         except OSError as error:
             self.drop(connection, f"{error}")
-            return
-        if connection.outgoing:
-            connection.watch(self._selector)
 
-    def drop(self, connection: Connection, reason: str = "") -> None:
+    def drop(self, connection: RequestConnection, reason: str = "") -> None:
         """Close a connection; what it asked for is finished, but not answered.
 
         Args:
@@ -130,7 +131,7 @@ class SocketService(Service):
             return
         if reason:
             LOG.warning("Connection of %s ended: %s", connection.name, reason)
-        connection.close(self._selector)
+        connection.close()
         self.connections.remove(connection)
         if connection in self._ready:
             self._ready.remove(connection)
@@ -138,7 +139,8 @@ class SocketService(Service):
 
     def after(self, seconds: float, action: Callable[[], None]) -> None:
         """Call a function once, some time from now, between messages."""
-        self._timers.add(seconds, action)
+        self._open()
+        self._listener.timers.add(seconds, action)
 
     # The loop -------------------------------------------------------------------------------
 
@@ -161,16 +163,16 @@ class SocketService(Service):
         if not self._is_polling:
             self._release()
             return
-        with self._lock, contextlib.suppress(BlockingIOError):
+        with self._lock:
             if self._is_open and not self._released:
-                self._wakes.send(b"x")
+                self._listener.wake()
 
     def _cycle(self, timeout: float | None) -> None:
         if not self._is_open:
             self._open()
         if not self._came_soon(timeout):
             self._look(timeout)
-        if self._work is not None or self._ready or self._timers.next < math.inf:
+        if self._work is not None or self._ready or self._listener.timers.next < math.inf:
             self._turn()
         else:
             self._has_more = False
@@ -196,29 +198,17 @@ class SocketService(Service):
 
     def _look(self, timeout: float | None) -> None:
         """Handle what the selector sees."""
-        has_guests = False
-        for key, events in self._selector.select(self._wait(timeout)):
-            if key.data is not None:
-                self._serve(key.data, events)
-            elif key.fileobj is self._waker:
-                self._waker.recv(1024)
-            else:
-                has_guests = True
+        for connection, events in self._listener.select(self._wait(timeout)):
+            self._serve(connection, events)
         self._looked = time.monotonic()
-        if has_guests:  # those who left make room first
-            self._accept()
+        self._listener.accept()
 
     def _open(self) -> None:
         """Take what the loop needs from the system."""
         with self._lock:
-            if self._is_open or self._released:
-                return
-            self._is_open = True
-            self._selector = selectors.DefaultSelector()
-            self._waker, self._wakes = socket.socketpair()
-            self._waker.setblocking(False)
-            self._wakes.setblocking(False)
-            self._selector.register(self._waker, selectors.EVENT_READ)
+            if not (self._is_open or self._released):
+                self._is_open = True
+                self._listener = Listener(self._meet)
 
     def _release(self) -> None:
         with self._lock:
@@ -230,17 +220,13 @@ class SocketService(Service):
             self._work = None
             for connection in [*self.connections]:
                 self.drop(connection)
-            if self._listener is not None:
-                self._listener.close()
-            self._waker.close()
-            self._wakes.close()
-            self._selector.close()
+            self._listener.close()
 
     def _wait(self, timeout: float | None) -> float | None:
         """Return how long nothing happens, unless something arrives."""
         if self._has_more:
             return 0.0
-        moment = self._timers.next
+        moment = self._listener.timers.next
         if self._work is not None:
             moment = min(moment, self._resume_at)
         if moment == math.inf:
@@ -251,7 +237,7 @@ class SocketService(Service):
     def _turn(self) -> None:
         """Run timers, and work until there is none, or others have waited long enough."""
         begin = time.monotonic()
-        self._timers.call_due()
+        self._listener.timers.call_due()
         self._has_more = True
         while not self._over:
             if self._work is not None:
@@ -268,7 +254,7 @@ class SocketService(Service):
             if time.monotonic() - begin > _SLICE:
                 return
 
-    def _next(self) -> Connection | None:
+    def _next(self) -> RequestConnection | None:
         """Return whose message is to be handled now: the one that waits longest."""
         for _ in range(len(self._ready)):
             connection = self._ready.popleft()
@@ -277,10 +263,10 @@ class SocketService(Service):
             self._ready.append(connection)
         return None
 
-    def _begin(self, connection: Connection) -> None:
+    def _begin(self, connection: RequestConnection) -> None:
         body, connection.body = connection.body, None
         try:
-            work = self.received(connection, body or b"")
+            work = self.received(connection, body)
         except BaseException as error:
             self._failed(connection, error)
             return
@@ -304,7 +290,7 @@ class SocketService(Service):
             self._work = None
             self._failed(connection, error)
 
-    def _failed(self, connection: Connection, error: BaseException) -> None:
+    def _failed(self, connection: RequestConnection, error: BaseException) -> None:
         """Give up the connection whose request could not be handled."""
         if not isinstance(error, Exception):
             self.drop(connection, f"interrupted by {type(error).__name__}")
@@ -312,7 +298,7 @@ class SocketService(Service):
         LOG.error("A request of %s failed", connection.name, exc_info=error)
         self.drop(connection, f"{type(error).__name__}: {error}")
 
-    def _after(self, connection: Connection) -> None:
+    def _after(self, connection: RequestConnection) -> None:
         """Look for the next message of a connection, or for its end."""
         if connection.closed:
             return
@@ -327,12 +313,12 @@ class SocketService(Service):
                 half = connection.reader.waiting
                 self.drop(connection, f"in the middle of a message ({half} bytes)" if half else "")
                 return
-        except RemoteProtocolError as error:
+        except PhysxError as error:
             self.drop(connection, str(error))
             return
-        connection.watch(self._selector)
+        connection.watch()
 
-    def _serve(self, connection: Connection, events: int) -> None:
+    def _serve(self, connection: RequestConnection, events: int) -> None:
         """Read and write what a connection has and takes."""
         if connection.closed:
             return
@@ -350,46 +336,26 @@ class SocketService(Service):
         if had_body and connection.ended and not self.admits(connection):
             self.drop(connection, "it left before its turn came")
         elif had_body or (self._work is not None and self._work[0] is connection):
-            connection.watch(self._selector)
+            connection.watch()
         elif self._ready or self._work is not None or self._over:
             self._after(connection)
         else:
             self._answer(connection)
 
-    def _answer(self, connection: Connection) -> None:
+    def _answer(self, connection: RequestConnection) -> None:
         """Handle the message that has just arrived, where nobody else waits."""
         try:
             if connection.next_body() and self.admits(connection) and not connection.outgoing:
                 self._begin(connection)
                 return
-        except RemoteProtocolError as error:
+        except PhysxError as error:
             self.drop(connection, str(error))
             return
         self._after(connection)
 
-    def _accept(self) -> None:
-        """Take some of those who wait at the door."""
-        for _ in range(_ACCEPTED_AT_ONCE):
-            if self._listener is None:
-                return
-            try:
-                connected, place = self._listener.accept()
-            except BlockingIOError:
-                return
-            except ConnectionError:  # it was gone before it was accepted
-                continue
-            except OSError as error:  # the process has too many files open
-                LOG.warning("No connection can be accepted for now: %s", error)
-                self._selector.unregister(self._listener)
-                self.after(_PAUSE, self._accept_again)
-                return
-            if len(self.connections) >= self._max_clients:
-                connected.close()
-                LOG.warning("%s:%s was turned away: too many are connected", *place[:2])
-                continue
-            with contextlib.suppress(OSError):  # gone already
-                self.adopt(connected)
-
-    def _accept_again(self) -> None:
-        if self._listener is not None:
-            self._selector.register(self._listener, selectors.EVENT_READ)
+    def _meet(self, connected: socket.socket, name: str) -> None:
+        if len(self.connections) >= self._max_clients:
+            connected.close()
+            LOG.warning("%s was turned away: too many are connected", name)
+        else:
+            self.adopt(connected)

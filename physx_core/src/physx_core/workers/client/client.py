@@ -67,7 +67,7 @@ def _serve(link: Link, setup: dict[str, Any], say: Callable[[str], None]) -> int
         f"runs {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"
         + (f"; {skip['rows']} rows are there and are made again" if skip["rows"] else "")
     )
-    link.waits_awake = has_core_for_each(setup["instance_nb"])
+    link.spins = has_core_for_each(setup["instance_nb"])
     client = _Client(link, Instance(**setup), skip)
     try:
         client.live(draw)

@@ -14,11 +14,11 @@ from typing import Any
 
 from physx_core.net.frames import Frame, FrameReader, Kind
 from physx_core.net.remote_errors import decode_error
-from physx_core.net.spin_wait import awaited
+from physx_core.net.spin_wait import spin_until
 from physx_core.net.values import decode, pack_value
 from physx_core.workers.processes.descendants import kill_descendants
 
-_AWAKE_TIME = 2e-4
+_SPIN_TIME = 2e-4
 _CLEANUP_TIME = 1.0
 _REST = 1 << 16
 _MOST_PARTS = 512  # a system call takes no more than 1024
@@ -40,7 +40,7 @@ class Link:
     even inside a long step.
 
     Attributes:
-        waits_awake: Whether an answer is looked for without sleeping, for 0.2 ms.
+        spins: Whether to look for an answer without sleeping, for 0.2 ms.
     """
 
     def __init__(self, connection: socket.socket, reader: FrameReader) -> None:
@@ -50,7 +50,7 @@ class Link:
             connection: The socket.
             reader: The reader that the handshake left.
         """
-        self.waits_awake = False
+        self.spins = False
         self._connection = connection
         self._reader = reader
         self._postponed: deque[Frame] = deque()
@@ -97,7 +97,7 @@ class Link:
         Raises:
             RunEnded: The server is gone.
         """
-        self._wait_awake()
+        self._spin()
         return self._postponed.popleft() if self._postponed else self._next()
 
     def put_back(self, frame: Frame) -> None:
@@ -126,7 +126,7 @@ class Link:
         message = pack_value(kind, value, what, self._requests + 1)
         self._requests += 1
         self.send(message)
-        self._wait_awake()
+        self._spin()
         while True:
             frame = self._next()
             if frame.kind is Kind.CLOSE:
@@ -155,9 +155,9 @@ class Link:
             self._connection.shutdown(socket.SHUT_RDWR)
         self._connection.close()
 
-    def _wait_awake(self) -> None:
-        if self.waits_awake:
-            awaited(self.has_message, _AWAKE_TIME)
+    def _spin(self) -> None:
+        if self.spins:
+            spin_until(self.has_message, _SPIN_TIME)
 
     def _next(self) -> Frame:
         try:

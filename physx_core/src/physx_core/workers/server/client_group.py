@@ -199,7 +199,7 @@ class ClientGroup:
 
     def _unfinished(self) -> list[int]:
         peers = self.server.peers.values()
-        return [p.instance_id for p in peers if not (p.finished or p.gone or p.failure)]
+        return [p.instance_id for p in peers if not (p.finished or p.closed or p.failure)]
 
     def _present(self, number: int) -> Peer | None:
         """Return the connection of an instance's client; None where it has none now."""
@@ -221,7 +221,7 @@ class ClientGroup:
                 continue
             if peer is not None and peer.finished:
                 continue
-            if peer is not None and peer.gone:
+            if peer is not None and peer.closed:
                 left = handle is None and not peer.offense
                 self._lose(number, ended(number, peer, handle), left=left)
             elif handle is not None and handle.exit_status() is not None:

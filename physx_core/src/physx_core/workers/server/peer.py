@@ -1,4 +1,4 @@
-"""Peer: one connection of the server, a stranger until the handshake is done."""
+"""Peer: one connection of the server and what its client has sent, a stranger at first."""
 
 from __future__ import annotations
 
@@ -8,22 +8,20 @@ import time
 
 from physx_core.errors import PhysxError
 from physx_core.fields import Field
+from physx_core.net.connection import Connection
 from physx_core.net.frames import FrameReader
-from physx_core.net.handshake import HANDSHAKE_LIMIT, ServerHandshake
+from physx_core.net.handshake import HANDSHAKE_LIMIT
 from physx_core.workers.row_codec import RejectedRows, RowQueue
 from physx_core.workers.server.journal import Journal
 
 _PIECE = 1 << 16
 
 
-class Peer:
+class Peer(Connection):
     """What the server knows about one connection.
 
     Attributes:
-        connection: The socket; it does not block.
         reader: Reads its frames.
-        handshake: The handshake; None once the peer is trusted.
-        heard: When the peer last sent something or was last sent something, in monotonic s.
         instance_id: Number of its instance, counted from 1; 0 while it is a stranger.
         fields: The environment's fields; empty before it is ready.
         row_fields: Fields of its rows, all shapes known; empty before the first sample.
@@ -37,8 +35,6 @@ class Peer:
         last_step: Step of its last row, -1 before the first.
         offense: What it sent against the rules, for which it was cut off; empty for nothing.
         finished: Whether it said that its environment is closed.
-        gone: Whether the connection is at its end.
-        awaits_room: Whether the server looks for the moment when more can be sent.
         vacant: Whether another client may take the instance's place.
         has_told_fields: Whether it told the fields of its rows.
         requests: How many requests it sent.
@@ -46,19 +42,16 @@ class Peer:
         journal: What to tell a client that takes its place; None where none can.
     """
 
-    def __init__(self, connection: socket.socket, token: str) -> None:
+    reader: FrameReader
+
+    def __init__(self, connected: socket.socket, name: str) -> None:
         """Take a new connection.
 
         Args:
-            connection: The socket.
-            token: What the peer must know.
+            connected: The socket.
+            name: The other side as ``host:port``.
         """
-        connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.connection = connection
-        self.reader = FrameReader(HANDSHAKE_LIMIT)
-        self.handshake: ServerHandshake | None = ServerHandshake(token)
-        self.heard = time.monotonic()
+        super().__init__(connected, FrameReader(HANDSHAKE_LIMIT), name)
         self.instance_id = 0
         self.fields: list[Field] = []
         self.row_fields: list[Field] = []
@@ -70,12 +63,10 @@ class Peer:
         self.failed_row = 0
         self.last_step = -1
         self.offense = ""
-        self.finished = self.gone = self.awaits_room = False
-        self.vacant = self.has_told_fields = False
+        self.finished = self.vacant = self.has_told_fields = False
         self.requests = self.shown = 0
         self.journal: Journal | None = None
         self._arrived = 0  # of a long frame, when the peer was last heard of
-        self._outgoing = bytearray()
         self._next_order: int | None = None  # of the journal's, for this client; None: it had all
 
     @property
@@ -86,17 +77,7 @@ class Peer:
     @property
     def is_lost(self) -> bool:
         """Whether this client makes no more rows."""
-        return self.gone or self.failure is not None
-
-    @property
-    def has_outgoing(self) -> bool:
-        """Whether something waits to be sent."""
-        return bool(self._outgoing)
-
-    @property
-    def unread(self) -> int:
-        """How many bytes wait to be sent."""
-        return len(self._outgoing)
+        return self.closed or self.failure is not None
 
     def succeed(self, former: Peer) -> None:
         """Take the place of another client of the instance, with all that arrived from it."""
@@ -118,8 +99,8 @@ class Peer:
     def send(self, message: bytes) -> None:
         """Send as much as the connection takes now; `flush` sends the rest.
 
-        What a client in its place must be told again goes into the journal. A client that has just
-        taken a place is told the orders from there, one after the other.
+        What a successor must be told again goes into the journal. A client that has just taken a
+        place is told the orders from there, one after the other.
         """
         is_order = self.journal is not None and self.journal.record(message)
         if self._next_order is None or not is_order:
@@ -127,39 +108,39 @@ class Peer:
 
     def send_with_next(self, message: bytes) -> None:
         """Send a message together with the next one, so that the client wakes up once for both."""
-        if self.journal is None and self._next_order is None and not self.gone:
-            self._outgoing += message
+        if self.journal is None and self._next_order is None and not self.closed:
+            self.outgoing += message
         else:
             self.send(message)
 
     def send_once(self, message: bytes) -> None:
-        """Send what no other client needs to know."""
-        if self.gone:
+        """Send a message that no successor needs to know."""
+        if self.closed:
             return
-        sent = 0
-        if not self._outgoing and self._next_order is None:
-            try:
-                sent = self.connection.send(message)
-            except OSError:
-                sent = 0  # `flush` tries again
-        if sent < len(message):
-            self._outgoing += memoryview(message)[sent:]
+        if self.outgoing or self._next_order is not None:
+            self.outgoing += message
             self.flush()
+        else:
+            with contextlib.suppress(OSError):  # reading finds its end
+                self.write(message)
         self.heard = time.monotonic()  # its time to react begins now
 
-    def flush(self) -> None:
-        """Send what waits, as far as the connection takes it."""
-        with contextlib.suppress(OSError):  # it takes no more now, or reading finds its end
-            while self._outgoing or self._next_order is not None:
-                if not self._outgoing:
-                    self._take_order()
-                sent = self.connection.send(self._outgoing)
-                del self._outgoing[:sent]
+    def flush(self) -> int:
+        """Send what waits, and the orders of the journal, as far as the connection takes them."""
+        total = 0
+        with contextlib.suppress(OSError):  # reading finds its end
+            while self.outgoing or self._take_order():
+                sent = super().flush()
+                if not sent:
+                    break
+                total += sent
+        return total
 
-    def _take_order(self) -> None:
-        """Fetch the next order from the journal."""
+    def _take_order(self) -> bool:
+        """Fetch the next order from the journal; return whether there is something to send."""
         if self.journal is None or self._next_order is None:
-            return
+            return False
         order = self.journal.order(self._next_order)
         self._next_order = None if order is None else self._next_order + 1
-        self._outgoing += self.journal.credit if order is None else order
+        self.outgoing += self.journal.credit if order is None else order
+        return bool(self.outgoing)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import selectors
 import socket
 import time
@@ -17,12 +16,14 @@ from physx_core.errors import (
 )
 from physx_core.net.addresses import format_address
 from physx_core.net.frames import MAX_PAYLOAD, Frame, Kind, pack
+from physx_core.net.listener import Listener
 from physx_core.net.remote_errors import decode_error, encode_error
-from physx_core.net.spin_wait import awaited, has_core_for_each
+from physx_core.net.spin_wait import has_core_for_each
+from physx_core.net.strangers import Strangers
 from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.peer import Peer
-from physx_core.workers.server.service_requests import Answers
+from physx_core.workers.server.service_requests import ServiceRequests
 from physx_core.workers.server.validation import (
     check_environment_fields,
     check_row_fields,
@@ -31,9 +32,8 @@ from physx_core.workers.server.validation import (
 )
 
 _HANDSHAKE_TIME = 5.0
-_AWAKE_TIME = 5e-5  # for which clients that got answers are waited for without sleeping
+_SPIN_TIME = 5e-5  # for the next requests of clients that were just answered
 _MAX_STRANGERS = 128
-_ACCEPTED_AT_ONCE = 16
 _TURNS = 64
 _LONG = 1 << 16
 
@@ -71,13 +71,14 @@ class Server:
         self.peers: dict[int, Peer] = {}
         self.token = token
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
-        self._awake_time = _AWAKE_TIME if has_core_for_each(instance_nb) else 0.0
-        self._answers = Answers(services)
+        self._spin_time = _SPIN_TIME if has_core_for_each(instance_nb) else 0.0
+        self._requests = ServiceRequests(services)
         self._setup, self._replaces = setup, replaces
         self._ending = self._has_news = False
-        self._strangers: list[Peer] = []
-        self._selector = selectors.DefaultSelector()
-        self._listener: socket.socket | None = None
+        self._listener = Listener[Peer](self._meet)
+        self._strangers = Strangers(
+            token, _HANDSHAKE_TIME, _MAX_STRANGERS, self._drop, self._listener.timers
+        )
         self._dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
             Kind.READY: _ready,
             Kind.FIELDS: _fields,
@@ -86,7 +87,7 @@ class Server:
             Kind.ERROR: _error,
             Kind.BYE: self._bye,
             Kind.AGAIN: _again,
-            **dict.fromkeys((Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW), self._answers.take),
+            **dict.fromkeys((Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW), self._requests.take),
         }
 
     def open(self) -> None:
@@ -95,26 +96,21 @@ class Server:
         Raises:
             ConfigError: The address is not one of this machine, or the port is in use.
         """
-        where = f"{self._ip_address} port {self._port}"
         try:
-            found = socket.getaddrinfo(self._ip_address, self._port, type=socket.SOCK_STREAM)
-            family, address = found[0][0], found[0][4]
-            self._listener = socket.create_server(address, family=family, backlog=128)
-        except (OSError, OverflowError) as error:
+            self._listener.listen(self._ip_address, self._port)
+        except OSError as error:
             raise ConfigError(
-                f"The server cannot listen at {where}: {error}. Choose EnvironmentConfig.port=0 "
-                "for any free port, or an ip_address of this machine; a port below 1024 needs "
-                "rights, and one that another run uses is taken."
+                f"The server cannot listen at {self._ip_address} port {self._port}: {error}. "
+                "Choose EnvironmentConfig.port=0 for any free port, or an ip_address of this "
+                "machine; ports below 1024 need privileges, and another run may use this one."
             ) from error
-        self._listener.setblocking(False)
-        self._selector.register(self._listener, selectors.EVENT_READ)
 
     @property
     def address(self) -> str:
         """``HOST:PORT`` at which clients on this machine reach the server."""
-        if self._listener is None:
+        if not self._listener.is_listening:
             raise ConfigError("The server is not open.")
-        host, port = self._listener.getsockname()[:2]
+        host, port = self._listener.address
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
         return format_address(host, port)
 
@@ -125,39 +121,36 @@ class Server:
         longer than `timeout`, it goes on.
         """
         until = time.monotonic() + timeout
-        awake = 0.0
-        while self._answer_at_once(timeout, awake) and time.monotonic() < until:
-            awake = self._awake_time
-        self._watch()
+        spin = 0.0
+        while self._answer_at_once(timeout, spin) and time.monotonic() < until:
+            spin = self._spin_time
+        self._listener.timers.call_due()
 
-    def _answer_at_once(self, timeout: float, awake: float) -> bool:
+    def _answer_at_once(self, timeout: float, spin: float) -> bool:
         """Do what there is to do; return whether it was to answer requests and nothing else.
 
         Args:
             timeout: How long to wait for the first of it, in s.
-            awake: How much of that to wait without sleeping, in s.
+            spin: How long to look for it without sleeping before that, in s.
         """
         self._has_news = False
-        found = awaited(lambda: self._selector.select(0), awake) if awake else []
-        for key, events in found or self._selector.select(timeout):
-            if key.data is None:
-                self._accept()
-                self._has_news = True
-                continue
+        for peer, events in self._listener.select(timeout, spin):
             if events & selectors.EVENT_WRITE:
-                key.data.flush()
+                peer.flush()
                 self._has_news = True
             if events & selectors.EVENT_READ:
-                self._read(key.data)
-        asked = self._answers.count
+                self._read(peer)
+        if self._listener.accept():
+            self._has_news = True
+        asked = self._requests.count
         if not asked or (asked < self._instance_nb and self._expects_more_requests()):
             return False
-        return self._answers.predict() and not self._has_news
+        return self._requests.predict() and not self._has_news
 
     @property
     def asking(self) -> set[int]:
         """The instances that wait for a prediction."""
-        return self._answers.asking
+        return self._requests.asking
 
     def end(self) -> None:
         """Tell all clients to close their environments."""
@@ -170,19 +163,17 @@ class Server:
         peer = self.peers.get(number)
         if peer is not None:
             self._drop(peer)
-            self._answers.forget(peer)
+            self._requests.forget(peer)
             peer.vacant, peer.failure, peer.heard = True, None, time.monotonic()
 
     def close(self) -> None:
         """Close all connections; calling it again does nothing."""
-        for peer in [*self._strangers, *self.peers.values()]:
+        for peer in self.peers.values():
             self._drop(peer)
             if peer.journal is not None:
                 peer.journal.close()
-        if self._listener is not None:
-            self._listener.close()
-            self._listener = None
-        self._selector.close()
+        self._strangers.drop_all()
+        self._listener.close()
 
     def holding_up(self, waited: Iterable[int]) -> set[int]:
         """Return those that the server waits for in the end, where it waits for some instances.
@@ -200,9 +191,9 @@ class Server:
         a batch depends on the environments, and not on how fast each of them happens to be: the
         rounding of a network's result may depend on the size of the batch.
         """
-        if self._ending or not self._answers.batches:
+        if self._ending or not self._requests.batches:
             return False
-        numbers, asking = range(1, self._instance_nb + 1), self._answers.asking
+        numbers, asking = range(1, self._instance_nb + 1), self._requests.asking
         return any(n not in asking and self._is_at_work(n) for n in numbers)
 
     def _at_work(self) -> set[int]:
@@ -214,45 +205,18 @@ class Server:
             return peer is None
         return peer.vacant or not peer.is_lost or self._replaces(number, peer.failure)
 
-    def _accept(self) -> None:
-        """Take some of the connections that wait; a flood of them must not keep the run waiting.
-
-        Where strangers are too many one of them is dropped, by chance: whoever keeps places busy
-        cannot keep a client out that tries again.
-        """
-        for _ in range(_ACCEPTED_AT_ONCE):
-            if self._listener is None:
-                return
-            try:
-                connection, _ = self._listener.accept()
-                peer = Peer(connection, self.token)
-            except BlockingIOError:
-                return
-            except OSError:  # it was gone before it was accepted
-                continue
-            if len(self._strangers) >= _MAX_STRANGERS:
-                self._drop(secrets.choice(self._strangers))
-            self._strangers.append(peer)
-            self._selector.register(connection, selectors.EVENT_READ, peer)
-
-    def _watch(self) -> None:
-        """Drop strangers that keep silent; have the selector look for what is to be sent."""
-        for peer in [*self._strangers]:
-            if time.monotonic() - peer.heard > _HANDSHAKE_TIME:
-                self._drop(peer)
-        for peer in [*self._strangers, *self.peers.values()]:
-            if peer.has_outgoing != peer.awaits_room and not peer.gone:
-                peer.awaits_room = peer.has_outgoing
-                events = selectors.EVENT_READ | (selectors.EVENT_WRITE * peer.awaits_room)
-                self._selector.modify(peer.connection, events, peer)
+    def _meet(self, connected: socket.socket, name: str) -> None:
+        peer = Peer(connected, name)
+        self._strangers.add(peer)
+        self._listener.add(peer)
 
     def _read(self, peer: Peer) -> None:
         turns = 0
         try:
-            while not peer.gone:
+            while not peer.closed:
                 turns += 1
-                frame = peer.reader.read(peer.connection)
-                if peer.handshake is None:
+                frame = peer.reader.read(peer.socket)
+                if peer.instance_id:
                     peer.hear(whole=frame is not None)
                 if frame is not None:
                     self._take(peer, frame)
@@ -273,7 +237,7 @@ class Server:
             self._drop(peer)
 
     def _take(self, peer: Peer, frame: Frame) -> None:
-        if peer.handshake is not None:
+        if not peer.instance_id:
             self._greet(peer, frame)
         elif frame.kind in self._dispatch:
             self._has_news |= frame.kind is not Kind.PREDICT
@@ -284,11 +248,8 @@ class Server:
             )
 
     def _greet(self, peer: Peer, frame: Frame) -> None:
-        handshake = peer.handshake
-        if handshake is None:
-            return
-        peer.send(handshake.answer(frame))
-        wanted = handshake.instance_id
+        answer, wanted = self._strangers.greet(peer, frame)
+        peer.send(answer)
         if wanted is None:
             return
         numbers = range(1, self._instance_nb + 1)
@@ -300,10 +261,8 @@ class Server:
             )
             peer.send(pack(Kind.ERROR, encode_error(refusal)))
             raise refusal
-        peer.handshake = None
         peer.instance_id = wanted or free[0]
         peer.reader.limit = MAX_PAYLOAD
-        self._strangers.remove(peer)
         former = self.peers.get(peer.instance_id)
         self.peers[peer.instance_id] = peer
         if former is not None:
@@ -312,14 +271,12 @@ class Server:
             peer.journal = Journal()
         peer.send(pack(Kind.SETUP, self._setup(peer)))
 
-    def _drop(self, peer: Peer) -> None:
-        if peer.gone:
+    def _drop(self, peer: Peer, reason: str = "") -> None:
+        if peer.closed:
             return
-        peer.gone = self._has_news = True
-        self._selector.unregister(peer.connection)
-        peer.connection.close()
-        if peer in self._strangers:
-            self._strangers.remove(peer)
+        self._has_news = True
+        peer.close()
+        self._strangers.forget(peer)
 
     # What clients say -----------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Answers: what environments in other processes ask of the run, handed to its services."""
+"""ServiceRequests: requests of environments in workers, answered by the services of the run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Request: TypeAlias = tuple[Peer, int, Sample]
 """Who wants a prediction, the number of the request, and for what."""
 
 
-class Answers:
+class ServiceRequests:
     """Answers requests; those for predictions are collected and answered together.
 
     Where the services have a method ``predict_batch(batch) -> batch``, requests of the same fields
@@ -68,7 +68,7 @@ class Answers:
                 answers to others before it are not read.
         """
         if frame.kind is not Kind.SHOW:
-            if peer.unread > _MOST_UNREAD:
+            if len(peer.outgoing) > _MOST_UNREAD:
                 raise ConnectionRefusedByPeerError("It asks, but does not read the answers.")
             peer.requests += 1
             if frame.number != peer.requests:
@@ -116,14 +116,14 @@ class Answers:
         if len(waiting) == 1:
             ((peer, number, sample),) = waiting
             self._answer(peer, number, "the prediction", self._services.predict, sample)
-            return not peer.has_outgoing
+            return not peer.outgoing
         groups: dict[Signature | int, list[Request]] = {}
         for place, request in enumerate(sorted(waiting, key=lambda one: one[0].instance_id)):
             key = place if self._predict_batch is None else _signature(request[2])
             groups.setdefault(key, []).append(request)
         for requests in groups.values():
             self._predict_group(requests)
-        return not any(peer.has_outgoing for peer, _, _ in waiting)
+        return not any(peer.outgoing for peer, _, _ in waiting)
 
     def _predict_group(self, requests: list[Request]) -> None:
         try:

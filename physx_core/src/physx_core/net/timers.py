@@ -1,4 +1,4 @@
-"""Timers: what is to be done some time from now, in one thread."""
+"""Timers: calls functions at later times, in one thread."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from collections.abc import Callable
 
 
 class Timers:
-    """Functions that wait for their moment.
+    """Functions to be called at later times.
 
     Attributes:
-        next: When the first of them is due, in monotonic s; infinite without any.
+        next: When the first of them is due, in monotonic s; infinite if there are none.
     """
 
     def __init__(self) -> None:
-        """Begin without any."""
+        """Start with none."""
         self.next = math.inf
         self._heap: list[tuple[float, int, Callable[[], None]]] = []
         self._numbers = itertools.count()
 
     def add(self, seconds: float, action: Callable[[], None]) -> None:
-        """Have a function called once, some time from now."""
+        """Have a function called once, `seconds` from now."""
         heapq.heappush(self._heap, (time.monotonic() + seconds, next(self._numbers), action))
         self.next = self._heap[0][0]
 
     def call_due(self) -> None:
-        """Call those whose moment has come, in the order of their moments."""
+        """Call all functions that are due, in the order of their times."""
         now = time.monotonic()
         while self.next <= now:
             action = heapq.heappop(self._heap)[2]

@@ -1,0 +1,139 @@
+"""Listener: accepts a server's connections and watches all of them with one selector."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import selectors
+import socket
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+from physx_core.net.connection import Connection
+from physx_core.net.spin_wait import spin_until
+from physx_core.net.timers import Timers
+
+_ACCEPTED_AT_ONCE = 16
+_BACKLOG = 128
+_PAUSE = 0.5
+_LOG = logging.getLogger("physx")
+
+AnyConnection = TypeVar("AnyConnection", bound=Connection)
+
+
+class Listener(Generic[AnyConnection]):
+    """The sockets of one server: one that listens, and any number that are connected.
+
+    Attributes:
+        address: Host and port where it listens; an empty host: it does not.
+        timers: Functions to be called later; whoever owns the listener calls those that are due.
+    """
+
+    def __init__(self, accepted: Callable[[socket.socket, str], Any]) -> None:
+        """Start without listening.
+
+        Args:
+            accepted: Called with each new connection, and its other side as ``host:port``.
+        """
+        self.address = ("", 0)
+        self.timers = Timers()
+        self._accepted = accepted
+        self._has_guests = False
+        self._socket: socket.socket | None = None
+        self._selector = selectors.DefaultSelector()
+        self._waker, self._wakes = socket.socketpair()
+        for one in (self._waker, self._wakes):
+            one.setblocking(False)
+        self._selector.register(self._waker, selectors.EVENT_READ)
+
+    @property
+    def is_listening(self) -> bool:
+        """Whether connections are accepted."""
+        return self._socket is not None
+
+    def listen(self, address: str, port: int) -> None:
+        """Start to accept connections.
+
+        Args:
+            address: Address of this machine.
+            port: Port, 0 for any free one.
+
+        Raises:
+            OSError: If the address is not one of this machine, or the port is in use.
+        """
+        try:
+            found = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)
+            family, place = found[0][0], found[0][4]
+            self._socket = socket.create_server(place, family=family, backlog=_BACKLOG)
+        except (OverflowError, UnicodeError, TypeError) as error:
+            raise OSError(str(error)) from error
+        self._socket.setblocking(False)
+        self.address = self._socket.getsockname()[:2]
+        self._selector.register(self._socket, selectors.EVENT_READ)
+
+    def add(self, connection: AnyConnection) -> None:
+        """Watch a connection, until it is closed."""
+        connection.attach(self._selector)
+
+    def select(self, timeout: float | None, spin: float = 0.0) -> list[tuple[AnyConnection, int]]:
+        """Return the connections with something to do, and the events.
+
+        Args:
+            timeout: How long to wait for the first, in s; None: for ever.
+            spin: How long to look for it without sleeping before that, in s.
+        """
+        select = self._selector.select
+        found = (spin and spin_until(lambda: select(0), spin)) or select(timeout)
+        ready = []
+        for key, events in found:
+            if key.data is not None:
+                ready.append((key.data, events))
+            elif key.fileobj is self._waker:
+                self._waker.recv(1024)
+            else:
+                self._has_guests = True
+        return ready
+
+    def accept(self) -> bool:
+        """Accept some of the connections that `select` found; return whether there were any.
+
+        Called after those who left have made room. A flood must not keep the others waiting.
+        """
+        if not self._has_guests:
+            return False
+        self._has_guests = False
+        for _ in range(_ACCEPTED_AT_ONCE):
+            if self._socket is None:
+                break
+            try:
+                connected, place = self._socket.accept()
+            except BlockingIOError:
+                break
+            except ConnectionError:  # it was gone before it was accepted
+                continue
+            except OSError as error:  # the process has too many open files
+                _LOG.warning("No connection can be accepted for now: %s", error)
+                self._selector.unregister(self._socket)
+                self.timers.add(_PAUSE, self._accept_again)
+                break
+            with contextlib.suppress(OSError):  # gone already
+                self._accepted(connected, "{}:{}".format(*place[:2]))
+        return True
+
+    def wake(self) -> None:
+        """End the present or next `select`; may be called from any thread."""
+        with contextlib.suppress(BlockingIOError):
+            self._wakes.send(b"x")
+
+    def close(self) -> None:
+        """Stop listening; the connections are closed by their owner."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+        self._waker.close()
+        self._wakes.close()
+        self._selector.close()
+
+    def _accept_again(self) -> None:
+        if self._socket is not None:
+            self._selector.register(self._socket, selectors.EVENT_READ)

@@ -1,0 +1,93 @@
+"""Strangers: connections that have not yet proved that they know the token."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable
+from typing import Generic
+
+from physx_core.net.frames import Frame
+from physx_core.net.handshake import ServerHandshake
+from physx_core.net.listener import AnyConnection
+from physx_core.net.timers import Timers
+
+
+class Strangers(Generic[AnyConnection]):
+    """Connections whose handshake is under way: not too many, and none for too long.
+
+    Attributes:
+        patience: How long a stranger may take for the next part of its handshake, in s.
+    """
+
+    def __init__(
+        self,
+        token: str,
+        patience: float,
+        most: int,
+        drop: Callable[[AnyConnection, str], None],
+        timers: Timers,
+    ) -> None:
+        """Start without any.
+
+        Args:
+            token: The token that they must know.
+            patience: How long a stranger may take for the next part of its handshake, in s.
+            most: How many there are at most.
+            drop: Closes a connection for a reason and calls `forget`.
+            timers: Timers of the server.
+        """
+        self.patience = patience
+        self._token, self._most, self._drop, self._timers = token, most, drop, timers
+        self._handshakes: dict[AnyConnection, ServerHandshake] = {}
+        self._is_watching = False
+
+    def __contains__(self, connection: AnyConnection) -> bool:
+        """Return whether a connection is still a stranger."""
+        return connection in self._handshakes
+
+    def add(self, connection: AnyConnection) -> None:
+        """Start the handshake with a new connection.
+
+        Where there are too many, one of them is dropped at random: whoever occupies the places
+        cannot keep out a client that tries again.
+        """
+        if len(self._handshakes) >= self._most:
+            self._drop(secrets.choice([*self._handshakes]), "too many are connected")
+        self._handshakes[connection] = ServerHandshake(self._token)
+        if not self._is_watching:
+            self._is_watching = True
+            self._timers.add(self.patience, self._drop_silent)
+
+    def greet(self, connection: AnyConnection, frame: Frame) -> tuple[bytes, int | None]:
+        """Go on with the handshake of a connection, which is forgotten once it is trusted.
+
+        Returns:
+            What to send back, and the number that the client asks for once it is trusted.
+
+        Raises:
+            ConnectionRefusedByPeerError: If it sent nonsense or does not know the token.
+        """
+        handshake = self._handshakes[connection]
+        answer = handshake.answer(frame)
+        if handshake.instance_id is not None:
+            self.forget(connection)
+        return answer, handshake.instance_id
+
+    def forget(self, connection: AnyConnection) -> None:
+        """Forget a connection; nothing happens if it is not a stranger."""
+        self._handshakes.pop(connection, None)
+
+    def drop_all(self) -> None:
+        """Drop all strangers, because the server ends."""
+        for connection in [*self._handshakes]:
+            self._drop(connection, "")
+
+    def _drop_silent(self) -> None:
+        limit = time.monotonic() - self.patience
+        for connection, handshake in [*self._handshakes.items()]:
+            if handshake.since < limit:
+                self._drop(connection, f"no handshake within {self.patience:g} s")
+        self._is_watching = bool(self._handshakes)
+        if self._is_watching:
+            self._timers.add(self.patience / 4, self._drop_silent)
