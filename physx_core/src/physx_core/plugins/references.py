@@ -6,9 +6,10 @@ import hashlib
 import importlib
 import importlib.util
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 from physx_core.config import SCRIPT_PREFIX, reference_of
 from physx_core.errors import (
@@ -19,6 +20,35 @@ from physx_core.errors import (
 )
 from physx_core.plugins.hookspecs import KINDS
 from physx_core.plugins.registry import load
+
+if TYPE_CHECKING:
+    from physx_core.components import (
+        Environment,
+        Launcher,
+        Network,
+        Optimization,
+        Transformation,
+        Visualizer,
+    )
+    from physx_core.simulation import Backend
+
+
+@overload
+def resolve(kind: Literal["environment"], reference: Any) -> Callable[..., Environment]: ...
+@overload
+def resolve(kind: Literal["network"], reference: Any) -> Callable[..., Network]: ...
+@overload
+def resolve(kind: Literal["optimization"], reference: Any) -> Callable[..., Optimization]: ...
+@overload
+def resolve(kind: Literal["transformation"], reference: Any) -> Callable[..., Transformation]: ...
+@overload
+def resolve(kind: Literal["visualizer"], reference: Any) -> Callable[..., Visualizer]: ...
+@overload
+def resolve(kind: Literal["launcher"], reference: Any) -> Callable[..., Launcher]: ...
+@overload
+def resolve(kind: Literal["backend"], reference: Any) -> Backend: ...
+@overload
+def resolve(kind: str, reference: Any) -> Any: ...
 
 
 def resolve(kind: str, reference: Any) -> Any:
