@@ -120,7 +120,7 @@ def test_without_matplotlib_the_remedy_is_named(monkeypatch):
 
 
 def test_what_is_no_log():
-    with pytest.raises(LogError, match="is no log"):
+    with pytest.raises(LogError, match="is neither a log"):
         plot(3)
     with pytest.raises(LogError, match="There is no log"):
         plot([])

@@ -128,9 +128,9 @@ def test_what_is_no_array_is_refused(value, message):
     [
         (np.zeros(2), ["a"], r"shape \(2,\), but fieldnames of shape \(1,\)"),
         (np.zeros((2, 2)), ["a", "b"], r"shape \(2, 2\)"),
-        (np.zeros(1), [3], "is 3, not a text"),
-        (np.zeros(1), [""], "not a text"),
-        ({"k": np.zeros(1)}, {"l": "a"}, "lack 'k': they are nested like the value"),
+        (np.zeros(1), [3], "is 3, not a string"),
+        (np.zeros(1), [""], "not a string"),
+        ({"k": np.zeros(1)}, {"l": "a"}, "lack 'k': they must be nested like the value"),
         ({"k": np.zeros(1)}, "a", "lack 'k'"),
         (np.zeros(2), ["a", "a"], r'a number "v\.a", but that is the name of a number of "v" too'),
     ],

@@ -1,7 +1,7 @@
-"""Logs: what was recorded of an episode, in memory and in an HDF5 file.
+"""Logs of episodes, in memory and in HDF5 files.
 
-The file has one group for each type of numbers, ``float64`` and ``int64``, with the dataset
-``values`` of shape (rows, columns) in one piece, and the datasets ``names`` and ``units`` of its
+A file has one group for each type of numbers, ``float64`` and ``int64``, with the contiguous
+dataset ``values`` of shape (rows, columns), and the datasets ``names`` and ``units`` of its
 columns; the dataset ``constants`` is a JSON text. The first column is the time.
 """
 
@@ -24,24 +24,24 @@ from physx_gym.tasks.trajectory import Trajectory
 from physx_gym.telemetry.plain_description import to_plain, world_of
 
 TIME = "time"
-"""Column of the time since the episode's begin, in s."""
+"""Column of the time since the start of the episode, in s."""
 FORMAT = "physx log"
 VERSION = 1
 POSITIONS, VELOCITIES = "state.q", "state.v"
-"""Variables of the world's positions and velocities."""
+"""Names of the variables of the world's positions and velocities."""
 
 Column = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class Log:
-    """What was recorded of an episode.
+    """The record of an episode.
 
     Attributes:
-        constants: What was true of the whole episode: the world, its state's layout, options, seed,
+        constants: Description of the episode: the world, the layout of its state, options, seed,
             units of columns.
         variables: The columns by name, each of shape (rows,); ``"time"`` is the first.
-        path: File that it is from, or that it goes to; None: none.
+        path: The file of the log; None: none.
     """
 
     constants: Mapping[str, Any]
@@ -50,7 +50,7 @@ class Log:
 
     @property
     def time(self) -> NDArray[np.float64]:
-        """Time since the episode's begin, shape (rows,), in s."""
+        """Time since the start of the episode, shape (rows,), in s."""
         return self.column(TIME)
 
     @property
@@ -61,14 +61,14 @@ class Log:
 
     @property
     def label(self) -> str:
-        """What the log is called beside others."""
+        """Name of the log in comparisons."""
         return self.path.stem if self.path else str(self.constants.get("environment", "episode"))
 
     def column(self, name: str) -> Column:
         """Return a column.
 
         Raises:
-            LogError: There is none of that name.
+            LogError: If there is none of that name.
         """
         if name not in self.variables:
             raise LogError(
@@ -78,14 +78,14 @@ class Log:
         return self.variables[name]
 
     def trajectory(self, robot: str | None = None) -> Trajectory:
-        """Return how a robot or object moved.
+        """Return the motion of a robot or object.
 
         Args:
             robot: Its name; None: everything in the world.
 
         Raises:
-            ComponentNotFoundError: There is nothing of that name in the world.
-            LogError: States were not recorded.
+            ComponentNotFoundError: If there is nothing of that name in the world.
+            LogError: If states were not recorded.
         """
         parts = self.constants.get("parts", {})
         if robot is not None and robot not in parts:
@@ -97,21 +97,21 @@ class Log:
         return Trajectory(self.time, positions, velocities)
 
     def _states(self, variable: str, place: Any) -> NDArray[np.float64]:
-        """Return a state's columns, or those from one place to another."""
+        """Return the columns of a state, or those within a range."""
         names = [name for name in self.variables if name.startswith(f"{variable}.")]
         found = [self.variables[name] for name in names[slice(*(place or (None,)))]]
         if not found:
             raise LogError(
-                f"The log {self._where} holds no states. They are recorded in evaluation mode: "
+                f"The log {self._where} contains no states. They are recorded in evaluation mode: "
                 "call eval() before reset."
             )
         return np.stack(found, axis=1)
 
     def world(self) -> World:
-        """Return the world that was simulated, made of its description.
+        """Return the simulated world, rebuilt from its description.
 
         Raises:
-            LogError: The log holds none, or what it holds makes no sense.
+            LogError: If the log does not contain a valid world.
         """
         return world_of(self.constants.get("world"), self._where)
 
@@ -120,10 +120,10 @@ class Log:
         return str(self.path) if self.path else "of this episode"
 
     def write(self, path: str | Path) -> None:
-        """Write the log to a file, which is there as a whole or not at all.
+        """Write the log to a file atomically.
 
         Raises:
-            LogError: It cannot be written, or the constants are no plain data.
+            LogError: If it cannot be written, or the constants are not plain data.
         """
         path = Path(path)
         try:
@@ -154,6 +154,6 @@ class Log:
 
 
 def _texts(texts: Iterable[str]) -> NDArray[np.bytes_]:
-    """Return texts as an array of fixed width, which HDF5 stores in one piece."""
+    """Return strings as an array of fixed width, which HDF5 stores contiguously."""
     found = [text.encode() for text in texts]
     return np.array(found, f"S{max(1, *map(len, found), 1)}")

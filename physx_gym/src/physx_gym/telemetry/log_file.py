@@ -1,4 +1,4 @@
-"""Reading log files: every claim in the file is checked, and nothing in it is run."""
+"""Reads log files: everything in a file is validated, and nothing in it is executed."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def read_log(path: str | Path) -> Log:
     """Read a log file.
 
     Args:
-        path: What `Log.write` wrote: the environment's ``log_path``.
+        path: A file written by `Log.write`: the environment's ``log_path``.
 
     Raises:
-        LogError: It is missing, is no log, or is damaged.
+        LogError: If it is missing, damaged, or not a log.
     """
     import h5py
 
@@ -43,20 +43,20 @@ Source = Log | Mapping[str, Any] | str | Path
 
 
 def as_logs(sources: Source | Sequence[Source], more: Sequence[Source] = ()) -> list[Log]:
-    """Return logs, their files, or what `RobotEnv.log_data` gave, as logs.
+    """Return logs, their files, or values of `RobotEnv.log_data`, as logs.
 
     Args:
-        sources: One, or several.
+        sources: One or several.
         more: Several.
 
     Raises:
-        LogError: Something is none of them, a file cannot be read, or nothing was recorded.
+        LogError: If something is none of these, a file cannot be read, or nothing was recorded.
     """
     several = isinstance(sources, Sequence) and not isinstance(sources, str)
     given: Any = sources if several else [sources]
     logs = [_log(each) for each in (*given, *more)]
     if not logs:
-        raise LogError("There is no log: give one or several.")
+        raise LogError("There is no log: pass one or several.")
     return logs
 
 
@@ -66,7 +66,7 @@ def _log(source: Any) -> Log:
     if isinstance(source, Mapping):
         source = Log(source.get("constants", {}), source.get("variables", {}))
     if not isinstance(source, Log):
-        raise LogError(f"{source!r} is no log, no log_data and no path of a log.")
+        raise LogError(f"{source!r} is neither a log nor log_data nor the path of a log.")
     if not len(source.variables.get(TIME, ())):
         raise LogError(
             "Nothing was recorded of the episode. In training only variables with "
@@ -85,20 +85,20 @@ class _Reader:
     def read(self) -> Log:
         """Return the log."""
         if self._file.attrs.get("format") != FORMAT:
-            raise self._error("is no log of physx")
+            raise self._error("is not a log of physx")
         version = self._file.attrs.get("version")
         if version != VERSION:
             raise self._error(f"has the version {version}; this physx reads version {VERSION}")
         constants = json.loads(self._values(self._file, "constants", "u1", 1).tobytes())
         if not isinstance(constants, dict):
-            raise self._error("has constants that are no dictionary")
+            raise self._error("has constants that are not a dictionary")
         variables: dict[str, Column] = {}
         units: dict[str, str] = {}
         for dtype in ("float64", "int64"):
             if dtype in self._file:
                 self._table(dtype, variables, units)
         if next(iter(variables), None) != TIME:
-            raise self._error("has no column of the time")
+            raise self._error("does not start with the column of the time")
         if len({len(each) for each in variables.values()}) != 1:
             raise self._error("has columns of different lengths")
         return Log({**constants, "units": units}, variables, self._path)
@@ -111,43 +111,43 @@ class _Reader:
         if not len(names) == len(own) == values.shape[1]:
             raise self._error(f"has {values.shape[1]} columns of {dtype} but {len(names)} names")
         if len(set(names)) != len(names) or set(names) & set(variables):
-            raise self._error("has two columns of one name")
+            raise self._error("has two columns of the same name")
         variables |= {name: values[:, number] for number, name in enumerate(names)}
         units |= {name: unit for name, unit in zip(names, own, strict=True) if unit}
 
     def _item(self, group: Any, name: str) -> Any:
-        """Return a member of a group; links that lead elsewhere are not followed."""
+        """Return a member of a group; links to other places are not followed."""
         import h5py
 
         if not isinstance(group, h5py.Group) or name not in group:
             raise self._error(f'lacks "{name}"')
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            raise self._error(f'has a link in the place of "{name}"')
+            raise self._error(f'has a link instead of "{name}"')
         return group[name]
 
     def _values(self, group: Any, name: str, dtype: str | None, axes: int) -> Any:
-        """Return a dataset that lies in one piece within this file.
+        """Return a dataset that is contiguous within this file.
 
-        So nothing is unpacked, and nothing larger than the file is allocated.
+        So nothing is decompressed, and nothing larger than the file is allocated.
         """
         import h5py
 
         item = self._item(group, name)
         if not isinstance(item, h5py.Dataset) or item.shape is None or item.ndim != axes:
-            raise self._error(f'has no array of {axes} axes in the place of "{name}"')
+            raise self._error(f'has no array of {axes} axes as "{name}"')
         if dtype is not None and item.dtype != np.dtype(dtype):
-            raise self._error(f'has numbers of the type {item.dtype} in "{name}"')
+            raise self._error(f'has numbers of type {item.dtype} in "{name}"')
         if item.chunks is not None or item.is_virtual or item.external:
-            raise self._error(f'has "{name}" not in one piece')
+            raise self._error(f'does not store "{name}" contiguously')
         needed, offset = item.size * item.dtype.itemsize, item.id.get_offset()
         if needed and (offset is None or offset + needed > self._size):
-            raise self._error(f'was cut: "{name}" is not all there')
+            raise self._error(f'is truncated: "{name}" is incomplete')
         return item[()]
 
     def _texts(self, group: Any, name: str) -> list[str]:
         texts = self._values(group, name, None, 1)
         if texts.dtype.kind != "S" or texts.dtype.itemsize > _NAMES_WIDTH:
-            raise self._error(f'has no texts in the place of "{name}"')
+            raise self._error(f'has no strings as "{name}"')
         return [text.decode() for text in texts.tolist()]
 
     def _error(self, what: str) -> LogError:

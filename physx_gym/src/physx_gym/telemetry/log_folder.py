@@ -1,4 +1,4 @@
-"""The folder of the logs for which nobody named a file."""
+"""Temporary folder of logs."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 KEPT = 32
-"""Logs that are kept; the oldest ones go."""
+"""Number of logs that are kept."""
 
 
 class LogFolder:
-    """A folder that is made when it is needed, and goes with its owner and all logs in it."""
+    """A temporary folder that is created when it is first needed."""
 
     def __init__(self) -> None:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
@@ -20,18 +20,18 @@ class LogFolder:
         self._count = 0
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return nothing: a copy has a folder of its own."""
+        """Return nothing: a copy uses its own folder."""
         return {}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Begin without a folder."""
+        """Start without a folder."""
         LogFolder.__init__(self)
 
     def new_path(self, name: str) -> Path:
-        """Return the path of the next log; of those before, the newest `KEPT` stay.
+        """Return the path of the next log, and delete all but the newest `KEPT`.
 
         Args:
-            name: What its name begins with.
+            name: Prefix of its name.
         """
         if self._folder is None:
             self._folder = tempfile.TemporaryDirectory(prefix="physx-logs-")

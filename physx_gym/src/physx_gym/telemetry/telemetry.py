@@ -1,4 +1,4 @@
-"""Telemetry: what is recorded of an episode, row by row, by reference."""
+"""Telemetry: registered arrays, recorded row by row."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from physx_core.errors import ConfigError, EpisodeError
 from physx_gym.telemetry.log import TIME, Log
 from physx_gym.telemetry.variables import WORD, Variable, words_of
 
-_BLOCK = 1024  # rows that are allocated at a time
+_BLOCK = 1024  # rows that are allocated at once
 
 
 class Telemetry:
     """Records registered arrays: each `record` copies all of them into one row.
 
-    Variables are read by reference, so whoever registers one updates it in place. The rows of the
-    last episode are kept until the next one begins.
+    Variables are read by reference: update them in place. The rows of the last episode are kept
+    until the next one begins.
     """
 
     def __init__(self) -> None:
@@ -35,11 +35,11 @@ class Telemetry:
         self.is_recording = False
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is registered; what was recorded is left behind, and a recording ends."""
+        """Return the registered variables, without what was recorded."""
         return {"variables": self._variables}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take up what is registered."""
+        """Restore the registered variables."""
         Telemetry.__init__(self)
         for name, variable in state["variables"].items():
             self._variables[name], self._fieldnames[name] = variable, variable.fieldnames
@@ -62,20 +62,20 @@ class Telemetry:
         """Record a variable from the next `begin` on.
 
         Registering the same arrays again does nothing; registering others under a name that was
-        there before the last episode replaces it.
+        registered before the last episode replaces that variable.
 
         Args:
             name: Name of the variable, which begins the names of its columns.
             value: An array of float64 or int64, or dictionaries and sequences of such, nested.
-            fieldnames: Name of each number, nested likewise, with a sequence of texts for each
-                array; None: the keys and numbers that lead to it.
-            namespace: What comes before the name.
-            is_eval_only: Whether it is left out where `begin` is told that this is training.
-            unit: Unit of its numbers, or of each.
+            fieldnames: Name of each number, nested likewise, with a sequence of strings for each
+                array; None: the keys and indices that lead to it.
+            namespace: Prefix of the name.
+            is_eval_only: Whether it is left out in training.
+            unit: Unit of all its numbers, or a sequence of units.
 
         Raises:
-            EpisodeError: It records just now.
-            ConfigError: A type, shape or name is wrong, or the name is taken.
+            EpisodeError: If an episode is being recorded.
+            ConfigError: If a type, shape or name is wrong, or the name is taken.
         """
         if self.is_recording:
             raise EpisodeError(
@@ -84,7 +84,7 @@ class Telemetry:
             )
         variable = Variable.of(name, value, fieldnames, namespace, unit, is_eval_only)
         known = self._variables.get(variable.name)
-        if known is not None and variable.name in self._new and not variable.is_of(known):
+        if known is not None and variable.name in self._new and not variable.is_same(known):
             raise ConfigError(
                 f'A variable "{variable.name}" is registered already. Choose another name, or a '
                 "namespace."
@@ -108,13 +108,10 @@ class Telemetry:
             taken[name] = f'"{variable.name}" too'
 
     def unregister(self, name: str) -> None:
-        """Record a variable no longer; nothing happens if there is none.
-
-        Args:
-            name: Its name, with the namespace.
+        """Remove a variable, if there is one of a name with namespace.
 
         Raises:
-            EpisodeError: It records just now.
+            EpisodeError: If an episode is being recorded.
         """
         if self.is_recording:
             raise EpisodeError(f'The variable "{name}" cannot be removed while an episode runs.')
@@ -131,13 +128,13 @@ class Telemetry:
         *,
         training: bool = False,
     ) -> None:
-        """Begin an episode; the rows of the last one are forgotten.
+        """Start an episode; the rows of the last one are discarded.
 
         Args:
             path: File to write at the end; None: none.
-            constants: What is true of the whole episode: plain data.
-            training: Whether to record only what was registered with ``is_eval_only=False``. If
-                there is nothing of that kind, nothing is recorded at all.
+            constants: Description of the episode: plain data.
+            training: Whether to record only what was registered with ``is_eval_only=False``; if
+                there is none, nothing is recorded.
         """
         self.end()
         self._path, self._constants = path, dict(constants or {})
@@ -148,20 +145,16 @@ class Telemetry:
     def record(self, time: float) -> None:
         """Record a row: copies of all variables as they are now.
 
-        A second row of the same time takes the place of the first.
+        A second row of the same time replaces the first.
 
         Args:
-            time: Time since the episode's begin, in s.
+            time: Time since the start of the episode, in s.
         """
         if self.is_recording:
             self._table.record(time)
 
     def rewind(self, time: float) -> None:
-        """Forget the rows of a time and later.
-
-        Args:
-            time: Since the episode's begin, in s.
-        """
+        """Discard the rows from a time, in s, on."""
         if self.is_recording:
             self._table.rewind(time)
 
@@ -169,7 +162,7 @@ class Telemetry:
         """End the episode and write its file; nothing happens if none is being recorded.
 
         Raises:
-            LogError: The file cannot be written.
+            LogError: If the file cannot be written.
         """
         if not self.is_recording:
             return
@@ -195,13 +188,13 @@ class Telemetry:
 
     @property
     def log(self) -> Log:
-        """Copy of what was recorded of the running episode, or of the last one, up to now."""
+        """Copy of what was recorded of the running episode, up to now, or of the last one."""
         constants = {**self._constants, "units": self._table.units}
         return Log(constants, self._table.columns(), self._path)
 
     @property
     def log_data(self) -> dict[str, Any]:
-        """What `log` holds, as ``{"constants": ..., "variables": ...}``; empty without rows."""
+        """The `log` as ``{"constants": ..., "variables": ...}``; empty without rows."""
         if not self.rows:
             return {}
         log = self.log
@@ -226,14 +219,14 @@ class _Table:
         self._times: list[float] = []
         self._blocks: list[NDArray[np.int64]] = []
         self._last = np.empty(0, WORD)  # row of the last time
-        self._free: Iterator[NDArray[np.int64]] = iter(())  # rows of the last block behind it
+        self._free: Iterator[NDArray[np.int64]] = iter(())  # unused rows of the last block
 
     @property
     def rows(self) -> int:
         return len(self._times)
 
     def record(self, time: float) -> None:
-        """Copy everything into the next row, or into the last one if it is of the same time."""
+        """Copy everything into the next row, or into the last one if that has the same time."""
         times = self._times
         if not times or times[-1] != time:
             row = next(self._free, None)
@@ -246,7 +239,7 @@ class _Table:
         np.concatenate(self._words, out=self._last)
 
     def rewind(self, time: float) -> None:
-        """Forget the rows of a time and later."""
+        """Discard the rows from a time on."""
         kept = bisect.bisect_left(self._times, time)
         del self._times[kept:], self._blocks[-(-kept // _BLOCK) :]
         self._free = iter(())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from physx_core.errors import ConfigError
 from physx_gym.shared_arrays import SharedArrays
+from physx_gym.spaces import Path, leaves, map_leaves, value_at
 
 Array = NDArray[Any]
-Leaf = tuple[tuple[Any, ...], Array]
-"""The keys that lead to an array in nested containers, and the array."""
 
 TYPES = ("float64", "int64")
 """Types of the numbers that can be recorded."""
@@ -26,11 +25,11 @@ class Variable(SharedArrays):
 
     Attributes:
         name: Its name, with the namespace.
-        value: The arrays, nested in dictionaries and sequences; the user's own.
+        value: The user's arrays, nested in dictionaries and sequences.
         fieldnames: Names of its columns, nested likewise.
         arrays: The arrays in the order of the columns.
         columns: Names of the columns of each array.
-        units: Units of the columns; empty where nobody knows.
+        units: Units of the columns; empty if unknown.
         is_eval_only: Whether it is left out in training.
     """
 
@@ -55,94 +54,76 @@ class Variable(SharedArrays):
         """Check a variable and name its columns; see `Telemetry.register`.
 
         Raises:
-            ConfigError: A type, shape or name is wrong.
+            ConfigError: If a type, shape or name is wrong.
         """
         for text in (name, namespace):
             if not isinstance(text, (str, type(None))):
-                raise ConfigError(f"A variable's name is a text, not {text!r}.")
+                raise ConfigError(f"The name of a variable must be a string, not {text!r}.")
         full = f"{namespace}.{name}" if namespace else name
         if not name:
             raise ConfigError("A variable of the telemetry needs a name.")
-        found = list(leaves(value, full))
-        names = [_names(full, leaf, fieldnames) for leaf in found]
-        size = sum(each.size for each in names)
+        arrays = dict(leaves(value))
+        names = {path: _names(full, path, each, fieldnames) for path, each in arrays.items()}
+        size = sum(each.size for each in names.values())
         units = (unit,) * size if isinstance(unit, str) else tuple(unit)
         if len(units) != size:
             raise ConfigError(f'"{full}" has {size} numbers, but {len(units)} units.')
         return cls(
             full,
             value,
-            _nested(value, iter(names)),
-            tuple(array for _, array in found),
-            tuple(tuple(each.ravel().tolist()) for each in names),
+            map_leaves(lambda path, _: names[path].tolist(), value),
+            tuple(arrays.values()),
+            tuple(tuple(each.ravel().tolist()) for each in names.values()),
             units,
             is_eval_only,
         )
 
-    def is_of(self, other: Variable) -> bool:
-        """Return whether the other is the same: the same arrays under the same names."""
+    def is_same(self, other: Variable) -> bool:
+        """Return whether the other one has the same arrays under the same names."""
         same = len(self.arrays) == len(other.arrays) and self.columns == other.columns
         pairs = zip(self.arrays, other.arrays, strict=True) if same else ()
         return same and all(_memory(mine) == _memory(its) for mine, its in pairs)
 
 
-def leaves(value: Any, name: str, keys: tuple[Any, ...] = ()) -> Iterator[Leaf]:
-    """Return the arrays in nested containers, in their order.
-
-    Raises:
-        ConfigError: Something in it is no array of float64 or int64.
-    """
-    where = ".".join([name, *map(str, keys)])
-    if isinstance(value, Mapping):
-        for key, each in value.items():
-            yield from leaves(each, name, (*keys, key))
-    elif isinstance(value, (list, tuple)):
-        for number, each in enumerate(value):
-            yield from leaves(each, name, (*keys, number))
-    elif isinstance(value, np.ndarray):
-        if value.dtype.name not in TYPES or not value.dtype.isnative:
-            raise ConfigError(
-                f'"{where}" is an array of {value.dtype}; only float64 and int64 can be recorded. '
-                "Keep the numbers in an array of one of them, and register that."
-            )
-        yield keys, value
-    else:
-        raise ConfigError(
-            f'"{where}" is {value!r}, a {type(value).__name__}. Variables are registered by '
-            "reference: keep the numbers in an array of float64 or int64, and register that."
-        )
-
-
-def _names(name: str, leaf: Leaf, fieldnames: Any) -> Array:
+def _names(name: str, path: Path, array: Any, fieldnames: Any) -> Array:
     """Return the names of an array's numbers as an array of its shape."""
-    keys, array = leaf
+    prefix = ".".join([name, *map(str, path)])
+    _check_array(prefix, array)
     if fieldnames is None:
-        prefix = ".".join([name, *map(str, keys)])
         numbers = np.ndindex(array.shape)
         flat = [".".join([prefix, *map(str, number)]) for number in numbers]
     else:
-        flat = [f"{name}.{own}" for own in _flat(_below(name, fieldnames, keys), name, array)]
+        try:
+            own = value_at(fieldnames, path)
+        except (KeyError, IndexError, TypeError) as error:
+            raise ConfigError(
+                f'The fieldnames of "{name}" lack {".".join(map(str, path))!r}: they must be '
+                "nested like the value."
+            ) from error
+        flat = [f"{name}.{each}" for each in _flatten(own, name, array)]
     named = np.empty(array.size, object)
     named[:] = flat
     return named.reshape(array.shape)
 
 
-def _below(name: str, fieldnames: Any, keys: tuple[Any, ...]) -> Any:
-    for key in keys:
-        try:
-            fieldnames = fieldnames[key]
-        except (KeyError, IndexError, TypeError) as error:
-            raise ConfigError(
-                f'The fieldnames of "{name}" lack {key!r}: they are nested like the value.'
-            ) from error
-    return fieldnames
+def _check_array(where: str, value: Any) -> None:
+    if not isinstance(value, np.ndarray):
+        raise ConfigError(
+            f'"{where}" is {value!r}, a {type(value).__name__}. Variables are registered by '
+            "reference: keep the numbers in an array of float64 or int64, and register that."
+        )
+    if value.dtype.name not in TYPES or not value.dtype.isnative:
+        raise ConfigError(
+            f'"{where}" is an array of {value.dtype}; only float64 and int64 can be recorded. '
+            "Keep the numbers in an array of one of them, and register that."
+        )
 
 
-def _flat(fieldnames: Any, name: str, array: Array) -> Sequence[str]:
-    """Return the own names of an array's numbers.
+def _flatten(fieldnames: Any, name: str, array: Array) -> Sequence[str]:
+    """Return the names of an array's numbers.
 
-    A text is the name of a single number; otherwise there are nested sequences of the array's
-    shape, or one sequence for all numbers.
+    They are a string for a single number, nested sequences of the array's shape, or a flat sequence
+    for all numbers.
     """
     names = np.array([fieldnames] if isinstance(fieldnames, str) else fieldnames, object)
     fits = names.shape == array.shape or (names.ndim == 1 and names.size == array.size)
@@ -153,29 +134,21 @@ def _flat(fieldnames: Any, name: str, array: Array) -> Sequence[str]:
     flat: list[Any] = names.ravel().tolist()
     wrong = [each for each in flat if not isinstance(each, str) or not each]
     if wrong:
-        raise ConfigError(f'A fieldname of "{name}" is {wrong[0]!r}, not a text.')
+        raise ConfigError(f'A fieldname of "{name}" is {wrong[0]!r}, not a string.')
     return flat
-
-
-def _nested(value: Any, names: Iterator[Array]) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _nested(each, names) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_nested(each, names) for each in value]
-    return next(names).tolist()
 
 
 # Memory -------------------------------------------------------------------------------------
 
 WORD = np.dtype(np.int64)
-"""What numbers are copied as: 8 bytes, whatever they mean."""
+"""Type that numbers are copied as: 8 bytes, whatever they mean."""
 
 
 def words_of(arrays: Iterable[Array]) -> list[NDArray[np.int64]]:
-    """Return one-dimensional views, as few as possible, that are all numbers in order."""
+    """Return as few one-dimensional views as possible of all numbers of arrays, in order."""
     found: list[NDArray[np.int64]] = []
     for view in (view for array in arrays for view in _flat_views(array) if view.size):
-        both = _joined(found[-1], view) if found else None
+        both = _join(found[-1], view) if found else None
         if both is None:
             found.append(view)
         else:
@@ -191,8 +164,8 @@ def _flat_views(array: Array) -> Iterator[NDArray[np.int64]]:
             yield from _flat_views(part)
 
 
-def _joined(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Return two views as one, where they follow each other in one owner's memory."""
+def _join(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64] | None:
+    """Return two views as one, if they are adjacent in the memory of one array."""
     owner, step = _owner(first), WORD.itemsize
     if _owner(second) is not owner or not owner.flags.c_contiguous or owner.itemsize != step:
         return None
