@@ -28,7 +28,6 @@ class BodyObserver(ObserverBlock):
 
     Attributes:
         bodies: Names of the links.
-        compute_rpy: Whether ``roll_pitch_yaw`` is a feature.
     """
 
     def __init__(
@@ -47,7 +46,7 @@ class BodyObserver(ObserverBlock):
             env: The environment below, with a `MahonyFilter` somewhere.
             update_ratio: See `Block`.
             bodies: Names of the links; None: those with an IMU.
-            compute_rpy: See above.
+            compute_rpy: Whether ``roll_pitch_yaw`` is a feature.
 
         Raises:
             ConfigError: If there is no `MahonyFilter` below, or a joint does not have an encoder.

@@ -44,12 +44,6 @@ class MahonyFilter(ObserverBlock):
 
     Attributes:
         sensors: Names of the IMUs.
-        kp: How fast the attitude follows the acceleration, in rad/s.
-        ki: How fast the bias follows it, in rad/s².
-        exact_init: Whether an episode begins with the IMU's true orientation; otherwise with the
-            attitude for which its acceleration points up, not rotated about the vertical.
-        ignore_twist: Whether to remove all rotation about the vertical.
-        compute_rpy: Whether ``roll_pitch_yaw`` is a feature.
         estimates: A column for each IMU: quaternion, rates without their bias, bias, last rates,
             and with `compute_rpy` roll, pitch and yaw; shape (13 or 16, IMUs).
     """
@@ -74,11 +68,12 @@ class MahonyFilter(ObserverBlock):
             name: Name within the pipeline.
             env: The environment below.
             update_ratio: See `Block`.
-            kp: See above.
-            ki: See above.
-            exact_init: See above.
-            ignore_twist: See above.
-            compute_rpy: See above.
+            kp: How fast the attitude follows the acceleration, in rad/s.
+            ki: How fast the bias follows it, in rad/s².
+            exact_init: Whether an episode begins with the IMU's true orientation; otherwise with
+                the attitude for which its acceleration points up, not rotated about the vertical.
+            ignore_twist: Whether to remove all rotation about the vertical.
+            compute_rpy: Whether ``roll_pitch_yaw`` is a feature.
 
         Raises:
             ConfigError: If there is no IMU, or a gain is negative.

@@ -29,8 +29,6 @@ class PDAdapter(ControllerBlock):
 
     Attributes:
         controller: The PD controller below.
-        order: 0: the action is positions; 1: velocities.
-        is_instantaneous: See above.
     """
 
     def __init__(
@@ -49,8 +47,8 @@ class PDAdapter(ControllerBlock):
             name: Name within the pipeline.
             env: The environment below: a `ControlledEnv` with a `PDController`.
             update_ratio: See `Block`; not used with `is_instantaneous`.
-            order: See above.
-            is_instantaneous: See above.
+            order: 0: the action is positions; 1: velocities.
+            is_instantaneous: Whether to move as fast as the controller's bounds allow.
             deadband: Changes of position, or velocities, below which a target does not move; in
                 rad, m, rad/s or m/s: a number, or one for each motor.
 

@@ -20,20 +20,20 @@ class ShowLog:
     files: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
     """The log files."""
     columns: tuple[str, ...] = ()
-    """Only columns whose names begin so."""
+    """Only columns whose names begin with one of these."""
     plot: str | None = None
-    """Write a plot of the columns, of all files together, to this file."""
+    """Write a plot of the columns of all files to this file."""
     replay: str | None = None
-    """Write a recording of the episodes side by side, for the viewer, to this file (.rrd)."""
+    """Write a recording of all episodes, side by side, for the viewer to this file (.rrd)."""
 
 
 def run(words: Sequence[str]) -> None:
     """Print each log as a table, or write a plot or a recording.
 
     Raises:
-        LogError: A file cannot be read, or holds nothing of what is wanted.
-        MissingLibraryError: Matplotlib is not installed.
-        PluginNotFoundError: The viewer is not installed.
+        LogError: If a file cannot be read, or does not hold what was asked for.
+        MissingLibraryError: If Matplotlib is not installed.
+        PluginNotFoundError: If the viewer is not installed.
     """
     options = tyro.cli(ShowLog, args=words, prog="physx log")
     logs = [read_log(file) for file in options.files]
@@ -52,11 +52,11 @@ def run(words: Sequence[str]) -> None:
 
 
 def _print_table(log: Log, columns: tuple[str, ...]) -> None:
-    """Print what the log is of, and a line for each column."""
+    """Print what was recorded, and a line for each column."""
     rows = len(log.time)
     duration = log.time[-1] - log.time[0] if rows else 0.0
-    of = log.constants.get("environment", "?"), log.constants.get("backend", "?")
-    print(f"{log.path}: {of[0]} on {of[1]}, seed {log.constants.get('seed', '?')}")
+    environment, backend = (log.constants.get(name, "?") for name in ("environment", "backend"))
+    print(f"{log.path}: {environment} on {backend}, seed {log.constants.get('seed', '?')}")
     print(f"{rows} rows of {len(log.variables)} columns, {duration:g} s\n")
     chosen = [name for name in log.variables if name.startswith(columns or "") and name != TIME]
     width = max(map(len, chosen), default=4)

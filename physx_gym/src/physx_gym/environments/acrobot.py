@@ -1,4 +1,4 @@
-"""Two links that swing up."""
+"""Acrobot: two links that swing up."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ HEIGHT = 1.0
 class AcrobotEnv(OneMotorEnv):
     """Swing two links of 1 m above a bar 1 m over the shoulder: ``physx/Acrobot-v0``.
 
-    Only the elbow is driven. Action: a torque of -1, 0 or 1 N m; or, if `continuous`, a number
-    between. Observation, shape (6,): cosine and sine of the shoulder's angle, 0 where the link
-    hangs down, those of the elbow's, and both velocities in rad/s. Reward: -1 for every step,
+    Only the elbow is driven. Action: a torque of -1, 0 or 1 N m; or, if `continuous`, any number
+    in between. Observation, shape (6,): cosine and sine of the shoulder's angle, which is 0 if the
+    link hangs down, and of the elbow's, then both velocities in rad/s. Reward: -1 for every step,
     but 0 for the last. It terminates above the bar, and is truncated after 500 steps of 0.2 s.
 
     The task is that of R. S. Sutton, "Generalization in reinforcement learning", 1996.
     """
 
     def __init__(self, *, backend: Any = BACKEND, continuous: bool = False, **options: Any) -> None:
-        """Make the environment.
+        """Create the environment.
 
         Args:
             backend: Reference of the engine.
-            continuous: Whether the torque is a number rather than a choice.
-            options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
+            continuous: Whether the action is a number instead of a choice.
+            options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
         options = {"simulation_duration_max": 100.0, **options}
         super().__init__(

@@ -1,4 +1,4 @@
-"""Four legs that learn to run."""
+"""Ant: a four-legged robot that learns to run."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ FARTHEST = 1000.0
 class AntEnv(RobotEnv):
     """Run along the x axis on four legs of two joints: ``physx/Ant-v0``.
 
-    Action, shape (8,): torques of the joints, as shares of 15 N m. Observation, shape (27,): height
-    of the torso in m; its orientation, a quaternion x, y, z, w; the joints' positions in rad;
-    velocity of the torso in its own frame, in m/s and rad/s; the joints' velocities. Reward: mean
-    velocity along x in the step, in m/s, plus 1, less half the sum of the squared actions;
-    ``info["reward"]`` has the parts. It terminates where the torso is below 0.12 m, above 1 m, or
+    Action, shape (8,): torques of the joints, as fractions of 15 N m. Observation, shape (27,):
+    height of the torso in m; its orientation, a quaternion x, y, z, w; the joints' positions in
+    rad; velocity of the torso in its own frame, in m/s and rad/s; the joints' velocities. Reward:
+    mean velocity along x in the step, in m/s, plus 1, minus half the sum of the squared actions;
+    ``info["reward"]`` has the parts. It terminates if the torso is below 0.12 m, above 1 m, or
     upside down, and is truncated after 1000 steps of 50 ms.
 
     The task is that of J. Schulman et al., "High-dimensional continuous control using generalized
@@ -35,11 +35,11 @@ class AntEnv(RobotEnv):
     """
 
     def __init__(self, *, backend: Any = BACKEND, **options: Any) -> None:
-        """Make the environment.
+        """Create the environment.
 
         Args:
             backend: Reference of the engine.
-            options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
+            options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
         world = World([Robot("ant", fixed_base=False)], period=6.25e-3, ground=Ground())
         options = {"simulation_duration_max": 50.0, **options}
@@ -78,12 +78,12 @@ class AntEnv(RobotEnv):
         self._place, self._before = memory
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Observe all of the state but where on the ground the ant is."""
+        """Observe the whole state except the position on the ground."""
         state = measurement["states"]["agent"]
         self.observation[:13], self.observation[13:] = state["q"][2:], state["v"]
 
     def compute_command(self, action: Any, command: Vector) -> None:
-        """Drive the joints."""
+        """Scale the action to torques."""
         np.multiply(action, self._strength, out=command)
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:

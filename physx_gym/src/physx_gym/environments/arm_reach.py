@@ -1,4 +1,4 @@
-"""An arm that reaches for points."""
+"""An arm that reaches for random points."""
 
 from __future__ import annotations
 
@@ -30,22 +30,22 @@ class ArmReachEnv(RobotEnv):
     """Reach for a point with the hand of a Franka Panda: ``physx/ArmReach-v0``.
 
     Needs the robots of ``physx-dart[robots]``. Action, shape (7,): velocities of the joints, as
-    shares of 1.5 rad/s; a controller follows them and carries the arm's weight. Observation, shape
-    (20,): positions and velocities of the joints, in rad and rad/s; position of the hand, and from
-    there to the point, in m. Reward: minus the distance in m, less a hundredth of the mean squared
-    action; ``info["is_success"]`` says whether it is below 5 cm. An episode never terminates and is
-    truncated after 100 steps of 40 ms.
+    fractions of 1.5 rad/s; a controller follows them and compensates gravity. Observation, shape
+    (20,): positions and velocities of the joints, in rad and rad/s; position of the hand, and
+    vector from there to the point, in m. Reward: minus the distance in m, minus a hundredth of the
+    mean squared action; ``info["is_success"]`` is whether the distance is below 5 cm. An episode
+    never terminates and is truncated after 100 steps of 40 ms.
     """
 
     def __init__(self, *, backend: Any = BACKEND, **options: Any) -> None:
-        """Make the environment.
+        """Create the environment.
 
         Args:
             backend: Reference of the engine.
-            options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
+            options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
         fingers = JointSettings(stiffness=1e3, damping=50.0)
-        # Damping by the engine, at every physics step: the wrist is too light for the controller's.
+        # The engine damps at every physics step: the wrist is too light for the controller's period.
         pairs = zip(_ARM, DAMPING.tolist(), strict=True)
         damped = {joint: JointSettings(damping=damping) for joint, damping in pairs}
         robot = Robot(
@@ -109,7 +109,7 @@ class ArmReachEnv(RobotEnv):
         seen[14:17], seen[17:] = hand, self.goal - hand
 
     def compute_command(self, action: Any, command: Vector) -> None:
-        """Follow the velocities, and carry the arm's weight."""
+        """Follow the velocities, and compensate gravity."""
         self._target += SPEED * self.control_dt * action
         np.clip(self._target, self._lower, self._upper, out=self._target)
         state, simulation = self.robot_state, self.simulator.simulation
@@ -120,7 +120,7 @@ class ArmReachEnv(RobotEnv):
         command += weight
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
-        """Return no: the hand is to stay at the point."""
+        """Return no termination: the hand is to stay at the point."""
         return False, not self.is_inside()
 
     def compute_reward(self, terminated: bool, info: Info) -> float:

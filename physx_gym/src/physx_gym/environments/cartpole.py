@@ -1,4 +1,4 @@
-"""A pole on a cart, to be kept upright."""
+"""Cartpole: a pole on a cart, to be kept upright."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ STEEPEST = math.radians(12.0)
 
 
 class CartpoleEnv(OneMotorEnv):
-    """Keep a pole upright by pushing the cart on which it stands: ``physx/Cartpole-v0``.
+    """Keep a pole upright by pushing the cart that it stands on: ``physx/Cartpole-v0``.
 
     Action: push to the left, not at all, or to the right, with 10 N; or, if `continuous`, the push
-    as a share of that. Observation, shape (4,): position of the cart in m, angle of the pole in
-    rad, and their velocities. Reward: 1 for every step. It terminates where the pole leans by more
+    as a fraction of that. Observation, shape (4,): position of the cart in m, angle of the pole in
+    rad, and their velocities. Reward: 1 for every step. It terminates if the pole leans by more
     than 12 degrees or the cart is more than 2.2 m away, and is truncated after 500 steps of 20 ms.
 
     The task is that of A. G. Barto, R. S. Sutton and C. W. Anderson, "Neuronlike adaptive elements
@@ -30,12 +30,12 @@ class CartpoleEnv(OneMotorEnv):
     """
 
     def __init__(self, *, backend: Any = BACKEND, continuous: bool = False, **options: Any) -> None:
-        """Make the environment.
+        """Create the environment.
 
         Args:
             backend: Reference of the engine.
-            continuous: Whether the push is a number rather than a choice.
-            options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
+            continuous: Whether the action is a number instead of a choice.
+            options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
         options = {"simulation_duration_max": 10.0, **options}
         super().__init__(

@@ -1,4 +1,4 @@
-"""Robots with one motor, which the arrow keys drive."""
+"""Robots with a single motor, which can be driven with the arrow keys."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _KEYS = {"Left": 0, "Right": 2}
 
 
 class OneMotorEnv(RobotEnv):
-    """A robot whose only motor pushes with all its strength to one side or the other, or rests.
+    """A robot whose only motor pushes with full strength in either direction, or rests.
 
-    Action: 0, 1 and 2 push to the negative side, not at all, and to the positive side; or, if
-    `continuous`, a number from -1 to 1 is the share of the motor's strength.
+    Action: 0, 1 and 2 push in the negative direction, not at all, and in the positive direction;
+    or, if `continuous`, a number from -1 to 1 is the fraction of the motor's strength.
 
     Attributes:
-        continuous: Whether the push is a number rather than a choice.
-        strength: What the motor gives at most, in N m or N.
+        continuous: Whether the action is a number instead of a choice.
+        strength: Largest torque or force of the motor, in N m or N.
     """
 
     def __init__(
@@ -39,17 +39,17 @@ class OneMotorEnv(RobotEnv):
         continuous: bool,
         **options: Any,
     ) -> None:
-        """Make the environment.
+        """Create the environment.
 
         Args:
-            robot: The robot; it touches nothing.
+            robot: The robot; it does not collide.
             joint: The joint that the motor drives.
-            strength: What the motor gives at most, in N m or N.
-            period: Time of a physics step, in s.
-            step_dt: Time of a step, in s.
+            strength: Largest torque or force of the motor, in N m or N.
+            period: Duration of a physics step, in s.
+            step_dt: Duration of a step, in s.
             backend: Reference of the engine.
-            continuous: Whether the push is a number rather than a choice.
-            options: Of `RobotEnv`.
+            continuous: Whether the action is a number instead of a choice.
+            options: Options of `RobotEnv`.
         """
         self.continuous, self.strength = continuous, strength
         world = World([Robot(robot, collisions="none")], period=period)

@@ -1,4 +1,4 @@
-"""A box that is pushed to a place."""
+"""A gantry that pushes a box to a goal."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ SIZE = (0.25, 0.25, 0.2)
 
 
 class PushBoxEnv(RobotEnv):
-    """Push a box of 0.5 kg over the ground to a place: ``physx/PushBox-v0``.
+    """Push a box of 0.5 kg over the ground to a goal: ``physx/PushBox-v0``.
 
     The robot is a gantry that moves a stick over the ground. It needs an engine with contacts
-    between things that both move: DART. Action, shape (2,): forces along x and y, as shares of
-    20 N. Observation, shape (15,): position and velocity of the stick; position of the box, cosine
-    and sine of its heading, its velocity and rate of turning; from the stick to the box, and from
+    between moving bodies: DART. Action, shape (2,): forces along x and y, as fractions of 20 N.
+    Observation, shape (15,): position and velocity of the stick; position of the box, cosine and
+    sine of its heading, its linear and angular velocity; vectors from the stick to the box and from
     the box to the goal; in m, m/s and rad/s. Reward: minus the box's distance from the goal and a
-    quarter of the stick's from the box, in m; 10 more where the box is within 8 cm of the goal,
-    which terminates. It is truncated after 200 steps of 50 ms, or where the box is out of reach.
+    quarter of the stick's from the box, in m; 10 more when the box is within 8 cm of the goal,
+    which terminates. It is truncated after 200 steps of 50 ms, or if the box is out of reach.
     """
 
     def __init__(self, *, backend: Any = BACKEND, **options: Any) -> None:
-        """Make the environment.
+        """Create the environment.
 
         Args:
             backend: Reference of the engine; it needs the feature ``body_contacts``.
-            options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
+            options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
         self.goal = np.zeros(2)
         rubs = JointSettings(damping=8.0)
@@ -89,7 +89,7 @@ class PushBoxEnv(RobotEnv):
         scene.update_lines("goal", positions=self._goal_circle())
 
     def _goal_circle(self) -> Vector:
-        """Return points on the ground around the goal, where the box's middle has to be."""
+        """Return points on a circle around the goal, in which the center of the box must be."""
         angles = np.linspace(0.0, 2 * math.pi, 33)
         around = CLOSE * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         return np.insert(self.goal + around, 2, 0.01, axis=1)
@@ -107,7 +107,7 @@ class PushBoxEnv(RobotEnv):
         seen[13:15] = self.goal - pose[:2]
 
     def compute_command(self, action: Any, command: Vector) -> None:
-        """Drive the gantry."""
+        """Scale the action to forces."""
         np.multiply(action, FORCE, out=command)
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
@@ -117,7 +117,7 @@ class PushBoxEnv(RobotEnv):
         return info["is_success"], bool(np.abs(box).max() > REACH) or not self.is_inside()
 
     def compute_reward(self, terminated: bool, info: Info) -> float:
-        """Return the reward for a box that is near its goal."""
+        """Return the reward for a box close to its goal."""
         seen = self.observation.tolist()
         near, left = math.hypot(*seen[11:13]), math.hypot(*seen[13:15])
         return (10.0 if terminated else 0.0) - left - 0.25 * near
@@ -126,7 +126,7 @@ class PushBoxEnv(RobotEnv):
 def _away_from(
     random: np.random.Generator, place: Vector, nearest: float, farthest: float
 ) -> Vector:
-    """Return a point within the gantry's reach at a distance from a place, in m."""
+    """Return a random point within the gantry's reach at a distance from a place, in m."""
     while True:
         angle, distance = random.uniform(-math.pi, math.pi), random.uniform(nearest, farthest)
         point = place + distance * np.array([math.cos(angle), math.sin(angle)])

@@ -28,23 +28,23 @@ _UP = np.array([[0.0, 0.0, 1.0]])
 class QuadrupedEnv(RobotEnv):
     """Walk forward with a Unitree A1: ``physx/Quadruped-v0``.
 
-    Needs the robots of ``physx-dart[robots]``. Action, shape (12,): where the joints shall be, as
-    shares of 0.4 rad from a standing pose; a controller of 40 N m/rad and 1 N m s/rad takes them
-    there, 200 times a second. Observation, shape (45,): the vertical in the frame of the trunk;
+    Needs the robots of ``physx-dart[robots]``. Action, shape (12,): target positions of the joints,
+    as fractions of 0.4 rad from a standing pose; a controller of 40 N m/rad and 1 N m s/rad follows
+    them, 200 times a second. Observation, shape (45,): the vertical in the frame of the trunk;
     linear and angular velocity of the trunk in its frame, in m/s and rad/s; the joints' positions,
     from the standing pose, in rad, and velocities; the last action. Reward: up to 1 for a forward
-    velocity of `speed`, up to 0.5 for going straight, 0.25 for staying up, less costs of torques
-    and of hasty actions; ``info["reward"]`` has the parts. It terminates where the trunk is below
+    velocity of `speed`, up to 0.5 for going straight, 0.25 for staying up, minus costs of torques
+    and of abrupt actions; ``info["reward"]`` has the parts. It terminates if the trunk is below
     0.12 m or leans by more than 1 rad, and is truncated after 1000 steps of 20 ms.
     """
 
     def __init__(self, *, backend: Any = BACKEND, speed: float = 0.6, **options: Any) -> None:
-        """Make the environment.
+        """Create the environment.
 
         Args:
             backend: Reference of the engine.
-            speed: Forward velocity that is wanted, in m/s.
-            options: Of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
+            speed: Desired forward velocity, in m/s.
+            options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
         self.speed = float(speed)
         world = World([Robot("a1/a1", fixed_base=False)], period=2.5e-3, ground=Ground())
@@ -99,7 +99,7 @@ class QuadrupedEnv(RobotEnv):
         seen[21:33], seen[33:] = v[6:], self._previous
 
     def compute_command(self, action: Any, command: Vector) -> None:
-        """Drive the joints to where they shall be."""
+        """Drive the joints to their target positions."""
         state = self.robot_state
         np.multiply(action, RANGE, out=command)
         command += self._stand
