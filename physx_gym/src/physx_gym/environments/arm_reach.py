@@ -45,7 +45,7 @@ class ArmReachEnv(RobotEnv):
             options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
         fingers = JointSettings(stiffness=1e3, damping=50.0)
-        # The engine damps at every physics step: the wrist is too light for the controller's period.
+        # The engine damps at every physics step: the wrist is too light for the controller's rate.
         pairs = zip(_ARM, DAMPING.tolist(), strict=True)
         damped = {joint: JointSettings(damping=damping) for joint, damping in pairs}
         robot = Robot(
