@@ -16,6 +16,8 @@ Batch: TypeAlias = dict[str, Array]
 Tensors: TypeAlias = dict[str, Any]
 """Field name to a tensor of the network's library, with a leading sample axis."""
 Vector: TypeAlias = NDArray[np.float64]
+Index: TypeAlias = NDArray[np.intp]
+"""Numbers of rows."""
 Records: TypeAlias = NDArray[np.void]
 """Array of records: one row of named columns for each contact or ray."""
 Color: TypeAlias = str | Sequence[float]

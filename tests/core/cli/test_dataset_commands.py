@@ -157,7 +157,7 @@ def test_minari_by_commands(session, run, tmp_path):
         (["export", "run", "out"], "--to"),
         (["export", "run", "out", "--to", "npz", "--compression", "zip"], "deflate"),
         (["export", "run", "out", "--to", "npz", "--mode", "trainin"], 'Did you mean "training"'),
-        (["export", "run", "run", "--to", "npz"], "there already"),
+        (["export", "run", "run", "--to", "npz"], "exists already"),
         (["export", "run", "out", "--to", "parquet"], "--mode"),
         (["import", __file__, "out"], "neither a NumPy archive"),
         (["import", "a.npz", "out"], "There is no file"),

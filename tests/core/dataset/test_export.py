@@ -274,7 +274,7 @@ def test_unfit_exports_are_refused(everything, tmp_path):
         export(everything, "npz", out, options=ExportOptions(actions=["f8_0"]))
     with pytest.raises(DatasetError, match="no mode"):
         export(everything, "npz", out, modes=["test"])
-    with pytest.raises(ExchangeError, match="there already"):
+    with pytest.raises(ExchangeError, match="exists already"):
         export(everything, "npz", tmp_path)
     with pytest.raises(ExchangeError, match="does not exist"):
         export(everything, "npz", tmp_path / "none" / "out")

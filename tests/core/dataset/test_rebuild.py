@@ -42,7 +42,7 @@ def test_a_manifest_edited_by_hand_is_refused_and_then_checked(folder, thousand)
     path.write_text(text.replace('"first"', '"second"'))
     with pytest.raises(DatasetError, match=r"dataset\.json.*edited by hand.*repair"):
         Dataset.open(folder)
-    assert "it fits the files and is kept" in Dataset.repair(folder)[0]
+    assert "it matches the files and is kept" in Dataset.repair(folder)[0]
     with Dataset.open(folder) as dataset:
         assert dataset.info == {"note": "second"}
     thousand.check(folder, thousand.rows)
@@ -163,6 +163,6 @@ def test_a_newer_version_is_refused(folder, thousand):
     plain = json.loads(path.read_text()) | {"format_version": 2}
     path.write_text(json.dumps(plain))
     with pytest.raises(
-        DatasetError, match=r"version 2 of the dataset's format; this physx reads 1"
+        DatasetError, match=r"version 2 of the dataset's format, but this physx reads version 1"
     ):
         Dataset.open(folder)

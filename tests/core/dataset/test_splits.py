@@ -162,11 +162,11 @@ def test_trajectories_of_unequal_length_come_near_to_the_shares(folder):
 @pytest.mark.parametrize(
     ("shares", "by", "message"),
     [
-        ({"a": 0.9, "b": 0.2}, "row", "1 at most together"),
-        ({"a": 0.9, "b": 0}, "row", "above 0"),
-        ({"a": -0.1}, "row", "above 0"),
-        ({}, "row", "above 0"),
-        ({"a": float("nan")}, "row", "above 0"),
+        ({"a": 0.9, "b": 0.2}, "row", "add up to 1 at most"),
+        ({"a": 0.9, "b": 0}, "row", "must be positive"),
+        ({"a": -0.1}, "row", "must be positive"),
+        ({}, "row", "must be positive"),
+        ({"a": float("nan")}, "row", "must be positive"),
         ({"a": 0.5, "b": 1e-6}, "row", '"b" would be empty'),
         ({"a": 0.5}, "time", '"row" or "episode"'),
         (dict.fromkeys(map(str, range(61)), 1 / 61), "episode", "60 trajectories"),

@@ -1,6 +1,6 @@
 """Datasets: samples in HDF5 partitions, written at the speed of the disk and safe at any moment.
 
-The format is described in `physx_core.dataset.store`: `partition_format` and `manifest`.
+`physx_core.dataset.store` describes the format: `partition_format` and `manifest`.
 """
 
 from __future__ import annotations

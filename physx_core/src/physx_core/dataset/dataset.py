@@ -1,32 +1,32 @@
-"""Dataset: samples by mode and field, written by one process and read by any."""
+"""Dataset: samples by mode and field, written by one process or by several, and read by any."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, Unpack
 
 import numpy as np
-from numpy.typing import DTypeLike
 
+from physx_core import files
 from physx_core.closeable import Closeable
-from physx_core.dataset.read import strategy as strategies
 from physx_core.dataset.read.cache import ColumnCache
 from physx_core.dataset.read.episodes import Episode, find_episodes
+from physx_core.dataset.read.mode_statistics import compute_statistics
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.read.sampling import Batches
-from physx_core.dataset.read.splits import Source, Subset, split
-from physx_core.dataset.read.views import ModeView
-from physx_core.dataset.repair import recovery
+from physx_core.dataset.read.sampling import BatchOptions, BatchReader
+from physx_core.dataset.read.splits import Subset, split
+from physx_core.dataset.read.strategy import Strategy
+from physx_core.dataset.read.views import ModeView, row_numbers
+from physx_core.dataset.repair import recovery, repair
 from physx_core.dataset.repair.report import find_problems, summarize
-from physx_core.dataset.store.manifest import Manifest
-from physx_core.dataset.store.mode_statistics import statistics_of
+from physx_core.dataset.store.manifest import Manifest, to_plain_info
 from physx_core.dataset.write.appender import Appender
+from physx_core.dataset.write.merging import add_partitions, drop_partition
 from physx_core.dataset.write.opening import WriterOptions, create, extend
+from physx_core.dataset.write.updating import check_update, update_rows
 from physx_core.dataset.write.writer import Writer
-from physx_core.dataset.writing import Changes
-from physx_core.errors import UsageError
+from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
 from physx_core.statistics import Normalization
 from physx_core.typing import Batch
@@ -34,29 +34,21 @@ from physx_core.typing import Batch
 MAX_FILE_SIZE = 0.25
 
 
-class Dataset(Changes, Closeable):
-    """A folder of partition files with its manifest; make one with `create` or `open`.
+class Dataset(Closeable):
+    """A folder of partition files with its manifest, created or opened by `create` and `open`.
 
-    A context manager. One process at a time may write; any number may read, also meanwhile. What
-    `append` returned from survives the death of the process at any later moment.
+    A context manager. Unless it is shared, one process at a time may write; any number may read,
+    even meanwhile. What `append` has stored survives if the process dies at any later moment.
 
     Attributes:
         directory: The folder.
         session: Session that new partitions are named after; empty when only reading.
     """
 
-    def __init__(
-        self,
-        directory: Path,
-        manifest: Manifest,
-        writer: Writer | None = None,
-        lock: int | None = None,
-    ) -> None:
+    def __init__(self, directory: Path, manifest: Manifest, writer: Writer | None = None) -> None:
         self.directory = directory
         self.session = writer.session if writer else ""
         self._manifest = manifest
-        self._writer = writer
-        self._lock = lock
         self._reader = Reader(directory, manifest)
         self._columns = ColumnCache(self._reader)
         self._appender = Appender(writer) if writer else None
@@ -75,26 +67,25 @@ class Dataset(Changes, Closeable):
         shared: bool = False,
         info: Mapping[str, Any] | None = None,
     ) -> Self:
-        """Make a new dataset and open it for writing.
+        """Create a dataset and open it for writing.
 
         Args:
-            directory: Its folder; made if it does not exist.
+            directory: Its folder, which is created if it does not exist.
             session: Name that its files begin with.
             max_file_size: Size in GB at which a partition is full and the next one begins.
-            durable: Whether every append waits for the disk, to survive a power cut too.
-                Otherwise the disk gets what is written about once a second.
+            durable: Whether every append waits for the disk, so that the rows survive a power cut
+                too. Otherwise, what is written reaches the disk within about a second.
             shared: Whether other processes may write to it at the same time: see `open`.
             info: Where the data come from: see `update_info`.
 
         Raises:
-            DatasetError: There is a dataset already, or the folder cannot be written.
-            DatasetLockedError: Another process is making one there.
-            ConfigError: The session's name or the size is not valid.
+            DatasetError: If there is a dataset already, or the folder cannot be written.
+            DatasetLockedError: If another process is creating one there.
+            ConfigError: If the session's name or the size is not valid.
         """
-        folder = Path(directory)
         options = WriterOptions(session, max_file_size, durable, shared)
-        writer, lock = create(folder, options, info or {})
-        return cls(folder, writer.store.manifest, writer, lock)
+        writer = create(Path(directory), options, info or {})
+        return cls(Path(directory), writer.store.manifest, writer)
 
     @classmethod
     def open(
@@ -107,56 +98,56 @@ class Dataset(Changes, Closeable):
         durable: bool = False,
         shared: bool = False,
     ) -> Self:
-        """Open a dataset that exists.
+        """Open an existing dataset.
 
         Args:
             directory: The dataset's folder, or the session's folder that holds it.
             writable: Whether to add rows. Otherwise nothing on the disk is ever changed.
             session: Name of the new files when writing; None: that of the last session.
             max_file_size: Size in GB at which a new partition is full.
-            durable: Whether every append waits for the disk, to survive a power cut too.
+            durable: Whether every append waits for the disk, so that the rows survive a power cut
+                too.
             shared: Whether other processes may write to it at the same time, each with
                 ``shared=True``. Each writes partitions of its own; the partitions follow each
                 other in the order in which they were begun.
 
         Raises:
-            DatasetNotFoundError: There is no dataset.
-            DatasetLockedError: It is to be written, and another process does so.
-            DatasetError: Its manifest is not valid, or a partition is damaged and it is to be
+            DatasetNotFoundError: If there is no dataset.
+            DatasetLockedError: If it is to be written, and another process writes to it.
+            DatasetError: If its manifest is not valid, or a partition is damaged and it is to be
                 written.
-            ConfigError: The session's name or the size is not valid.
+            ConfigError: If the session's name or the size is not valid.
         """
         folder = recovery.locate(directory)
         if not writable:
             return cls(folder, recovery.load(folder))
-        options = WriterOptions(session, max_file_size, durable, shared)
-        writer, lock = extend(folder, options)
-        return cls(folder, writer.store.manifest, writer, lock)
+        writer = extend(folder, WriterOptions(session, max_file_size, durable, shared))
+        return cls(folder, writer.store.manifest, writer)
 
     @property
     def writable(self) -> bool:
         """Whether rows can be added."""
-        return self._writer is not None and not self._closed
+        return self._appender is not None and not self._closed
 
     def close(self) -> None:
-        """Store what waits, seal the last partitions and release the lock; twice does nothing.
+        """Store pending samples, seal the last partitions and release the lock.
+
+        Closing a closed dataset does nothing.
 
         Raises:
-            DatasetError: What waits cannot be stored; all that was committed is intact.
+            DatasetError: If pending samples cannot be stored; all that was committed is intact.
         """
         if self._closed:
             return
         try:
-            if self._writer is not None:
+            if self._appender is not None:
                 try:
-                    self.flush()
+                    self._appender.flush()
                 finally:
-                    self._writer.close()
+                    self._appender.writer.close()
         finally:
             self._closed = True
             self._columns.clear()
-            if self._lock is not None:
-                os.close(self._lock)
 
     # Reading --------------------------------------------------------------------------------
 
@@ -179,7 +170,7 @@ class Dataset(Changes, Closeable):
         """Return the fields of a mode by name.
 
         Raises:
-            DatasetError: There is no such mode, or a partition is missing or damaged.
+            DatasetError: If there is no such mode, or a partition is missing or damaged.
         """
         return dict(self._reader.mode(mode).fields)
 
@@ -187,15 +178,15 @@ class Dataset(Changes, Closeable):
         """Return the number of committed samples of a mode.
 
         Raises:
-            DatasetError: There is no such mode, or a partition is missing or damaged.
+            DatasetError: If there is no such mode, or a partition is missing or damaged.
         """
-        self._reading()
+        self._prepare_reading()
         return self._reader.rows(mode)
 
     def __getitem__(self, mode: str) -> ModeView:
-        self._reading()
+        self._prepare_reading()
         self._reader.mode(mode)
-        return ModeView(self._reader, self._columns, mode)
+        return ModeView(self._columns, mode)
 
     def __contains__(self, mode: object) -> bool:
         return mode in self._manifest.modes
@@ -204,97 +195,75 @@ class Dataset(Changes, Closeable):
         """See the rows that another process has committed since the dataset was opened.
 
         Raises:
-            DatasetError: The manifest is not valid any more.
+            DatasetError: If the manifest is no longer valid.
         """
-        self._reading()
-        if self._writer is None:
-            moved = recovery.refresh(self.directory, self._manifest)
+        self._prepare_reading()
+        if self._appender is None:
+            self._manifest.take(recovery.load(self.directory))
         else:
-            moved = self._writer.refresh()
-        if moved:
-            self._columns.clear()
+            self._appender.writer.refresh()
 
     def batches(
-        self,
-        mode: str,
-        batch_size: int,
-        *,
-        shuffle: bool = False,
-        seed: int | Sequence[int] | None = None,
-        epochs: int | None = 1,
-        fields: Sequence[str] | None = None,
-        dtype: DTypeLike | None = None,
-        reuse: bool = False,
-        normalize: bool | Mapping[str, Normalization] = False,
-        strategy: strategies.Choice = "auto",
+        self, mode: str, batch_size: int, **options: Unpack[BatchOptions]
     ) -> Iterator[Batch]:
-        """Go through the samples of a mode in batches.
+        """Iterate over the samples of a mode in batches.
 
         Args:
             mode: Name of the mode.
             batch_size: Samples of a batch; only the last one of an epoch may have fewer.
-            shuffle: Whether each epoch is a new random order of all samples.
-            seed: Seed of the orders; None: a different one each time.
-            epochs: How often to go through all samples; None: without end. An epoch begins with
-                the samples that are committed by then.
-            fields: Names of the fields to give; None: all of them.
-            dtype: Type that floating fields are given in; None: their own.
-            reuse: Whether every batch is given in the same arrays, which is faster; each batch is
-                then valid until the next.
-            normalize: Whether floating fields are normalized, in place, by the mean and deviation
-                of all samples of the mode; or the normalization to use.
-            strategy: How samples are read, see `physx_core.dataset.read.strategy`; ``auto``: as
-                suits the fields' sizes and the free memory.
+            **options: Any of these keyword arguments:
+
+                shuffle (bool): Whether each epoch is a new random order of all samples; False.
+                seed (int | Sequence[int] | None): Seed of the orders; None, the default: a
+                different one each time.
+                epochs (int | None): How often to iterate over all samples, once by default; None:
+                endlessly. An epoch begins with the samples that are committed by then.
+                fields (Sequence[str] | None): Names of the fields to read; None, the default: all.
+                dtype (DTypeLike | None): Type to convert floating fields to; None, the default:
+                their own.
+                reuse (bool): Whether every batch is returned in the same arrays, which is faster;
+                each batch is then valid until the next. False by default.
+                normalize (bool | Mapping[str, Normalization]): Whether floating fields are
+                normalized, in place, by the mean and deviation of all samples of the mode; or the
+                normalization to use. False by default.
+                strategy (str): How samples are read, see `physx_core.dataset.read.strategy`;
+                ``"auto"``, the default: as suits the fields' sizes and the free memory.
 
         Returns:
             An iterator over batches: field name to array of shape (samples, *field shape).
 
         Raises:
-            DatasetError: There is no such mode or field, or the mode has no samples.
-            ConfigError: `batch_size` or `epochs` is out of range, or there is no such strategy.
+            DatasetError: If there is no such mode or field, or the mode has no samples.
+            ConfigError: If `batch_size` or `epochs` is out of range, or there is no such strategy.
         """
-        self._reading()
-        if isinstance(normalize, bool):
-            normalize = self.normalization_of(mode) if normalize else {}
-        return iter(
-            Batches(
-                self._columns,
-                mode,
-                list(dict.fromkeys(self._reader.mode(mode).fields if fields is None else fields)),
-                batch_size,
-                epochs,
-                np.random.default_rng(seed) if shuffle else None,
-                None if dtype is None else np.dtype(dtype),
-                reuse,
-                strategies.check(strategy),
-                normalize,
-            )
-        )
+        self._prepare_reading()
+        if options.get("normalize") is True:
+            options["normalize"] = self.normalization_of(mode)
+        return iter(BatchReader(self._columns, mode, batch_size, **options))
 
-    def reading_strategy(
-        self, mode: str, fields: Sequence[str] | None = None
-    ) -> strategies.Strategy:
-        """Return how `batches` reads by itself: ``memory``, ``disk exact`` or ``disk windowed``.
+    def reading_strategy(self, mode: str, fields: Sequence[str] | None = None) -> Strategy:
+        """Return how `batches` reads by default: ``memory``, ``disk exact`` or ``disk windowed``.
 
         Args:
             mode: Name of the mode.
             fields: Names of the fields that are read together; None: all of them.
 
         Raises:
-            DatasetError: There is no such mode or field.
+            DatasetError: If there is no such mode or field.
         """
-        self._reading()
+        self._prepare_reading()
         names = list(self._reader.mode(mode).fields if fields is None else fields)
-        return self._columns.strategy(mode, names, None)
+        return self._columns.choose_strategy(mode, names)
 
     def episodes(self, mode: str) -> list[Episode]:
-        """Return the trajectories of a mode, each with the numbers of its rows in order of time.
+        """Return the trajectories of a mode, each with the numbers of its rows in temporal order.
 
-        A trajectory ends where an environment calls `Environment.new_episode`, where
-        `check_sample` refuses a sample, and where another run begins.
+        A trajectory ends when an environment calls `Environment.new_episode`, when `check_sample`
+        rejects a sample, and when another run begins.
 
         Raises:
-            DatasetError: There is no such mode, or its rows do not say where trajectories begin.
+            DatasetError: If there is no such mode, or its rows do not tell where trajectories
+                begin.
         """
         return find_episodes(self[mode], self.num_samples(mode))
 
@@ -305,17 +274,17 @@ class Dataset(Changes, Closeable):
 
         Args:
             mode: Name of the mode.
-            shares: Name of each part to its share; together 1 at most, what is left is in none.
+            shares: Name of each part to its share. They add up to 1 at most; what remains is in no
+                part.
             by: ``row``: rows are drawn at random; ``episode``: whole trajectories are, so that
                 none has rows in two parts.
             seed: Seed of the draw; the same rows and seed give the same parts.
 
         Raises:
-            DatasetError: There is no such mode, or trajectories are not known.
-            ConfigError: The shares are unfit, or a part would be empty.
+            DatasetError: If there is no such mode, or trajectories are not known.
+            ConfigError: If the shares are not valid, or a part would be empty.
         """
-        source = Source(self[mode], self._columns, mode, self.num_samples(mode))
-        return split(source, shares, by, seed)
+        return split(self[mode], self.num_samples(mode), shares, by, seed)
 
     @property
     def normalization(self) -> dict[str, Normalization]:
@@ -326,22 +295,25 @@ class Dataset(Changes, Closeable):
         """Return mean and standard deviation of the floating fields of a mode, of all its samples.
 
         Raises:
-            DatasetError: There is no such mode, or a partition is missing or damaged.
+            DatasetError: If there is no such mode, or a partition is missing or damaged.
         """
-        self._reading()
-        statistics = statistics_of(self._reader, mode)
+        self._prepare_reading()
+        statistics = compute_statistics(self._reader, mode)
         return {name: s.normalization() for name, s in statistics.items() if s.count}
 
     def recompute_normalization(self, mode: str = "training") -> dict[str, Normalization]:
-        """Compute mean and standard deviation anew from all stored samples, and keep them.
+        """Recompute mean and standard deviation from all stored samples, and keep them.
 
         Raises:
-            DatasetError: There is no such mode, or a partition is missing or damaged.
+            DatasetError: If there is no such mode, or a partition is missing or damaged.
         """
-        self._reading()
+        self._prepare_reading()
         self._reader.mode(mode).forget_statistics()
         found = self.normalization_of(mode)
-        self._keep_statistics()
+        store = self._appender.writer.store if self._appender is not None else None
+        if store is not None and not store.shared:  # several writers leave it to the next one
+            with files.storing("The statistics"), store.change():
+                pass
         return found
 
     def describe(self) -> list[dict[str, Any]]:
@@ -351,11 +323,11 @@ class Dataset(Changes, Closeable):
             Rows with the entries mode, field, role, dtype, shape, unit, samples, partitions and
             bytes (of the values).
         """
-        self._reading()
+        self._prepare_reading()
         return summarize(self._manifest)
 
     def verify(self, *, content: bool = True) -> list[str]:
-        """Check all partition files: there, whole, of the right rows, and unchanged.
+        """Check that all partition files are there, complete, consistent and unchanged.
 
         Args:
             content: Whether to read every byte; otherwise only headers and sizes are checked.
@@ -363,14 +335,221 @@ class Dataset(Changes, Closeable):
         Returns:
             One text for each problem; empty for a sound dataset.
         """
-        self._reading()
+        self._prepare_reading()
         return find_problems(self.directory, self._manifest, content)
 
-    # Within ---------------------------------------------------------------------------------
+    # Writing --------------------------------------------------------------------------------
 
-    def _reading(self) -> None:
+    def define_fields(self, mode: str, fields: Iterable[Field]) -> None:
+        """Define the fields of a mode, with their units and roles, before its first rows.
+
+        Args:
+            mode: Name of the mode.
+            fields: The fields; a shape of None is taken from the first rows.
+
+        Raises:
+            FieldsMismatchError: If the mode has other fields already.
+            ConfigError: If the mode's name is not an identifier, or there are no fields.
+            UsageError: If the dataset is closed or open for reading only.
+        """
+        self._for_writing().define_fields(mode, fields)
+
+    def append(self, mode: str, rows: Mapping[str, Any], *, checked: bool = False) -> None:
+        """Store rows; they are committed when this returns.
+
+        Args:
+            mode: Name of the mode. If it has no fields yet, they are inferred from the rows.
+            rows: Field name to array of shape (n, *field shape), all fields of the mode.
+                `Field.convert` decides what fits.
+            checked: Whether the rows are known to be finite, as those of a `Source` are: arrays of
+                the fields' types are then stored without another look at their values.
+
+        Raises:
+            SampleError: If a field is missing, unknown, of another shape, type or length, or holds
+                NaN or an infinite number. None of the rows is stored.
+            DatasetError: If the disk is full or fails; says how many of the rows are stored.
+            UsageError: If the dataset is closed or open for reading only.
+        """
+        self._for_writing().append(mode, rows, checked=checked)
+
+    def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
+        """Store one sample; it is committed together with others, or by `flush`.
+
+        Args:
+            mode: Name of the mode. If it has no fields yet, they are inferred from the sample.
+            sample: Field name to value of the field's shape, all fields of the mode.
+
+        Raises:
+            SampleError: If the sample cannot be stored, as in `append`.
+            DatasetError: If pending samples cannot be stored: the disk is full or fails.
+            UsageError: If the dataset is closed or open for reading only.
+        """
+        self._for_writing().append_sample(mode, sample)
+
+    def flush(self) -> None:
+        """Commit the pending samples.
+
+        Raises:
+            DatasetError: If the disk is full or fails; says how many of them are stored. The
+                others are discarded.
+            UsageError: If the dataset is closed or open for reading only.
+        """
+        self._for_writing().flush()
+
+    def update_info(self, **values: Any) -> None:
+        """Set entries of `info` and store them.
+
+        Args:
+            values: Numbers, texts, lists, dictionaries; tuples and arrays become lists, classes
+                and paths become texts.
+
+        Raises:
+            ConfigError: If JSON cannot represent a value.
+            UsageError: If the dataset is closed or open for reading only.
+        """
+        store = self._for_writing().writer.store
+        with files.storing("The dataset's info"), store.change() as manifest:
+            manifest.info |= to_plain_info(values)
+
+    def update(self, mode: str, index: Any, rows: Mapping[str, Any]) -> None:
+        """Overwrite stored rows in place.
+
+        The new values are committed when this returns. If the process dies meanwhile, each value
+        is either old or new, and a concurrent reader may see some of both. Checksums and
+        statistics of the updated partitions are recomputed when the dataset is closed.
+
+        Args:
+            mode: Name of the mode.
+            index: Number of a row, a slice, or an array of numbers or booleans.
+            rows: Field name to rows of shape (n, *field shape), or to a single value if `index` is
+                one number; any of the mode's fields.
+
+        Raises:
+            SampleError: If a field is unknown, or rows are of another shape, type or number, or
+                hold NaN or an infinite number. Nothing is changed.
+            IndexError: If there are no such rows.
+            DatasetError: If the disk fails, or a partition is damaged.
+            UsageError: If the dataset is closed, open for reading only, or shared.
+        """
+        writer = self._as_only_writer("update rows")
+        fields, total = self._reader.mode(mode).fields, self._reader.rows(mode)
+        numbers = row_numbers(index, total)
+        single = not isinstance(index, slice) and np.ndim(index) == 0
+        values = check_update(fields, numbers, rows, single=single)
+        with files.storing(f"{len(numbers)} updated rows of mode {mode!r}"):
+            writer.wait()
+            update_rows(writer.store, mode, numbers, values, durable=writer.durable)
+
+    def merge(self, directory: str | Path) -> None:
+        """Append all rows of another dataset, which is not changed; all of them, or none.
+
+        Args:
+            directory: The other dataset's folder, or the session's folder that holds it.
+
+        Raises:
+            DatasetNotFoundError: If there is no dataset.
+            FieldsMismatchError: If a mode has other fields here than there.
+            DatasetError: If the other is damaged or this very dataset, or the disk is full.
+            UsageError: If the dataset is closed or open for reading only.
+        """
+        appender, source = self._for_writing(), recovery.locate(directory)
+        if source.resolve() == self.directory.resolve():
+            raise DatasetError(f"{source} cannot be merged into itself.")
+        appender.flush()
+        given = recovery.load(source)
+        if given.problems:
+            raise next(iter(given.problems.values()))
+        with files.storing(f"The rows of {source}"):
+            for name, mode in given.modes.items():
+                appender.define_fields(name, mode.fields.values())
+                appender.writer.finish(name)
+            add_partitions(appender.writer, source, given)
+
+    def remove_partition(self, mode: str, index: int, session: str | None = None) -> int:
+        """Remove a partition with all its rows and files; the rows behind it move up.
+
+        Args:
+            mode: Name of the mode.
+            index: Number of the partition, as in the names of its files.
+            session: Session that wrote it; required if several have one of this number.
+
+        Returns:
+            How many rows it had.
+
+        Raises:
+            DatasetError: If there is no such partition or mode, or the disk fails.
+            UsageError: If the dataset is closed, open for reading only, or shared.
+        """
+        writer = self._as_only_writer("remove partitions")
+        self._reader.mode(mode)
+        with files.storing(f"Mode {mode!r} without partition {index}"):
+            writer.finish(mode)
+            return drop_partition(writer, mode, session, index)
+
+    @staticmethod
+    def repair(directory: str | Path) -> list[str]:
+        """Repair what `verify` finds, as far as that is possible; no file is ever deleted.
+
+        What a killed writer left open is sealed; a manifest that is missing, cut or edited is
+        checked against the partition files or rebuilt from them; a damaged header is rewritten
+        around sound rows. The files of partitions that cannot be read are moved to the folder
+        ``damaged``, so that the other rows can be used.
+
+        Args:
+            directory: The dataset's folder, or the session's folder that holds it.
+
+        Returns:
+            One text for each thing that was repaired; empty if there was nothing to do.
+
+        Raises:
+            DatasetNotFoundError: If there is no dataset.
+            DatasetLockedError: If a process writes to it.
+            DatasetError: If the folder cannot be written.
+        """
+        return repair.repair(recovery.locate(directory))
+
+    @staticmethod
+    def rebuild(directory: str | Path) -> None:
+        """Rebuild the manifest from the partition files alone; the old one is kept beside it.
+
+        Everything but the info is restored: fields, units, order, checksums and statistics.
+
+        Args:
+            directory: The dataset's folder, or the session's folder that holds it.
+
+        Raises:
+            DatasetNotFoundError: If there is no dataset.
+            DatasetLockedError: If a process writes to it.
+            DatasetError: If a partition is missing or damaged, or the folder cannot be written.
+        """
+        repair.rebuild(recovery.locate(directory))
+
+    # Internals ------------------------------------------------------------------------------
+
+    def _prepare_reading(self) -> None:
+        """Check that the dataset is open, and commit pending samples."""
         if self._closed:
             raise UsageError(f"The dataset in {self.directory} is closed.")
         if self._appender is not None:
             self._appender.flush()
-            self._forget_moved()
+
+    def _for_writing(self) -> Appender:
+        """Return the appender, if the dataset is open for writing."""
+        if self._closed:
+            raise UsageError(f"The dataset in {self.directory} is closed.")
+        if self._appender is None:
+            raise UsageError(
+                f"The dataset in {self.directory} is open for reading only. To change it, use "
+                "Dataset.open(directory, writable=True)."
+            )
+        return self._appender
+
+    def _as_only_writer(self, what: str) -> Writer:
+        """Return the writer with all samples stored, unless the dataset is shared."""
+        appender = self._for_writing()
+        if appender.writer.store.shared:
+            raise UsageError(
+                f"Only a dataset's sole writer can {what}: open it without shared=True."
+            )
+        appender.flush()
+        return appender.writer

@@ -1,4 +1,4 @@
-"""Export: the rows of a dataset as one file or folder of another format."""
+"""Exports the rows of a dataset to one file or folder of another format."""
 
 from __future__ import annotations
 
@@ -8,67 +8,38 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from physx_core.dataset.dataset import Dataset
-from physx_core.dataset.exchange import hdf5_format as hdf5
-from physx_core.dataset.exchange import minari_format as minari_episodes
-from physx_core.dataset.exchange import npz_format as npz
-from physx_core.dataset.exchange import parquet_format as parquet
-from physx_core.dataset.exchange import zarr_format as zarr_groups
-from physx_core.dataset.exchange.table import Advance, Table
+from physx_core.dataset.exchange import (
+    hdf5_format,
+    minari_format,
+    npz_format,
+    parquet_format,
+    zarr_format,
+)
+from physx_core.dataset.exchange.table import Advance, ExportOptions, Table
 from physx_core.errors import ConfigError, ExchangeError, PhysxError, listed, nearest
 
 
 @dataclass(frozen=True)
-class ExportOptions:
-    """What a format may be told.
-
-    Attributes:
-        compression: Name of the format's compression, or "none".
-        observations: Fields that are the observations of an episode (minari only); empty: all
-            training fields that are nothing else.
-        actions: Fields that are its actions (minari only).
-        rewards: Field that is its rewards (minari only); None: they are 0.
-    """
-
-    compression: str = "none"
-    observations: Sequence[str] = ()
-    actions: Sequence[str] = ()
-    rewards: str | None = None
-
-
-@dataclass(frozen=True)
 class Format:
-    """A format that datasets are exported to.
+    """A format that datasets can be exported to.
 
     Attributes:
-        write: Writes tables to a path; what does not hold all rows returns how many it left out.
+        write: Writes tables to a path; returns how many rows it left out.
         compressions: Names of its compressions, "none" first.
         several: Whether one file holds several modes.
     """
 
-    write: Callable[[Sequence[Table], Path, ExportOptions], int | None]
+    write: Callable[[Sequence[Table], Path, ExportOptions], int]
     compressions: Collection[str]
     several: bool
 
 
-def _minari(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
-    roles = minari_episodes.Roles.of(
-        tables[0], options.observations, options.actions, options.rewards
-    )
-    return minari_episodes.write(tables[0], out, roles)
-
-
 FORMATS = {
-    "npz": Format(lambda t, out, o: npz.write(t, out, o.compression), npz.COMPRESSIONS, True),
-    "parquet": Format(
-        lambda t, out, o: parquet.write(t[0], out, o.compression), parquet.COMPRESSIONS, False
-    ),
-    "minari": Format(_minari, ("none",), False),
-    "zarr": Format(
-        lambda t, out, o: zarr_groups.write(t, out, o.compression), zarr_groups.COMPRESSIONS, True
-    ),
-    "hdf5-single": Format(
-        lambda t, out, o: hdf5.write(t, out, o.compression), hdf5.COMPRESSIONS, True
-    ),
+    "npz": Format(npz_format.write, npz_format.COMPRESSIONS, True),
+    "parquet": Format(parquet_format.write, parquet_format.COMPRESSIONS, False),
+    "minari": Format(minari_format.write, ("none",), False),
+    "zarr": Format(zarr_format.write, zarr_format.COMPRESSIONS, True),
+    "hdf5-single": Format(hdf5_format.write, hdf5_format.COMPRESSIONS, True),
 }
 """The formats by name."""
 
@@ -84,40 +55,40 @@ def export(
 ) -> dict[str, int]:
     """Write the rows of a dataset in another format, block by block.
 
-    What is written appears under its name only when it is complete.
+    The file or folder appears under its name only when it is complete.
 
     Args:
         dataset: The dataset.
         to: Name of the format, one of `FORMATS`.
-        out: The file, or for zarr and minari the folder. There must be nothing yet.
+        out: The file, or the folder for zarr and minari. It must not exist.
         modes: Names of the modes; empty: all that have rows. Parquet and minari hold one.
-        options: What the format is told.
-        advance: Is told how many bytes were read.
+        options: Options of the format.
+        advance: Is called with the number of bytes read.
 
     Returns:
         How many rows of each mode were written.
 
     Raises:
-        ConfigError: There is no such format or compression, or several modes do not fit.
-        ExchangeError: A field does not fit into the format, or the file cannot be written.
-        MissingLibraryError: The library of the format is not installed.
-        DatasetError: There is no such mode, nothing to write, or a partition is damaged.
+        ConfigError: If there is no such format or compression, or several modes do not fit.
+        ExchangeError: If a field does not fit into the format, or the file cannot be written.
+        MissingLibraryError: If the library of the format is not installed.
+        DatasetError: If there is no such mode, nothing to write, or a partition is damaged.
     """
     out, options = Path(out), options or ExportOptions()
-    form = _format(to, options)
-    tables = _tables(dataset, modes, advance)
+    form = _choose_format(to, options)
+    tables = _make_tables(dataset, modes, advance)
     if len(tables) > 1 and not form.several:
         raise ConfigError(
             f"{to} holds one mode. Choose one with modes (--mode on the command line): "
             f"{listed(table.mode for table in tables)}."
         )
     if out.exists() or not out.absolute().parent.is_dir():
-        why = "is there already" if out.exists() else "would be in a folder that does not exist"
-        raise ExchangeError(f"{out} {why}. Choose another place.")
+        why = "exists already" if out.exists() else "would be in a folder that does not exist"
+        raise ExchangeError(f"{out} {why}. Choose another path.")
     try:
         with tempfile.TemporaryDirectory(dir=out.absolute().parent, prefix=".export-") as folder:
             draft = Path(folder) / out.name
-            left_out = form.write(tables, draft, options) or 0
+            left_out = form.write(tables, draft, options)
             draft.rename(out)
     except PhysxError:
         raise
@@ -129,7 +100,7 @@ def export(
     return {table.mode: table.rows - left_out for table in tables}
 
 
-def _format(to: str, options: ExportOptions) -> Format:
+def _choose_format(to: str, options: ExportOptions) -> Format:
     if to not in FORMATS:
         raise ConfigError(
             f'There is no format "{to}".{nearest(to, FORMATS)} Formats: {listed(FORMATS)}.'
@@ -144,7 +115,7 @@ def _format(to: str, options: ExportOptions) -> Format:
     return form
 
 
-def _tables(dataset: Dataset, modes: Sequence[str], advance: Advance) -> list[Table]:
+def _make_tables(dataset: Dataset, modes: Sequence[str], advance: Advance) -> list[Table]:
     names = modes or [name for name in dataset.modes if dataset.num_samples(name)]
     tables = []
     for name in dict.fromkeys(names):

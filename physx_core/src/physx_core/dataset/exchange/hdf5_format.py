@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset.exchange.table import Column, Notes, Table, describe, rows_of
+from physx_core.dataset.exchange.table import Column, ExportOptions, Notes, Table, encode_notes
+from physx_core.dataset.store.segment import rows_per_block
 from physx_core.errors import ExchangeError
 from physx_core.typing import Array
 
@@ -20,37 +21,36 @@ _ATTRIBUTE = 60000
 """Bytes that fit into an attribute."""
 
 
-def write(tables: Sequence[Table], out: Path, compression: str) -> None:
+def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
     """Write the modes as groups of datasets.
 
-    Args:
-        tables: The modes.
-        out: The file.
-        compression: One of `COMPRESSIONS`; "none" stores each dataset in one piece, which can be
-            mapped into memory.
+    Without compression each dataset is contiguous, so that it can be mapped into memory.
     """
     import h5py
 
+    compression = COMPRESSIONS[options.compression]
+
     with _Sink(out, "w+") as sink:
         with h5py.File(sink, "w") as file:
-            file.attrs["physx"] = describe(tables, _ATTRIBUTE)
+            file.attrs["physx"] = encode_notes(tables, _ATTRIBUTE)
             for table in tables:
                 group = file.create_group(table.mode)
                 for name in table.fields:
-                    _write_field(group, table, name, COMPRESSIONS[compression], sink)
+                    _write_field(group, table, name, compression, sink)
         sink.check()
+    return 0
 
 
 class _Sink(io.FileIO):
-    """A file that keeps the first error of writing to itself until it is asked.
+    """A file whose `check` raises the first error of writing, which HDF5 never sees.
 
-    HDF5 ends the process when a write fails, so none ever fails for it.
+    HDF5 ends the process when a write fails.
     """
 
     _error: OSError | None = None
 
     def write(self, content: Any) -> int:
-        """Write all of the content; after an error, nothing more."""
+        """Write all of the content; nothing after an error."""
         view = memoryview(content).cast("B")
         count = len(view)
         try:
@@ -78,11 +78,11 @@ def _write_field(group: Any, table: Table, name: str, compression: str | None, s
     field = table.fields[name]
     shape, options = (table.rows, *(field.shape or ())), {}
     if compression and 0 not in shape:
-        rows = min(table.rows, rows_of(field.nbytes, _CHUNK))
+        rows = min(table.rows, rows_per_block(field.nbytes, _CHUNK))
         options = {"compression": compression, "shuffle": True, "chunks": (rows, *shape[1:])}
     stored = group.create_dataset(name, shape, np.dtype(field.dtype), **options)
     stored.attrs["unit"], stored.attrs["role"] = field.unit, field.role
-    for start, block in table.column(name, rows_of(field.nbytes)):
+    for start, block in table.column(name):
         stored[start : start + len(block)] = block
         sink.check()
 
@@ -107,11 +107,11 @@ class Hdf5Column:
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[tuple[dict[str, Column], Notes]]:
-    """Open a file; give its datasets by their paths, and what its attributes say.
+def open_columns(path: Path) -> Iterator[tuple[dict[str, Column], Notes]]:
+    """Open a file; yield its datasets by their paths, and the notes in its attributes.
 
     Raises:
-        ExchangeError: It is no HDF5 file, is damaged, or refers to other files.
+        ExchangeError: If it is not an HDF5 file, is damaged, or refers to other files.
     """
     import h5py
 
@@ -119,35 +119,35 @@ def opened(path: Path) -> Iterator[tuple[dict[str, Column], Notes]]:
         try:
             file = files.enter_context(h5py.File(path, "r"))
             columns = _columns(path, file, "", set())
-            notes = Notes.read(file.attrs.get("physx", "{}"))
+            notes = Notes.parse(file.attrs.get("physx", "{}"))
         except (OSError, RuntimeError, KeyError) as error:
             raise ExchangeError(f"{path} cannot be read as HDF5: {error}.") from error
         yield columns, notes
 
 
 def _columns(path: Path, group: Any, prefix: str, seen: set[Any]) -> dict[str, Column]:
-    """Return the datasets below a group; what leads out of the file is refused, not followed."""
+    """Return the datasets below a group; what leads out of the file is rejected, not followed."""
     import h5py
 
     columns: dict[str, Column] = {}
     for name in group:
         place = f'"{prefix}{name}" of {path}'
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-            raise ExchangeError(f"{place} is a link, which is not followed.")
+            raise ExchangeError(f"{place} is a link, and links are not followed.")
         item = group[name]
         if isinstance(item, h5py.Dataset):
-            if _is_elsewhere(item):
-                raise ExchangeError(f"{place} has its values in files of another folder.")
+            if _is_external(item):
+                raise ExchangeError(f"{place} stores its values in files of another folder.")
             columns[f"{prefix}{name}"] = Hdf5Column(place, item)
         elif isinstance(item, h5py.Group):
             address = h5py.h5o.get_info(item.id).addr
             if address in seen:
-                raise ExchangeError(f"{place} is a group that holds itself.")
+                raise ExchangeError(f"{place} is a group that contains itself.")
             columns |= _columns(path, item, f"{prefix}{name}/", {*seen, address})
     return columns
 
 
-def _is_elsewhere(dataset: Any) -> bool:
+def _is_external(dataset: Any) -> bool:
     if dataset.is_virtual:
         names = [source.file_name for source in dataset.virtual_sources()]
         return any(PurePath(name).name != name for name in names)

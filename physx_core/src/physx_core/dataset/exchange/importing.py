@@ -1,4 +1,4 @@
-"""Import: rows of a NumPy archive or an ordinary HDF5 file into a dataset."""
+"""Imports rows of a NumPy archive or an ordinary HDF5 file into a dataset."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathlib import Path
 
 from physx_core.config import MODES
 from physx_core.dataset.dataset import Dataset
-from physx_core.dataset.exchange import hdf5_format as hdf5
-from physx_core.dataset.exchange import npz_format as npz
-from physx_core.dataset.exchange.table import Advance, Column, Notes, rows_of
+from physx_core.dataset.exchange import hdf5_format, npz_format
+from physx_core.dataset.exchange.table import BLOCK, Advance, Column, Notes
 from physx_core.dataset.repair.recovery import holds_dataset
+from physx_core.dataset.store.segment import rows_per_block
 from physx_core.errors import ExchangeError, SampleError, listed
 from physx_core.fields import Field
 
-_READERS = {b"PK": npz.opened, b"\x89HDF\r\n\x1a\n": hdf5.opened}
-"""The first bytes of a file, whatever its name, to what reads it."""
+_READERS = {b"PK": npz_format.open_columns, b"\x89HDF\r\n\x1a\n": hdf5_format.open_columns}
+"""The first bytes of a file, regardless of its name, to the function that opens it."""
 
 _SESSION = "import"
 
@@ -41,26 +41,26 @@ def import_file(
 
     Args:
         path: A NumPy archive (npz) or an HDF5 file, of any name.
-        directory: The dataset's folder. A dataset that is there gets the rows added.
-        mode: Mode for the rows, whatever mode the file says; of a file with several modes, the
-            one to take. None: the modes that the file names, or else ``training``.
-        fields: Names of the arrays to take, as in the file; empty: all of them.
-        advance: Is told how many bytes were stored.
+        directory: The dataset's folder. The rows are added to an existing dataset.
+        mode: Mode for the rows, regardless of the mode in the file; of a file with several modes,
+            the one to import. None: the modes that the file names, or else ``training``.
+        fields: Names of the arrays to import, as in the file; empty: all of them.
+        advance: Is called with the number of bytes stored.
 
     Returns:
-        How many rows each mode got.
+        How many rows were added to each mode.
 
     Raises:
-        ExchangeError: The file is missing or damaged, or holds other than arrays of one length.
-        SampleError: A value is NaN or infinite.
-        DatasetError: The dataset has other fields, or cannot be written.
+        ExchangeError: If the file is missing or damaged, or does not hold arrays of one length.
+        SampleError: If a value is NaN or infinite.
+        DatasetError: If the dataset has other fields, or cannot be written.
     """
     path, directory = Path(path), Path(directory)
     with _reader(path)(path) as (columns, notes):
-        chosen = _chosen(path, columns, fields)
-        modes = _arranged(path, chosen, notes, mode)
-        tables = {name: _fields(path, name, found, notes) for name, found in modes.items()}
-        with _target(directory) as dataset:
+        chosen = _choose(path, columns, fields)
+        modes = _arrange(path, chosen, notes, mode)
+        tables = {name: _make_fields(path, name, found, notes) for name, found in modes.items()}
+        with _open_target(directory) as dataset:
             if not dataset.modes:
                 dataset.update_info(**{**notes.info, "imported_from": path.name})
             return {
@@ -70,7 +70,7 @@ def import_file(
 
 
 def _reader(path: Path) -> Callable[[Path], AbstractContextManager[tuple[Columns, Notes]]]:
-    """Return what reads a file of this kind."""
+    """Return the function that opens a file of this kind."""
     if not path.is_file():
         raise ExchangeError(f"There is no file {path}.")
     try:
@@ -85,15 +85,15 @@ def _reader(path: Path) -> Callable[[Path], AbstractContextManager[tuple[Columns
 
 
 @contextlib.contextmanager
-def _target(directory: Path) -> Iterator[Dataset]:
-    """Open the dataset for writing; one that is made for rows that fail leaves nothing behind."""
+def _open_target(directory: Path) -> Iterator[Dataset]:
+    """Open the dataset for writing, or create it; one created for rows that fail is removed."""
     if holds_dataset(directory) or holds_dataset(directory / "dataset"):
         with Dataset.open(directory, writable=True) as dataset:
             yield dataset
         return
     was_there = directory.is_dir()
     if was_there and any(directory.iterdir()):
-        raise ExchangeError(f"{directory} holds other things than a dataset; name a new folder.")
+        raise ExchangeError(f"{directory} is not empty and not a dataset; choose a new folder.")
     try:
         with Dataset.create(directory, session=_SESSION) as dataset:
             yield dataset
@@ -105,11 +105,11 @@ def _target(directory: Path) -> Iterator[Dataset]:
         raise
 
 
-def _chosen(path: Path, columns: Columns, names: Sequence[str]) -> Columns:
+def _choose(path: Path, columns: Columns, names: Sequence[str]) -> Columns:
     missing = [name for name in names if name not in columns]
     if missing or not columns:
         wanted = f'no array "{missing[0]}"' if missing else "no arrays"
-        raise ExchangeError(f"{path} holds {wanted}. It holds: {listed(columns)}.")
+        raise ExchangeError(f"{path} has {wanted}. It has: {listed(columns)}.")
     chosen = {name: columns[name] for name in names} if names else columns
     for name, column in chosen.items():
         if column.dtype.kind not in "biufc" or not column.shape:
@@ -121,7 +121,7 @@ def _chosen(path: Path, columns: Columns, names: Sequence[str]) -> Columns:
     return chosen
 
 
-def _arranged(path: Path, columns: Columns, notes: Notes, mode: str | None) -> dict[str, Columns]:
+def _arrange(path: Path, columns: Columns, notes: Notes, mode: str | None) -> dict[str, Columns]:
     """Return the columns by mode and field name."""
     parts = {name: name.split("/") for name in columns}
     known = notes.modes.keys() or set(MODES)
@@ -143,7 +143,7 @@ def _arranged(path: Path, columns: Columns, notes: Notes, mode: str | None) -> d
     return {mode: modes[mode] if mode in modes else next(iter(modes.values()))}
 
 
-def _fields(path: Path, mode: str, columns: Columns, notes: Notes) -> dict[str, Field]:
+def _make_fields(path: Path, mode: str, columns: Columns, notes: Notes) -> dict[str, Field]:
     lengths = {name: column.shape[0] for name, column in columns.items()}
     if len(set(lengths.values())) > 1:
         counts = ", ".join(f"{name} {count}" for name, count in lengths.items())
@@ -160,7 +160,7 @@ def _copy(
 ) -> int:
     dataset.define_fields(mode, fields.values())
     rows = next(iter(columns.values())).shape[0]
-    step = rows_of(sum(field.nbytes for field in fields.values()))
+    step = rows_per_block(sum(field.nbytes for field in fields.values()), BLOCK)
     for start in range(0, rows, step):
         count = min(step, rows - start)
         block = {name: column.read(start, count) for name, column in columns.items()}

@@ -1,8 +1,8 @@
-"""Minari: the trajectories of a mode as episodes for offline reinforcement learning.
+"""Exports the trajectories of a mode to Minari, as episodes for offline reinforcement learning.
 
 Minari's episode of n steps has n + 1 observations: row i of a trajectory is observation i, and its
 action and reward belong to the step to row i + 1. So a trajectory of n + 1 rows becomes n steps;
-the action and the reward of its last row, which lead nowhere, are kept in ``infos/last``.
+the action and the reward of its last row, which lead to no further row, are kept in ``infos/last``.
 """
 
 from __future__ import annotations
@@ -17,15 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset.exchange.table import Table, describe, library
+from physx_core.dataset.exchange.table import ExportOptions, Table, encode_notes, import_library
 from physx_core.dataset.read.episodes import Episode, find_episodes
 from physx_core.errors import ConfigError, ExchangeError, listed, nearest
 from physx_core.fields import Field
 from physx_core.typing import Batch
 
-_PURPOSE = "Exporting to Minari"
 _OVERHEAD = 6000
-"""Bytes that an array of an episode takes besides its values, at most."""
+"""Upper bound of the bytes that an array of an episode takes besides its values."""
 _OWN_ARRAYS = 4
 """Arrays that Minari adds to each episode: actions, rewards, terminations, truncations."""
 _NAME = re.compile(r"[-_\w]+-v\d+")
@@ -33,13 +32,13 @@ _NAME = re.compile(r"[-_\w]+-v\d+")
 
 @dataclass(frozen=True)
 class Roles:
-    """What the fields of a mode are in an episode; the others are its infos.
+    """The roles of a mode's fields in an episode; the other fields are its infos.
 
     Attributes:
         observations: One field that is the observation itself, or several that are its entries.
-        actions: The same for the actions; none: there is only one action, doing nothing.
-        rewards: Field that is the reward, one number; None: it is 0.
-        entries: Whether the observation is a dictionary though it is one field.
+        actions: Likewise for the actions; none: there is only one action, which does nothing.
+        rewards: Field that is the reward, one number; None: the reward is 0.
+        entries: Whether the observation is a dictionary even if it is one field.
     """
 
     observations: Sequence[str]
@@ -48,14 +47,14 @@ class Roles:
     entries: bool
 
     @classmethod
-    def of(
-        cls, table: Table, observations: Sequence[str], actions: Sequence[str], rewards: str | None
-    ) -> Roles:
+    def choose(cls, table: Table, options: ExportOptions) -> Roles:
         """Complete what a user chose.
 
         Raises:
-            ConfigError: A field does not exist, is chosen twice, or the reward is no number.
+            ConfigError: If a field does not exist or is chosen twice, no field is left for the
+                observations, or the reward is not one number.
         """
+        observations, actions, rewards = options.observations, options.actions, options.rewards
         chosen = [*observations, *actions, *([] if rewards is None else [rewards])]
         for name in chosen:
             if name not in table.fields:
@@ -73,61 +72,70 @@ class Roles:
         return cls(observations or rest, actions, rewards, not observations)
 
 
-def write(table: Table, out: Path, roles: Roles) -> int:
-    """Write the trajectories of a mode as a Minari dataset in HDF5.
+def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
+    """Write the trajectories of one mode as a Minari dataset in HDF5.
 
-    ``minari.MinariDataset(out / "data")`` opens it; ``minari.load_dataset(name)`` does, too, if the
-    folder has a name such as ``arm-v0`` and lies in the folder ``MINARI_DATASETS_PATH``.
-
-    Args:
-        table: The mode.
-        out: The folder.
-        roles: What the fields are.
+    ``minari.MinariDataset(out / "data")`` opens it; so does ``minari.load_dataset(name)`` if the
+    folder has a name such as ``arm-v0`` and is in the folder ``MINARI_DATASETS_PATH``.
 
     Returns:
         How many rows are in no episode, because each is a trajectory of its own.
 
     Raises:
-        MissingLibraryError: Minari is not installed.
-        ExchangeError: A field does not fit, or no trajectory has two rows.
+        ConfigError: If the fields cannot have the chosen roles.
+        MissingLibraryError: If Minari is not installed.
+        ExchangeError: If a field does not fit, or no trajectory has two rows.
     """
-    minari = library("minari", _PURPOSE, "minari")
-    storages = library("minari.dataset.minari_storage", _PURPOSE, "minari")
-    buffers = library("minari.data_collector", _PURPOSE, "minari")
-    library("PIL", _PURPOSE, "minari")  # what its HDF5 storage imports
+    (table,) = tables
+    roles = Roles.choose(table, options)
+    minari, storages, serialization, collector, _ = (
+        import_library(name, "Exporting to Minari", "minari")
+        for name in (
+            "minari",
+            "minari.dataset.minari_storage",
+            "minari.serialization",
+            "minari.data_collector",
+            "PIL",  # its HDF5 storage needs it
+        )
+    )
     episodes = [e for e in find_episodes(table.view, table.rows) if len(e.rows) > 1]
     if not episodes:
         raise ExchangeError(
             f'No trajectory of mode "{table.mode}" has two samples, which an episode of Minari '
             "needs. A trajectory ends where an environment calls new_episode(), and where "
-            "check_sample() refuses a sample."
+            "check_sample() rejects a sample."
         )
     _check_space(table, out, len(episodes))
     out.mkdir()
+    observed = _space(table.fields, roles.observations, entries=roles.entries)
+    acted = _space(table.fields, roles.actions, entries=False)
     storage = storages.MinariStorage.new(
         out / "data",
-        observation_space=_space(table.fields, roles.observations, entries=roles.entries),
-        action_space=_space(table.fields, roles.actions, entries=False),
+        observation_space=serialization.deserialize_space(observed),
+        action_space=serialization.deserialize_space(acted),
         jpeg_encoding=False,
     )
     storage.update_episodes(
-        buffers.EpisodeBuffer(**_episode(table, roles, episode)) for episode in episodes
+        collector.EpisodeBuffer(**_episode(table, roles, episode)) for episode in episodes
     )
     name = out.name if _NAME.fullmatch(out.name) else "physx-v0"
     storage.update_metadata(
         {
             "dataset_id": name,
             "minari_version": minari.__version__,
-            "physx": json.loads(describe([table])),
+            "physx": json.loads(encode_notes(tables)),
         }
     )
     return table.rows - sum(len(episode.rows) for episode in episodes)
 
 
 def _check_space(table: Table, out: Path, episodes: int) -> None:
-    """Check that the disk has room: HDF5, which Minari writes with, crashes where it has not."""
+    """Check that the disk has room: HDF5, with which Minari writes, crashes if it has not."""
     arrays = episodes * (len(table.fields) + _OWN_ARRAYS)
-    needed, free = table.nbytes + arrays * _OVERHEAD, shutil.disk_usage(out.parent).free
+    needed, free = (
+        table.rows * table.row_nbytes + arrays * _OVERHEAD,
+        shutil.disk_usage(out.parent).free,
+    )
     if needed > free:
         raise ExchangeError(
             f"{len(table.fields)} fields in {episodes} episodes take up to {needed / 1e6:.1f} MB, "
@@ -166,20 +174,18 @@ def _single(arrays: Batch) -> Any:
     return next(iter(arrays.values())) if len(arrays) == 1 else arrays
 
 
-def _space(fields: Mapping[str, Field], names: Sequence[str], *, entries: bool) -> Any:
-    from gymnasium import spaces
-
+def _space(fields: Mapping[str, Field], names: Sequence[str], *, entries: bool) -> dict[str, Any]:
+    """Return the space of fields in the form in which Minari stores it."""
     if not names:
-        return spaces.Discrete(1)
+        return {"type": "Discrete", "n": 1, "start": 0}
     boxes = {name: _box(fields[name]) for name in names}
-    return boxes[names[0]] if len(names) == 1 and not entries else spaces.Dict(boxes)
+    single = len(names) == 1 and not entries
+    return boxes[names[0]] if single else {"type": "Dict", "subspaces": boxes}
 
 
-def _box(field: Field) -> Any:
-    from gymnasium import spaces
-
-    dtype = np.dtype(field.dtype)
-    if dtype.kind == "c" or 0 in (field.shape or ()):
+def _box(field: Field) -> dict[str, Any]:
+    dtype, shape = np.dtype(field.dtype), field.shape or ()
+    if dtype.kind == "c" or 0 in shape:
         raise ExchangeError(
             f'Minari has no space for the field "{field.name}" of type {dtype} and shape '
             f"{field.shape}."
@@ -190,4 +196,5 @@ def _box(field: Field) -> Any:
         low, high = 0, 1
     elif dtype.kind in "iu":
         low, high = np.iinfo(dtype).min, np.iinfo(dtype).max
-    return spaces.Box(low, high, field.shape or (), dtype.type)
+    bounds = {"low": np.full(shape, low, dtype), "high": np.full(shape, high, dtype)}
+    return {"type": "Box", "dtype": dtype.name, "shape": shape, **bounds}

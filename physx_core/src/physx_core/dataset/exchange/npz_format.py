@@ -1,6 +1,6 @@
 """NumPy's ``.npz``: a zip archive with one array for each field; nothing in it is ever unpickled.
 
-The archive's comment holds units, roles and modes, where `numpy.load` does not see them.
+The archive's comment holds units, roles and modes; `numpy.load` ignores it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import IO
 import numpy as np
 from numpy.lib import format as npy
 
-from physx_core.dataset.exchange.table import Column, Notes, Table, describe, rows_of
+from physx_core.dataset.exchange.table import Column, ExportOptions, Notes, Table, encode_notes
 from physx_core.errors import ExchangeError
 from physx_core.typing import Array
 
@@ -25,21 +25,16 @@ _COMMENT = 2**16 - 1
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 
 
-def write(tables: Sequence[Table], out: Path, compression: str) -> None:
-    """Write the fields as ``<field>``, or as ``<mode>/<field>`` where there are several modes.
-
-    Args:
-        tables: The modes.
-        out: The file.
-        compression: One of `COMPRESSIONS`.
-    """
-    with zipfile.ZipFile(out, "w", COMPRESSIONS[compression]) as archive:
+def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
+    """Write the fields as ``<field>``, or as ``<mode>/<field>`` if there are several modes."""
+    with zipfile.ZipFile(out, "w", COMPRESSIONS[options.compression]) as archive:
         for table in tables:
             prefix = f"{table.mode}/" if len(tables) > 1 else ""
             for name in table.fields:
                 with archive.open(f"{prefix}{name}.npy", "w", force_zip64=True) as file:
                     _write_array(table, name, file)
-        archive.comment = describe(tables, _COMMENT).encode()
+        archive.comment = encode_notes(tables, _COMMENT).encode()
+    return 0
 
 
 def _write_array(table: Table, name: str, file: IO[bytes]) -> None:
@@ -50,7 +45,7 @@ def _write_array(table: Table, name: str, file: IO[bytes]) -> None:
         "shape": (table.rows, *(field.shape or ())),
     }
     npy.write_array_header_1_0(file, header)
-    for _, block in table.column(name, rows_of(field.nbytes)):
+    for _, block in table.column(name):
         file.write(block.tobytes())
 
 
@@ -66,10 +61,10 @@ class NpzColumn:
             path: The archive, for messages.
             name: Name of the array.
             file: Its bytes.
-            size: How many they are, if the archive says the truth.
+            size: How many bytes there are according to the archive.
 
         Raises:
-            ExchangeError: The header is damaged, or promises more than there is.
+            ExchangeError: If the header is damaged, or promises more than there is.
         """
         self._place, self._file = f'The array "{name}" of {path}', file
         try:
@@ -77,14 +72,14 @@ class NpzColumn:
             read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
             self.shape, fortran, self.dtype = read(file)
         except (ValueError, KeyError, *_DAMAGE) as error:
-            raise ExchangeError(f"{self._place} has no header that can be read.") from error
+            raise ExchangeError(f"{self._place} has no readable header.") from error
         self._whole: Array | None = None
         if self.dtype.kind not in "biufc" or not self.shape:
-            return  # it cannot be taken, which is said where it is asked for
+            return  # it cannot be imported; the error is raised if it is asked for
         self._row = math.prod(self.shape[1:]) * self.dtype.itemsize
         if min(self.shape) < 0 or size - file.tell() != self.shape[0] * self._row:
             raise ExchangeError(f"{self._place} is not as long as its header says.")
-        if fortran:  # its rows do not lie one behind the other
+        if fortran:  # its rows are not contiguous
             flat = np.frombuffer(self._take(self.shape[0]), self.dtype)
             self._whole = flat.reshape(self.shape, order="F")
 
@@ -101,16 +96,16 @@ class NpzColumn:
         except _DAMAGE as error:
             raise ExchangeError(f"{self._place} is damaged: {error}.") from error
         if len(content) != count * self._row:
-            raise ExchangeError(f"{self._place} is cut off.")
+            raise ExchangeError(f"{self._place} is truncated.")
         return content
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[tuple[dict[str, Column], Notes]]:
-    """Open an archive; give its arrays by name, and what its comment says.
+def open_columns(path: Path) -> Iterator[tuple[dict[str, Column], Notes]]:
+    """Open an archive; yield its arrays by name, and the notes in its comment.
 
     Raises:
-        ExchangeError: It is no archive of arrays, or is damaged.
+        ExchangeError: If it is not an archive of arrays, or is damaged.
     """
     columns: dict[str, Column] = {}
     with contextlib.ExitStack() as files:
@@ -118,13 +113,13 @@ def opened(path: Path) -> Iterator[tuple[dict[str, Column], Notes]]:
             archive = files.enter_context(zipfile.ZipFile(path))
             damaged = archive.testzip()  # before anything of it is stored
             if damaged is not None:
-                raise zipfile.BadZipFile(f"{damaged} is not what was written")
+                raise zipfile.BadZipFile(f"{damaged} does not match its checksum")
             for item in archive.infolist():
                 if item.filename.endswith(".npy"):
                     name = item.filename.removesuffix(".npy")
                     file = files.enter_context(archive.open(item))
                     columns[name] = NpzColumn(path, name, file, item.file_size)
-            notes = Notes.read(archive.comment)
+            notes = Notes.parse(archive.comment)
         except _DAMAGE as error:
-            raise ExchangeError(f"{path} is no sound npz archive: {error}.") from error
+            raise ExchangeError(f"{path} is not a valid npz archive: {error}.") from error
         yield columns, notes

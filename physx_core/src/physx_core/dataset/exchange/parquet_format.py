@@ -1,17 +1,24 @@
-"""Parquet: one file with a column for each field; arrays are lists of a fixed size, nested.
+"""Parquet: one file with a column for each field; arrays are nested lists of a fixed size.
 
-Complex numbers are lists of two numbers. Unit, role, shape and NumPy type stand in the metadata of
-each column.
+Complex numbers are lists of two numbers. The metadata of each column hold unit, role, shape and
+NumPy type.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from physx_core.dataset.exchange.table import BLOCK, Table, describe, library
+from physx_core.dataset.exchange.table import (
+    BLOCK,
+    ExportOptions,
+    Table,
+    encode_notes,
+    import_library,
+)
 from physx_core.errors import ExchangeError
 from physx_core.fields import Field
 from physx_core.typing import Array
@@ -20,34 +27,28 @@ COMPRESSIONS = ("none", "snappy", "gzip", "zstd", "lz4", "brotli")
 _ROW_GROUP = 2 * BLOCK
 
 
-def write(table: Table, out: Path, compression: str) -> None:
-    """Write the rows of a mode.
-
-    Args:
-        table: The mode.
-        out: The file.
-        compression: One of `COMPRESSIONS`.
+def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
+    """Write the rows of one mode.
 
     Raises:
-        MissingLibraryError: pyarrow is not installed.
-        ExchangeError: Parquet has no such type.
+        MissingLibraryError: If pyarrow is not installed.
+        ExchangeError: If Parquet has no type for a field.
     """
-    arrow = library("pyarrow", "Exporting to Parquet", "parquet")
-    parquet = library("pyarrow.parquet", "Exporting to Parquet", "parquet")
+    (table,) = tables
+    arrow = import_library("pyarrow", "Exporting to Parquet", "parquet")
+    parquet = import_library("pyarrow.parquet", "Exporting to Parquet", "parquet")
     columns = [
         arrow.field(name, _type(arrow, field), nullable=False, metadata=_metadata(field))
         for name, field in table.fields.items()
     ]
-    schema = arrow.schema(columns, metadata={"physx": describe([table])})
+    schema = arrow.schema(columns, metadata={"physx": encode_notes(tables)})
     with parquet.ParquetWriter(
-        out, schema, compression=compression, use_dictionary=False
+        out, schema, compression=options.compression, use_dictionary=False
     ) as writer:
         for block in table.blocks(_ROW_GROUP):
-            arrays = [
-                _array(arrow, column.type, block[column.name], len(block[column.name]))
-                for column in schema
-            ]
+            arrays = [_array(arrow, column.type, block[column.name]) for column in schema]
             writer.write_batch(arrow.RecordBatch.from_arrays(arrays, schema=schema))
+    return 0
 
 
 def _metadata(field: Field) -> dict[str, str]:
@@ -67,16 +68,18 @@ def _type(arrow: Any, field: Field) -> Any:
         kind = arrow.from_numpy_dtype(np.empty(0, dtype).real.dtype)
     except (arrow.ArrowNotImplementedError, arrow.ArrowInvalid) as error:
         raise ExchangeError(
-            f'Parquet has no type for {dtype}, which the field "{field.name}" has.'
+            f'Parquet has no type for {dtype}, the type of the field "{field.name}".'
         ) from error
     if 0 in (field.shape or ()):
-        raise ExchangeError(f'Parquet holds no arrays without elements as "{field.name}" has them.')
+        raise ExchangeError(
+            f'Parquet cannot hold arrays without elements, such as those of "{field.name}".'
+        )
     for length in reversed(_shape(field)):
         kind = arrow.list_(kind, length)
     return kind
 
 
-def _array(arrow: Any, kind: Any, values: Array, rows: int) -> Any:
+def _array(arrow: Any, kind: Any, values: Array) -> Any:
     """Return rows as an Arrow array; lists of lists share one flat array of numbers."""
     if np.iscomplexobj(values):
         values = np.stack([values.real, values.imag], axis=-1)

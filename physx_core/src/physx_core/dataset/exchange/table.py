@@ -1,16 +1,17 @@
-"""Tables: the rows of one mode on their way into or out of a file of another format."""
+"""Tables: the rows of one mode on their way to or from a file of another format."""
 
 from __future__ import annotations
 
 import importlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 
 from physx_core.dataset.read.views import ModeView
+from physx_core.dataset.store.segment import rows_per_block
 from physx_core.errors import ConfigError, MissingLibraryError
 from physx_core.fields import RESERVED, Field, Role
 from physx_core.typing import Array, Batch
@@ -21,20 +22,38 @@ BLOCK = 2**23
 """Bytes of the blocks that are in memory at a time."""
 
 Advance = Callable[[int], None]
-"""Is told how many bytes went through."""
+"""Is called with the number of bytes that were transferred."""
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """Options of the formats.
+
+    Attributes:
+        compression: Name of the format's compression, or "none".
+        observations: Fields that are the observations of an episode (minari only); empty: all
+            training fields without another role.
+        actions: Fields that are its actions (minari only).
+        rewards: Field that is its rewards (minari only); None: they are 0.
+    """
+
+    compression: str = "none"
+    observations: Sequence[str] = ()
+    actions: Sequence[str] = ()
+    rewards: str | None = None
 
 
 @dataclass(frozen=True)
 class Table:
-    """The rows of one mode that leave a dataset.
+    """The rows of one mode to export.
 
     Attributes:
         mode: Name of the mode.
         fields: The fields by name, all with shapes.
-        rows: How many rows leave; those that a writer adds meanwhile stay.
+        rows: How many rows to export; those that a writer adds meanwhile are left out.
         info: Where the data come from.
-        view: Gives the rows.
-        advance: Is told how many bytes were read.
+        view: Reads the rows.
+        advance: Is called with the number of bytes read.
     """
 
     mode: str
@@ -45,38 +64,39 @@ class Table:
     advance: Advance
 
     @property
-    def nbytes(self) -> int:
-        """Bytes of all values."""
-        return self.rows * sum(field.nbytes for field in self.fields.values())
+    def row_nbytes(self) -> int:
+        """Bytes of the values of one row."""
+        return sum(field.nbytes for field in self.fields.values())
 
-    def column(self, name: str, step: int) -> Iterator[tuple[int, Array]]:
-        """Yield blocks of `step` rows of one field, each with the number of its first row."""
+    def column(self, name: str, step: int | None = None) -> Iterator[tuple[int, Array]]:
+        """Yield the rows of one field in blocks, each with the number of its first row.
+
+        Args:
+            name: Name of the field.
+            step: Rows of a block; None: as many as make about `BLOCK` bytes.
+        """
         values = self.view[name]
+        step = step or rows_per_block(self.fields[name].nbytes, BLOCK)
         for start in range(0, self.rows, step):
             block = values[start : min(start + step, self.rows)]
             self.advance(block.nbytes)
             yield start, block
 
-    def blocks(self, nbytes: int = BLOCK) -> Iterator[Batch]:
+    def blocks(self, nbytes: int) -> Iterator[Batch]:
         """Yield blocks of rows of all fields, of about `nbytes` bytes."""
-        step = rows_of(sum(field.nbytes for field in self.fields.values()), nbytes)
+        step = rows_per_block(self.row_nbytes, nbytes)
         columns = [self.column(name, step) for name in self.fields]
         for parts in zip(*columns, strict=True):
             yield {name: block for name, (_, block) in zip(self.fields, parts, strict=True)}
 
 
-def rows_of(row_nbytes: int, nbytes: int = BLOCK) -> int:
-    """Return how many rows of a size make about `nbytes` bytes, at least one."""
-    return max(1, nbytes // max(1, row_nbytes))
-
-
 class Column(Protocol):
-    """The rows of one field that enter a dataset, read from the first to the last.
+    """The rows of one field to import, read from the first to the last.
 
     Attributes:
         shape: (rows, *field shape).
         dtype: Type of the values.
-        unit: Unit that the file says of them.
+        unit: Their unit according to the file.
     """
 
     shape: tuple[int, ...]
@@ -87,20 +107,20 @@ class Column(Protocol):
         """Return the next rows, those from `start` on.
 
         Raises:
-            ExchangeError: The file is damaged.
+            ExchangeError: If the file is damaged.
         """
         ...
 
 
-def describe(tables: Sequence[Table], limit: int | None = None) -> str:
+def encode_notes(tables: Sequence[Table], limit: int | None = None) -> str:
     """Return what a file keeps of modes besides their rows, as JSON.
 
     Args:
         tables: The modes.
-        limit: Most bytes that the file can keep; then only the most important stays.
+        limit: How many bytes the file can keep; only the most important notes remain then.
     """
     plain: dict[str, Any] = {"format": FORMAT, "format_version": VERSION}
-    plain["modes"] = {t.mode: [field.to_dict() for field in t.fields.values()] for t in tables}
+    plain["modes"] = {t.mode: [of.to_dict() for of in t.fields.values()] for t in tables}
     text = json.dumps({**plain, "info": dict(tables[0].info) if tables else {}})
     if limit is None or len(text) <= limit:
         return text
@@ -110,30 +130,30 @@ def describe(tables: Sequence[Table], limit: int | None = None) -> str:
 
 @dataclass(frozen=True)
 class Notes:
-    """What a file says of its rows; a file that physx did not write says nothing.
+    """What a file notes about its rows; nothing, if physx did not write it.
 
     Attributes:
         modes: Mode to the fields by name, for their units and roles.
         info: Where the data come from.
     """
 
-    modes: Mapping[str, Mapping[str, Field]]
-    info: Mapping[str, Any]
+    modes: Mapping[str, Mapping[str, Field]] = field(default_factory=dict)
+    info: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, text: str | bytes) -> Notes:
-        """Return what `describe` wrote; nothing from any other text."""
+    def parse(cls, text: str | bytes) -> Notes:
+        """Return what `encode_notes` wrote; nothing from any other text."""
         try:
             plain = json.loads(text)
             if plain["format"] != FORMAT:
-                return cls({}, {})
-            fields = {
-                mode: {field.name: field for field in map(Field.from_dict, listed)}
-                for mode, listed in plain["modes"].items()
+                return cls()
+            modes = {
+                mode: {of.name: of for of in map(Field.from_dict, fields)}
+                for mode, fields in plain["modes"].items()
             }
-            return cls(fields, dict(plain.get("info", {})))
+            return cls(modes, dict(plain.get("info", {})))
         except (ValueError, KeyError, TypeError, AttributeError, ConfigError):
-            return cls({}, {})  # no more than a note is lost
+            return cls()  # only notes are lost
 
     def field(self, mode: str, name: str, column: Column) -> Field:
         """Return the field of a column, with unit and role if they are noted."""
@@ -143,16 +163,16 @@ class Notes:
         return Field(name, column.shape[1:], column.dtype, unit, role)
 
 
-def library(name: str, purpose: str, extra: str) -> Any:
-    """Import a library that only this needs.
+def import_library(name: str, purpose: str, extra: str) -> Any:
+    """Import a library that only one format needs.
 
     Args:
         name: Name of the module.
-        purpose: What needs it, for the error's text.
-        extra: Extra of physx-core that brings it.
+        purpose: What needs it, for the error message.
+        extra: Extra of physx-core that installs it.
 
     Raises:
-        MissingLibraryError: It is not installed.
+        MissingLibraryError: If it is not installed.
     """
     try:
         return importlib.import_module(name)

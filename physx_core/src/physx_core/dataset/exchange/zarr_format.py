@@ -9,38 +9,42 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset.exchange.table import BLOCK, Table, describe, library, rows_of
+from physx_core.dataset.exchange.table import (
+    BLOCK,
+    ExportOptions,
+    Table,
+    encode_notes,
+    import_library,
+)
+from physx_core.dataset.store.segment import rows_per_block
 from physx_core.errors import ExchangeError
 
 COMPRESSIONS = ("none", "zstd", "gzip", "blosc")
 _CODECS = {"zstd": "ZstdCodec", "gzip": "GzipCodec", "blosc": "BloscCodec"}
 
 
-def write(tables: Sequence[Table], out: Path, compression: str) -> None:
+def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
     """Write the modes as groups of arrays.
 
-    Args:
-        tables: The modes.
-        out: The folder.
-        compression: One of `COMPRESSIONS`.
-
     Raises:
-        MissingLibraryError: zarr is not installed.
-        ExchangeError: Zarr has no such type.
+        MissingLibraryError: If zarr is not installed.
+        ExchangeError: If Zarr has no type for a field.
     """
-    zarr = library("zarr", "Exporting to Zarr", "zarr")
-    codecs = library("zarr.codecs", "Exporting to Zarr", "zarr")
-    used = [getattr(codecs, _CODECS[compression])()] if compression != "none" else None
-    root = zarr.create_group(str(out), attributes={"physx": json.loads(describe(tables))})
+    zarr = import_library("zarr", "Exporting to Zarr", "zarr")
+    codecs = import_library("zarr.codecs", "Exporting to Zarr", "zarr")
+    codec = _CODECS.get(options.compression)
+    used = [getattr(codecs, codec)()] if codec else None
+    root = zarr.create_group(str(out), attributes={"physx": json.loads(encode_notes(tables))})
     for table in tables:
         group = root.create_group(table.mode)
         for name in table.fields:
             _write_field(group, table, name, used)
+    return 0
 
 
 def _write_field(group: Any, table: Table, name: str, codecs: list[Any] | None) -> None:
-    field, step = table.fields[name], rows_of(table.fields[name].nbytes, BLOCK)
-    shape = field.shape or ()
+    field = table.fields[name]
+    step, shape = rows_per_block(field.nbytes, BLOCK), field.shape or ()
     try:
         stored = group.create_array(
             name,

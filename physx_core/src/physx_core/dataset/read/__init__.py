@@ -1,1 +1,1 @@
-"""Reading rows and shuffled batches."""
+"""Reads rows and shuffled batches."""

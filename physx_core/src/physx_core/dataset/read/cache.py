@@ -1,25 +1,21 @@
-"""The columns of a dataset that are in memory or mapped, kept from one use to the next."""
+"""Caches the columns of a dataset that are in memory or mapped."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from physx_core.dataset.read import strategy
 from physx_core.dataset.read.mapping import MappedColumn
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.read.strategy import Strategy
+from physx_core.dataset.read.strategy import Strategy, choose_strategy
 from physx_core.fields import Field
-from physx_core.typing import Array
-
-Index: TypeAlias = NDArray[np.intp]
+from physx_core.typing import Array, Index
 
 
 class MemoryColumn:
-    """A field in memory, in the type it is asked for.
+    """A field in memory, in the requested type.
 
     Attributes:
         shape: (rows, *field shape).
@@ -33,10 +29,10 @@ class MemoryColumn:
         self._array = np.empty(self.shape, dtype)
 
     def extend(self, rows: int) -> None:
-        """Read what is not there yet of the first `rows` rows.
+        """Read those of the first `rows` rows that are not there yet.
 
         Raises:
-            DatasetError: A partition is missing, truncated or damaged.
+            DatasetError: If a partition is missing, truncated or damaged.
         """
         have = self.shape[0]
         if rows > len(self._array):
@@ -46,10 +42,9 @@ class MemoryColumn:
         if self._plain:
             self._reader.read_into(self._array[have:rows], self._mode, self._name, have)
         else:
-            for block in self._reader.blocks(self._mode, self._name, have):
-                end = min(rows, have + len(block))
-                self._array[have:end] = block[: end - have]
-                have = end
+            for block in self._reader.blocks(self._mode, self._name, have, rows):
+                self._array[have : have + len(block)] = block
+                have += len(block)
         self.shape = (rows, *self.shape[1:])
 
     @property
@@ -59,19 +54,26 @@ class MemoryColumn:
 
     def gather(self, index: Index, out: Array) -> None:
         """Copy the rows of an index array, all in range, into `out`."""
-        # Any mode but the default one writes straight into `out`.
+        # Every mode but the default one writes straight to `out`.
         self._array.take(index, 0, out, "clip")
 
 
 class ColumnCache:
-    """The columns of a dataset, kept from one use to the next."""
+    """The columns of a dataset, kept from one use to the next until stored rows change.
+
+    Attributes:
+        reader: Reads the rows.
+    """
 
     def __init__(self, reader: Reader) -> None:
         self.reader = reader
+        self._generation = reader.manifest.generation
         self._loaded: dict[tuple[str, str, np.dtype[Any]], MemoryColumn] = {}
         self._mapped: dict[tuple[str, str], MappedColumn] = {}
 
-    def strategy(self, mode: str, names: Sequence[str], dtype: np.dtype[Any] | None) -> Strategy:
+    def choose_strategy(
+        self, mode: str, names: Sequence[str], dtype: np.dtype[Any] | None = None
+    ) -> Strategy:
         """Return how the rows of fields are best read now.
 
         Args:
@@ -80,19 +82,20 @@ class ColumnCache:
             dtype: Type that floating fields are converted to; None: each keeps its own.
 
         Raises:
-            DatasetError: There is no such mode or field.
+            DatasetError: If there is no such mode or field.
         """
         fields = [self.reader.field(mode, name) for name in names]
-        return strategy.choose(sum(self.missing(mode, name, dtype) for name in names), fields)
+        return choose_strategy(sum(self.missing(mode, name, dtype) for name in names), fields)
 
     def load(self, mode: str, name: str, dtype: np.dtype[Any] | None = None) -> MemoryColumn:
         """Return all rows of a field that are committed now, in memory.
 
         Raises:
-            DatasetError: The field does not exist, or a partition is missing or damaged.
+            DatasetError: If the field does not exist, or a partition is missing or damaged.
         """
+        self._drop_stale()
         field = self.reader.field(mode, name)
-        key = mode, name, wanted(field, dtype)
+        key = mode, name, converted_dtype(field, dtype)
         column = self._loaded.get(key)
         if column is None:
             column = self._loaded[key] = MemoryColumn(self.reader, mode, field, key[2])
@@ -106,8 +109,9 @@ class ColumnCache:
         """Return all rows of a field that are committed now, mapped into the address space.
 
         Raises:
-            DatasetError: The field does not exist, or a partition is missing or damaged.
+            DatasetError: If the field does not exist, or a partition is missing or damaged.
         """
+        self._drop_stale()
         field, rows = self.reader.field(mode, name), self.reader.rows(mode)
         column = self._mapped.get((mode, name))
         if column is None or column.shape[0] != rows:
@@ -117,19 +121,25 @@ class ColumnCache:
 
     def missing(self, mode: str, name: str, dtype: np.dtype[Any] | None) -> int:
         """Return how many bytes of memory loading a field would take."""
+        self._drop_stale()
         field = self.reader.field(mode, name)
-        kind = wanted(field, dtype)
+        kind = converted_dtype(field, dtype)
         loaded = self._loaded.get((mode, name, kind))
         rows = self.reader.rows(mode) - (loaded.shape[0] if loaded else 0)
         return rows * (field.nbytes // np.dtype(field.dtype).itemsize) * kind.itemsize
 
     def clear(self) -> None:
-        """Free memory and addresses; needed where stored rows have changed."""
+        """Free memory and addresses."""
         self._loaded.clear()
         self._mapped.clear()
 
+    def _drop_stale(self) -> None:
+        if self._generation != self.reader.manifest.generation:
+            self._generation = self.reader.manifest.generation
+            self.clear()
 
-def wanted(field: Field, dtype: np.dtype[Any] | None) -> np.dtype[Any]:
-    """Return the type that a field is given in, if floating ones are converted to `dtype`."""
+
+def converted_dtype(field: Field, dtype: np.dtype[Any] | None) -> np.dtype[Any]:
+    """Return the type in which a field is returned if floating ones are converted to `dtype`."""
     own = np.dtype(field.dtype)
     return own if dtype is None or own.kind != "f" else dtype

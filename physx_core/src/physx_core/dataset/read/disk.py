@@ -1,4 +1,4 @@
-"""Reading a field's rows from its files as they are needed, with the system told ahead of time."""
+"""Reads a field's rows from its files as they are needed, and announces them to the system."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 
 from physx_core import files
-from physx_core.dataset.read.cache import Index, wanted
+from physx_core.dataset.read.cache import converted_dtype
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.store.partition_format import cannot_open
-from physx_core.errors import DatasetError
-from physx_core.typing import Array
+from physx_core.typing import Array, Index
 
 _OPEN_FILES = 64
 
@@ -22,16 +20,17 @@ _OPEN_FILES = 64
 class DiskColumn:
     """A field on the disk; close it after use.
 
-    Rows are read with system calls, not through mapped memory: a file that becomes shorter is an
-    error and not the end of the process, and the process does not grow.
+    Rows are read with system calls, not through mapped memory: a file that becomes shorter raises
+    an error instead of killing the process, and the memory of the process does not grow.
 
     Attributes:
         shape: (rows, *field shape).
-        dtype: Type of the rows that are given.
+        dtype: Type of the rows that are returned.
+        row_nbytes: Bytes of one stored row.
     """
 
     def __init__(self, reader: Reader, mode: str, name: str, dtype: np.dtype[Any] | None) -> None:
-        """Keep where the rows that are committed now lie.
+        """Look up where the rows that are committed now are stored.
 
         Args:
             reader: Knows the partitions.
@@ -41,7 +40,7 @@ class DiskColumn:
         """
         field = reader.field(mode, name)
         self.shape: tuple[int, ...] = (reader.rows(mode), *(field.shape or ()))
-        self.dtype = wanted(field, dtype)
+        self.dtype = converted_dtype(field, dtype)
         self.row_nbytes = field.nbytes
         self._own = np.dtype(field.dtype)
         self._scratch = np.empty((0, *self.shape[1:]), self._own)
@@ -53,7 +52,7 @@ class DiskColumn:
         """Tell the system that `count` rows from `start` on will be read soon.
 
         Raises:
-            DatasetError: A partition is missing, truncated or damaged.
+            DatasetError: If a partition is missing, truncated or damaged.
         """
         size = self.row_nbytes
         if not size or not hasattr(os, "posix_fadvise"):
@@ -68,7 +67,7 @@ class DiskColumn:
         """Copy single rows into a contiguous array, shape (rows, *field shape).
 
         Raises:
-            DatasetError: A partition is missing, truncated or damaged, or the disk fails.
+            DatasetError: If a partition is missing, truncated or damaged, or the disk fails.
         """
         size, rows = self.row_nbytes, self._target(out)
         view = files.raw(rows)
@@ -81,7 +80,7 @@ class DiskColumn:
         """Copy consecutive rows into a contiguous array, shape (rows, *field shape).
 
         Raises:
-            DatasetError: A partition is missing, truncated or damaged, or the disk fails.
+            DatasetError: If a partition is missing, truncated or damaged, or the disk fails.
         """
         rows = self._target(out)
         self._read(start, len(rows), files.raw(rows))
@@ -106,22 +105,17 @@ class DiskColumn:
         size = self.row_nbytes
         while view:
             number, place, part = self._locate(row, count)
-            try:
-                whole = files.read_at(self._opened[number][0].fileno(), view[: part * size], place)
-            except OSError as error:
-                raise cannot_open(self._segments[number].path, error) from error
-            if not whole:
-                path = self._segments[number].path
-                raise DatasetError(f"{path} became shorter while it was read.")
+            file = self._opened[number][0]
+            self._segments[number].read(file, place, view[: part * size])
             row, count, view = row + part, count - part, view[part * size :]
 
     def _locate(self, row: int, count: int) -> tuple[int, int, int]:
-        """Return a row's segment, opened, its place there, and how many of `count` rows follow."""
+        """Return a row's opened segment, its offset, and how many of `count` rows follow there."""
         number = bisect_right(self._starts, row) - 1
         segment, found = self._segments[number], self._opened.get(number)
         if found is None:
             if len(self._opened) >= _OPEN_FILES:
                 self._opened.pop(next(iter(self._opened)))[0].close()
-            found = self._opened[number] = segment.open(self.row_nbytes)
+            found = self._opened[number] = segment.open()
         before = row - segment.start
         return number, found[1] + before * self.row_nbytes, min(count, segment.rows - before)

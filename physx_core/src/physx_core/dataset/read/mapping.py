@@ -1,4 +1,4 @@
-"""Mapping: the rows of a field in all its partitions as one array, read by the system when used."""
+"""Maps the rows of a field in all its partitions as one array, which the system reads on access."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physx_core import files
-from physx_core.dataset.read.reader import Segment
-from physx_core.dataset.store.partition_format import cannot_open, truncated
+from physx_core.dataset.store.partition_format import cannot_read, truncated
+from physx_core.dataset.store.segment import Segment
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
-from physx_core.typing import Array
+from physx_core.typing import Array, Index
 
-_FIXED = 0x10  # MAP_FIXED, which the module mmap does not name
+_FIXED = 0x10  # MAP_FIXED, which the module mmap does not define
 _ANONYMOUS = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
 
 
@@ -34,11 +34,11 @@ class _Mapped(NamedTuple):
 
 
 class MappedColumn:
-    """A field on the disk whose partitions lie side by side in the address space.
+    """A field on the disk whose partitions are mapped side by side in the address space.
 
-    A row is taken from the array at its number plus a shift that each partition has, so that a
-    batch is one gather however many partitions there are. Several processes that map the same
-    files share the system's memory for them.
+    Row numbers are shifted by an amount that each partition has, so that a batch is one gather
+    however many partitions there are. Processes that map the same files share the system's memory
+    for them.
 
     Attributes:
         shape: (rows, *field shape).
@@ -49,7 +49,7 @@ class MappedColumn:
         """Map the partitions.
 
         Raises:
-            DatasetError: A partition is missing, truncated or damaged, or cannot be mapped.
+            DatasetError: If a partition is missing, truncated or damaged, or cannot be mapped.
         """
         self.shape: tuple[int, ...] = (
             sum(segment.rows for segment in segments),
@@ -66,23 +66,23 @@ class MappedColumn:
         else:
             self._array = np.empty((slots, *self.shape[1:]), self.dtype)
 
-    def gather(self, index: NDArray[np.intp], out: Array) -> None:
+    def gather(self, index: Index, out: Array) -> None:
         """Copy the rows of an index array, all in range, into `out` of the field's own type."""
         if len(self._starts) > 1:
             index = index + self._shifts[self._starts.searchsorted(index, "right") - 1]
         self._array.take(index, 0, out, "clip")
 
     def check(self) -> None:
-        """Check that no file became shorter: the system ends a process that reads beyond the end.
+        """Check that no file became shorter: the system kills a process that reads past the end.
 
         Raises:
-            DatasetError: A file is truncated or gone.
+            DatasetError: If a file is truncated.
         """
         for part in self._mapped:
             try:
                 now = os.stat(part.path)  # noqa: PTH116 (quicker, and this is done often)
             except FileNotFoundError:
-                continue  # a file that was removed or replaced stays what it is while mapped
+                continue  # a file that was removed or replaced stays intact while it is mapped
             if now.st_size < part.end and (now.st_dev, now.st_ino) == part.inode:
                 path, size = Path(part.path), self._row_nbytes
                 raise truncated(path, now.st_size, part.end, part.start, size)
@@ -92,13 +92,13 @@ class MappedColumn:
         weakref.finalize(self, _libc().munmap, base, nbytes).atexit = False
         for segment, shift in zip(segments, self._shifts, strict=True):
             address = base + int(segment.start + shift) * self._row_nbytes
-            file, offset = segment.open(self._row_nbytes)
+            file, offset = segment.open()
             with file:
                 count = segment.rows * self._row_nbytes
                 try:
                     _place(address, count, file.fileno(), offset)
                 except OSError as error:
-                    raise cannot_open(segment.path, error) from error
+                    raise cannot_read(segment.path, error) from error
                 status = os.fstat(file.fileno())
             inode = status.st_dev, status.st_ino
             self._mapped.append(_Mapped(str(segment.path), inode, offset, offset + count))
@@ -107,8 +107,8 @@ class MappedColumn:
         return content
 
 
-def _places(segments: Sequence[Segment], row_nbytes: int) -> tuple[NDArray[np.intp], int]:
-    """Return how far each segment's rows lie behind their numbers, and the places in all.
+def _places(segments: Sequence[Segment], row_nbytes: int) -> tuple[Index, int]:
+    """Return how far each segment's rows are shifted, and the number of places in the array.
 
     Each segment begins at the start of a page, and at a whole number of rows.
     """
@@ -122,13 +122,13 @@ def _places(segments: Sequence[Segment], row_nbytes: int) -> tuple[NDArray[np.in
 
 
 def _place(address: int, count: int, descriptor: int, offset: int) -> None:
-    """Map `count` bytes of a file to an address; copy them where they do not begin with a page."""
+    """Map `count` bytes of a file to an address; copy them if they do not begin with a page."""
     if offset % mmap.PAGESIZE == 0:
         _mmap(address, count, mmap.PROT_READ, mmap.MAP_SHARED | _FIXED, descriptor, offset)
         return
     _mmap(address, count, mmap.PROT_READ | mmap.PROT_WRITE, _ANONYMOUS | _FIXED, -1, 0)
     if not files.read_at(descriptor, _bytes_at(address, count), offset):
-        raise OSError(0, "it became shorter while it was read")
+        raise OSError(0, "it became shorter while it was being read")
 
 
 def _bytes_at(address: int, count: int) -> memoryview:
@@ -136,14 +136,14 @@ def _bytes_at(address: int, count: int) -> memoryview:
 
 
 def _reserve(nbytes: int) -> int:
-    """Take addresses without memory behind them."""
+    """Reserve addresses without memory behind them."""
     noreserve = getattr(mmap, "MAP_NORESERVE", 0)
     try:
         return _mmap(None, nbytes, mmap.PROT_READ, _ANONYMOUS | noreserve, -1, 0)
     except OSError as error:
         raise DatasetError(
             f"Rows cannot be mapped: {error.strerror}. {nbytes} bytes of addresses are needed. "
-            "Raise the limit of addresses (ulimit -v), or read fewer fields."
+            "Raise the limit of the address space (ulimit -v), or read fewer fields."
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""How much memory this process may still take."""
+"""Determines how much memory this process may still allocate."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _CGROUPS = Path("/sys/fs/cgroup")
 
 
 def available_memory() -> int:
-    """Return how many bytes of memory this process may still take.
+    """Return how many bytes of memory this process may still allocate.
 
-    Memory that only caches files counts as free. What the machine has is bounded by the control
-    groups of the process (of version 1 or 2) and by its limit of addresses (``ulimit -v``).
+    Memory that only caches files counts as free. The machine's memory is bounded by the control
+    groups of the process (version 1 or 2) and by its limit of the address space (``ulimit -v``).
     """
     bounds = [_machine(), *_control_groups()]
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
@@ -34,7 +34,7 @@ def _machine() -> int:
 
 
 def _control_groups() -> Iterator[int]:
-    """Yield what each limited control group around this process has left."""
+    """Yield how many bytes each limited control group of this process has left."""
     try:
         lines = (_PROC / "self/cgroup").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Exact shuffling of rows on the disk: the system reads ahead what comes next."""
+"""Shuffles rows on the disk exactly, while the system prefetches those that come next."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset.read import strategy
-from physx_core.dataset.read.cache import ColumnCache, Index, MemoryColumn
+from physx_core.dataset.read.cache import ColumnCache, MemoryColumn
 from physx_core.dataset.read.disk import DiskColumn
-from physx_core.typing import Batch
+from physx_core.dataset.read.strategy import LARGE_ROW, memory_budget
+from physx_core.typing import Batch, Index
 
 _AHEAD = 2**24  # bytes that the system is asked to read ahead
 
@@ -18,7 +18,7 @@ _AHEAD = 2**24  # bytes that the system is asked to read ahead
 class ExactEpoch:
     """A pass over rows on the disk, in the same permutation as in memory.
 
-    Fields of small rows are read into memory as long as they fit there beside the others.
+    Fields with small rows are read into memory if they fit there beside the others.
 
     Attributes:
         rows: How many rows there are.
@@ -33,7 +33,7 @@ class ExactEpoch:
         random: np.random.Generator,
         subset: Index | None = None,
     ) -> None:
-        """Draw the permutation and ask for the first rows.
+        """Draw the permutation and open the columns.
 
         Args:
             columns: Columns in memory, and the reader of the others.
@@ -41,10 +41,10 @@ class ExactEpoch:
             names: Names of the fields.
             dtype: Type that floating fields are converted to; None: each keeps its own.
             random: Draws the permutation.
-            subset: The only rows to give; None: all.
+            subset: The only rows to read; None: all.
 
         Raises:
-            DatasetError: A partition is missing, truncated or damaged.
+            DatasetError: If a partition is missing, truncated or damaged.
         """
         self._order = random.permutation(columns.reader.rows(mode) if subset is None else subset)
         self.rows = len(self._order)
@@ -64,7 +64,7 @@ class ExactEpoch:
         """Copy the next rows: see `Epoch`.
 
         Raises:
-            DatasetError: A partition is missing, truncated or damaged, or the disk fails.
+            DatasetError: If a partition is missing, truncated or damaged, or the disk fails.
         """
         outs = list(batch.values())
         stop = start + len(outs[0])
@@ -81,7 +81,7 @@ class ExactEpoch:
             column.close()
 
     def _announce(self, stop: int) -> None:
-        """Ask the system for the rows up to `stop` of the permutation."""
+        """Announce the rows up to `stop` of the permutation to the system."""
         for row in self._order[self._announced : stop].tolist():
             for column in self._disk:
                 column.announce(row)
@@ -91,10 +91,10 @@ class ExactEpoch:
 def _small(
     columns: ColumnCache, mode: str, names: Sequence[str], dtype: np.dtype[Any] | None
 ) -> set[str]:
-    """Return the fields of small rows that fit into memory together, the smallest first."""
-    left, found = strategy.budget(), set()
+    """Return the fields with small rows that fit into memory together, the smallest first."""
+    left, found = memory_budget(), set()
     for size, name in sorted((columns.missing(mode, name, dtype), name) for name in names):
-        if size <= left and columns.reader.field(mode, name).nbytes < strategy.LARGE_ROW:
+        if size <= left and columns.reader.field(mode, name).nbytes < LARGE_ROW:
             left -= size
             found.add(name)
     return found

@@ -1,106 +1,147 @@
-"""Batches: rows in the order of writing or shuffled, gathered into arrays that may be reused.
+"""Reads batches of rows, in the order of writing or shuffled, into arrays that may be reused.
 
-`physx_core.dataset.read.strategy` says how rows can be read; each way is an `Epoch`.
+`physx_core.dataset.read.strategy` lists the ways to read rows; each is an `Epoch`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol, TypedDict
 
 import numpy as np
+from numpy.typing import DTypeLike
 
-from physx_core.dataset.read.cache import ColumnCache, Index, MemoryColumn, wanted
+from physx_core.dataset.read.cache import ColumnCache, MemoryColumn, converted_dtype
 from physx_core.dataset.read.disk import DiskColumn
 from physx_core.dataset.read.prefetch import ExactEpoch
-from physx_core.dataset.read.strategy import Strategy
+from physx_core.dataset.read.strategy import Choice, Strategy, check_strategy
 from physx_core.dataset.read.windows import WindowedEpoch
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.statistics import Normalization
-from physx_core.typing import Batch
+from physx_core.typing import Batch, Index
 
 
-@dataclass(frozen=True)
-class Batches:
-    """One request for batches, see `Dataset.batches`; iterating makes them.
+class BatchOptions(TypedDict, total=False):
+    """The options of `Dataset.batches`, which describes them, and of `Subset.batches`."""
 
-    Attributes:
-        columns: Columns in memory, and the reader of the others.
-        mode: Name of the mode.
-        names: Names of the fields.
-        batch_size: Rows of a batch.
-        epochs: How often to go through all rows; None: without end.
-        random: Draws a permutation for each epoch; None: the order of the rows.
-        dtype: Type that floating fields are converted to; None: each keeps its own.
-        reuse: Whether every batch is given in the same arrays.
-        strategy: How rows are read; None: as suits their size and the free memory.
-        normalization: What normalizes fields, by name; other fields stay as they are.
-        subset: The only rows to give, rising; None: all.
-    """
-
-    columns: ColumnCache
-    mode: str
-    names: Sequence[str]
-    batch_size: int
+    shuffle: bool
+    seed: int | Sequence[int] | None
     epochs: int | None
-    random: np.random.Generator | None
-    dtype: np.dtype[Any] | None
+    fields: Sequence[str] | None
+    dtype: DTypeLike | None
     reuse: bool
-    strategy: Strategy | None = None
-    normalization: Mapping[str, Normalization] = field(default_factory=dict)
-    subset: Index | None = None
+    normalize: bool | Mapping[str, Normalization]
+    strategy: Choice
 
-    def __post_init__(self) -> None:
-        """Check that there is something to give.
+
+class BatchReader:
+    """Reads the batches of a mode, or of a part of its rows, when it is iterated, once."""
+
+    def __init__(
+        self,
+        columns: ColumnCache,
+        mode: str,
+        batch_size: int,
+        subset: Index | None = None,
+        *,
+        shuffle: bool = False,
+        seed: int | Sequence[int] | None = None,
+        epochs: int | None = 1,
+        fields: Sequence[str] | None = None,
+        dtype: DTypeLike | None = None,
+        reuse: bool = False,
+        normalize: bool | Mapping[str, Normalization] = False,
+        strategy: Choice = "auto",
+    ) -> None:
+        """Check the options, which are those of `Dataset.batches`.
+
+        Args:
+            columns: Columns in memory, and the reader of the others.
+            mode: Name of the mode.
+            batch_size: Rows of a batch.
+            subset: The only rows to read, ascending; None: all.
+            shuffle: See `Dataset.batches`, as for the options below.
+            seed: See there.
+            epochs: See there.
+            fields: See there.
+            dtype: See there.
+            reuse: See there.
+            normalize: The normalization to use, by field; False: none.
+            strategy: See there.
 
         Raises:
-            ConfigError: `batch_size` or `epochs` is out of range, or no field is asked for.
-            DatasetError: A field does not exist, or there are no samples.
+            ConfigError: If an option is out of range, or no field is asked for.
+            DatasetError: If a field does not exist, or there are no samples.
         """
-        if self.batch_size < 1:
-            raise ConfigError(f"batch_size is {self.batch_size} but must be at least 1.")
-        if self.epochs is not None and self.epochs < 0:
-            raise ConfigError(f"epochs is {self.epochs} but cannot be negative.")
-        if not self.names:
+        if batch_size < 1:
+            raise ConfigError(f"batch_size is {batch_size} but must be at least 1.")
+        if epochs is not None and epochs < 0:
+            raise ConfigError(f"epochs is {epochs} but cannot be negative.")
+        reader = columns.reader
+        self._names = list(dict.fromkeys(reader.mode(mode).fields if fields is None else fields))
+        if not self._names:
             raise ConfigError("Batches need at least one field.")
-        for name in self.names:
-            self.columns.reader.field(self.mode, name)
-        if not self.columns.reader.rows(self.mode):
-            raise DatasetError(
-                f'Mode "{self.mode}" has no samples yet, so there are no batches to read.'
-            )
+        known = [reader.field(mode, name) for name in self._names]
+        if not reader.rows(mode):
+            raise DatasetError(f'Mode "{mode}" has no samples yet, so there are no batches.')
+        self._columns, self._mode, self._subset = columns, mode, subset
+        self._size, self._epochs = batch_size, epochs
+        self._random = np.random.default_rng(seed) if shuffle else None
+        self._dtype = None if dtype is None else np.dtype(dtype)
+        self._strategy = check_strategy(strategy)
+        self._kinds = {
+            field.name: (field.shape or (), converted_dtype(field, self._dtype)) for field in known
+        }
+        self._buffers = self._allocate(batch_size) if reuse else None
+        scales = normalize if isinstance(normalize, Mapping) else {}
+        self._scales = [
+            (name, np.asarray(scales[name].mean, kind), np.asarray(scales[name].std, kind))
+            for name, (_, kind) in self._kinds.items()
+            if name in scales and kind.kind == "f"
+        ]
 
     def __iter__(self) -> Iterator[Batch]:
         """Yield the batches of all epochs."""
-        form, strategy, size, count = _Form(self), self.strategy, self.batch_size, 0
-        while self.epochs is None or count < self.epochs:
-            if self.strategy is None and strategy in (None, "memory"):
-                strategy = self.columns.strategy(self.mode, self.names, self.dtype)
+        strategy, size, count = self._strategy, self._size, 0
+        while self._epochs is None or count < self._epochs:
+            if self._strategy is None and strategy in (None, "memory"):
+                strategy = self._columns.choose_strategy(self._mode, self._names, self._dtype)
             epoch = self._begin(strategy or "memory")
             try:
                 rows = epoch.rows
                 for start in range(0, rows, size):
-                    batch = form.batch(size if start + size <= rows else rows - start)
+                    batch = self._new_batch(size if start + size <= rows else rows - start)
                     epoch.fill(start, batch)
-                    if form.scales:
-                        form.normalize(batch)
+                    for name, mean, std in self._scales:
+                        values = batch[name]
+                        values -= mean
+                        values /= std
                     yield batch
             finally:
                 epoch.close()
             count += 1
 
     def _begin(self, strategy: Strategy) -> Epoch:
-        mode, names, dtype, random = self.mode, self.names, self.dtype, self.random
+        mode, names, dtype, random = self._mode, self._names, self._dtype, self._random
         if strategy == "memory":
-            loaded = [self.columns.load(mode, name, dtype) for name in names]
-            return MemoryEpoch(loaded, random, self.subset)
+            loaded = [self._columns.load(mode, name, dtype) for name in names]
+            return MemoryEpoch(loaded, random, self._subset)
         for name in names:
-            self.columns.reader.check(mode, name)
+            self._columns.reader.check(mode, name)
         if strategy == "disk exact" and random is not None:
-            return ExactEpoch(self.columns, mode, names, dtype, random, self.subset)
-        disk = [DiskColumn(self.columns.reader, mode, name, dtype) for name in names]
-        return WindowedEpoch(disk, random, self.subset)
+            return ExactEpoch(self._columns, mode, names, dtype, random, self._subset)
+        disk = [DiskColumn(self._columns.reader, mode, name, dtype) for name in names]
+        return WindowedEpoch(disk, random, self._subset)
+
+    def _new_batch(self, size: int) -> Batch:
+        if self._buffers is None:
+            return self._allocate(size)
+        if size == self._size:
+            return self._buffers.copy()
+        return {name: buffer[:size] for name, buffer in self._buffers.items()}
+
+    def _allocate(self, size: int) -> Batch:
+        return {name: np.empty((size, *shape), kind) for name, (shape, kind) in self._kinds.items()}
 
 
 class Epoch(Protocol):
@@ -116,7 +157,7 @@ class Epoch(Protocol):
         """Copy the next rows of each field into the arrays of a batch.
 
         Args:
-            start: How many rows were given before.
+            start: How many rows were read before.
             batch: The fields in the order of the request, with arrays of one length.
         """
 
@@ -154,44 +195,7 @@ class MemoryEpoch:
         else:
             index = self._order[start:stop]
             for take, out in zip(self._takes, outs):  # noqa: B905
-                take(index, 0, out, "clip")  # any mode but the default writes straight into `out`
+                take(index, 0, out, "clip")  # every mode but the default writes straight to `out`
 
     def close(self) -> None:
         """Do nothing: the columns are kept for the next epoch."""
-
-
-class _Form:
-    """The arrays that batches are given in, and what is done to them last.
-
-    Attributes:
-        scales: Field, mean and deviation, for each field to normalize.
-    """
-
-    def __init__(self, request: Batches) -> None:
-        fields = [request.columns.reader.field(request.mode, name) for name in request.names]
-        self._kinds = {of.name: (of.shape or (), wanted(of, request.dtype)) for of in fields}
-        self._size = request.batch_size
-        self._buffers = self._allocate(self._size) if request.reuse else None
-        self.scales = [
-            (name, np.asarray(known.mean, kind), np.asarray(known.std, kind))
-            for name, (_, kind) in self._kinds.items()
-            if (known := request.normalization.get(name)) and kind.kind == "f"
-        ]
-
-    def batch(self, size: int) -> Batch:
-        """Return a batch of `size` rows to fill."""
-        if self._buffers is None:
-            return self._allocate(size)
-        if size == self._size:
-            return self._buffers.copy()
-        return {name: buffer[:size] for name, buffer in self._buffers.items()}
-
-    def normalize(self, batch: Batch) -> None:
-        """Normalize in place."""
-        for name, mean, std in self.scales:
-            values = batch[name]
-            values -= mean
-            values /= std
-
-    def _allocate(self, size: int) -> Batch:
-        return {name: np.empty((size, *shape), kind) for name, (shape, kind) in self._kinds.items()}

@@ -1,48 +1,27 @@
-"""Splits: parts of a mode as lists of its rows; nothing is copied."""
+"""Splits a mode into parts, which are lists of its rows; nothing is copied."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, Unpack
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
 
-from physx_core.dataset.read import strategy as strategies
-from physx_core.dataset.read.cache import ColumnCache
 from physx_core.dataset.read.episodes import find_episodes
-from physx_core.dataset.read.sampling import Batches
+from physx_core.dataset.read.sampling import BatchOptions, BatchReader
 from physx_core.dataset.read.views import FieldView, ModeView
+from physx_core.dataset.store.manifest import has_statistics
+from physx_core.dataset.store.segment import rows_per_block
 from physx_core.errors import ConfigError
-from physx_core.fields import RESERVED, Field
+from physx_core.fields import Field
 from physx_core.statistics import Normalization, RunningStatistics
-from physx_core.typing import Array, Batch
+from physx_core.typing import Array, Batch, Index
 
-Index = NDArray[np.intp]
 _EXACT = 1e-9
-_BLOCK = 2**20
-
-
-@dataclass(frozen=True)
-class Source:
-    """The rows that are split.
-
-    Attributes:
-        view: Gives the rows.
-        columns: Gives batches of them.
-        mode: Name of the mode.
-        rows: How many rows there are.
-    """
-
-    view: ModeView
-    columns: ColumnCache
-    mode: str
-    rows: int
 
 
 class SubsetField:
-    """One field's rows of a subset; takes what a `FieldView` takes and returns copies.
+    """One field's rows of a subset; indexed like a `FieldView`, with copies as results.
 
     Attributes:
         field: The field.
@@ -73,16 +52,16 @@ class SubsetField:
 class Subset:
     """Some rows of a mode, in the order of writing.
 
-    The rows are those that were there when it was made; later ones are in no part.
+    The rows are among those that existed when the mode was split; later ones are in no part.
 
     Attributes:
         mode: Name of the mode.
-        rows: Numbers of the rows in the mode, rising.
+        rows: Numbers of the rows in the mode, ascending.
     """
 
-    def __init__(self, source: Source, rows: Index) -> None:
-        self.mode, self.rows = source.mode, rows
-        self._source = source
+    def __init__(self, view: ModeView, rows: Index) -> None:
+        self.mode, self.rows = view.mode, rows
+        self._view = view
 
     @property
     def num_samples(self) -> int:
@@ -92,92 +71,64 @@ class Subset:
     @property
     def fields(self) -> dict[str, Field]:
         """The fields by name."""
-        return {name: view.field for name, view in self._source.view.items()}
+        return {name: view.field for name, view in self._view.items()}
 
     def __getitem__(self, name: str) -> SubsetField:
-        return SubsetField(self._source.view[name], self.rows)
+        return SubsetField(self._view[name], self.rows)
 
-    def batches(
-        self,
-        batch_size: int,
-        *,
-        shuffle: bool = False,
-        seed: int | Sequence[int] | None = None,
-        epochs: int | None = 1,
-        fields: Sequence[str] | None = None,
-        dtype: DTypeLike | None = None,
-        reuse: bool = False,
-        normalize: bool | Mapping[str, Normalization] = False,
-        strategy: strategies.Choice = "auto",
-    ) -> Iterator[Batch]:
-        """Go through the rows in batches; arguments and errors are those of `Dataset.batches`.
+    def batches(self, batch_size: int, **options: Unpack[BatchOptions]) -> Iterator[Batch]:
+        """Iterate over the rows in batches; options and errors are those of `Dataset.batches`.
 
         ``normalize=True`` takes `normalization`, that of these rows alone.
         """
-        if isinstance(normalize, bool):
-            normalize = self.normalization() if normalize else {}
-        names = list(self.fields if fields is None else fields)
-        random = np.random.default_rng(seed) if shuffle else None
-        kind = None if dtype is None else np.dtype(dtype)
-        return iter(
-            Batches(
-                self._source.columns,
-                self.mode,
-                names,
-                batch_size,
-                epochs,
-                random,
-                kind,
-                reuse,
-                strategies.check(strategy),
-                normalize,
-                self.rows,
-            )
-        )
+        if options.get("normalize") is True:
+            options["normalize"] = self.normalization()
+        return iter(BatchReader(self._view.columns, self.mode, batch_size, self.rows, **options))
 
     def normalization(self) -> dict[str, Normalization]:
         """Compute what normalizes the floating fields from these rows alone, in one pass.
 
         Raises:
-            DatasetError: A partition is missing or damaged.
+            DatasetError: If a partition is missing or damaged.
         """
-        found = {}
-        for name, field in self.fields.items():
-            if name not in RESERVED and np.dtype(field.dtype).kind == "f":
-                found[name] = self._statistics(name, field).normalization()
-        return found
+        return {
+            name: self._statistics(name, field).normalization()
+            for name, field in self.fields.items()
+            if has_statistics(field)
+        }
 
     def _statistics(self, name: str, field: Field) -> RunningStatistics:
-        statistics, view = RunningStatistics(), self._source.view[name]
-        step = max(1, _BLOCK // max(1, field.nbytes))
-        for start in range(0, self._source.rows, step):
-            stop = min(start + step, self._source.rows)
-            first, last = np.searchsorted(self.rows, (start, stop))
+        statistics, view = RunningStatistics(), self._view[name]
+        step = rows_per_block(field.nbytes)
+        for start in range(0, int(self.rows[-1]) + 1, step):
+            first, last = np.searchsorted(self.rows, (start, start + step))
             if first < last:
-                statistics.update(view[start:stop][self.rows[first:last] - start])
+                statistics.update(view[start : start + step][self.rows[first:last] - start])
         return statistics
 
     def __repr__(self) -> str:
         return f"<{self.num_samples} samples of {self.mode}>"
 
 
-def split(source: Source, shares: Mapping[str, float], by: str, seed: int) -> dict[str, Subset]:
-    """Return the parts of a mode: see `Dataset.split`."""
+def split(
+    view: ModeView, total: int, shares: Mapping[str, float], by: str, seed: int
+) -> dict[str, Subset]:
+    """Return parts of the first `total` rows of a mode: see `Dataset.split`."""
     _check(shares, by)
     random = np.random.default_rng(seed)
     if by == "row":
-        rows = random.permutation(source.rows)
-        ends = [round(end * source.rows) for end in _ends(shares)]
+        rows = random.permutation(total)
+        ends = [round(end * total) for end in _ends(shares)]
     else:
-        rows, ends = _by_episode(source, shares, random)
+        rows, ends = _shuffle_episodes(view, total, shares, random)
     parts = {}
     for name, start, stop in zip(shares, [0, *ends], ends, strict=False):
         if start >= stop:
             raise ConfigError(
-                f'The part "{name}" would be empty: there are {source.rows} samples of mode '
-                f'"{source.mode}".'
+                f'The part "{name}" would be empty: there are {total} samples of mode '
+                f'"{view.mode}".'
             )
-        parts[name] = Subset(source, np.sort(rows[start:stop]))
+        parts[name] = Subset(view, np.sort(rows[start:stop]))
     return parts
 
 
@@ -187,35 +138,35 @@ def _check(shares: Mapping[str, float], by: str) -> None:
     values = np.array(list(shares.values()), np.float64)
     if not values.size or not (values > 0).all() or values.sum() > 1 + _EXACT:
         raise ConfigError(
-            f"The shares are {dict(shares)} but must be above 0, and 1 at most together."
+            f"The shares are {dict(shares)} but must be positive and add up to 1 at most."
         )
 
 
 def _ends(shares: Mapping[str, float]) -> list[float]:
-    """Return where each part ends, as a share of all rows; 1 is 1 in spite of rounding."""
+    """Return where each part ends, as a share of all rows; 1 is exact in spite of rounding."""
     ends = np.cumsum(list(shares.values()))
     return [1.0 if abs(end - 1) < _EXACT else float(end) for end in ends]
 
 
-def _by_episode(
-    source: Source, shares: Mapping[str, float], random: np.random.Generator
+def _shuffle_episodes(
+    view: ModeView, total: int, shares: Mapping[str, float], random: np.random.Generator
 ) -> tuple[Array, list[int]]:
     """Return all rows, shuffled by trajectory, and where each part ends among them.
 
-    Each part has one trajectory at least, and ends with the one that brings it nearest to its
+    Each part has at least one trajectory, and ends with the one that brings it closest to its
     share of the rows.
     """
-    episodes = find_episodes(source.view, source.rows)
+    episodes = find_episodes(view, total)
     if len(episodes) < len(shares):
         raise ConfigError(
-            f'Mode "{source.mode}" has {len(episodes)} trajectories, which cannot be split into '
+            f'Mode "{view.mode}" has {len(episodes)} trajectories, which cannot be split into '
             f'{len(shares)} parts by episode. Split by="row".'
         )
     order = random.permutation(len(episodes))
     ends = np.cumsum([len(episodes[number].rows) for number in order])
     counts: list[int] = []
     for number, share in enumerate(_ends(shares)):
-        nearest = int(np.abs(ends - share * source.rows).argmin()) + 1
+        nearest = int(np.abs(ends - share * total).argmin()) + 1
         most = len(episodes) - (len(shares) - number - 1)
         counts.append(min(max(nearest, (counts or [0])[-1] + 1), most))
     rows = np.concatenate([episodes[number].rows for number in order])

@@ -1,4 +1,4 @@
-"""Strategies: how batches are read, chosen from the sizes of the fields and the free memory."""
+"""Read strategies: how batches are read, chosen by the sizes of the fields and the free memory."""
 
 from __future__ import annotations
 
@@ -13,47 +13,47 @@ Strategy: TypeAlias = Literal["memory", "disk exact", "disk windowed"]
 """How batches are read.
 
 - ``memory``: the fields are read into memory once; a shuffled epoch is an exact permutation.
-- ``disk exact``: rows are read one by one, the system being told early which come next; the same
-  permutation.
+- ``disk exact``: the same permutation, read row by row; the system is told early which rows come
+  next.
 - ``disk windowed``: blocks of rows are read in random order, and the rows of 64 blocks at a time
   are shuffled. Every row comes once in an epoch, but rows of the same block come near each other.
 """
 Choice: TypeAlias = Strategy | Literal["auto"]
 
 LARGE_ROW = 4096
-"""Bytes from which a row is worth reading alone: a disk gives no less."""
+"""Bytes from which a row is worth reading alone: a disk reads no less at a time."""
 
 _SHARE = 0.5
 
 
-def choose(missing: int, fields: Sequence[Field]) -> Strategy:
+def choose_strategy(missing: int, fields: Sequence[Field]) -> Strategy:
     """Choose how to read.
 
     Args:
         missing: Bytes of the fields that are not in memory yet.
         fields: The fields to read together.
     """
-    if not missing or missing <= budget():
+    if not missing or missing <= memory_budget():
         return "memory"
     row_nbytes = sum(field.nbytes for field in fields)
     return "disk exact" if row_nbytes >= LARGE_ROW else "disk windowed"
 
 
-def budget() -> int:
-    """Return how many bytes rows may take in memory now."""
+def memory_budget() -> int:
+    """Return how many bytes of memory rows may take now."""
     return int(_SHARE * memory.available_memory())
 
 
-def check(strategy: str) -> Strategy | None:
-    """Return a strategy that was asked for by name; None for ``auto``.
+def check_strategy(choice: str) -> Strategy | None:
+    """Return the strategy that was chosen by name; None for ``auto``.
 
     Raises:
-        ConfigError: There is no such strategy.
+        ConfigError: If there is no such strategy.
     """
-    if strategy == "auto":
+    if choice == "auto":
         return None
     for known in get_args(Strategy):
-        if strategy == known:
+        if choice == known:
             return known  # type: ignore[no-any-return]
-    known_names = listed(["auto", *get_args(Strategy)])
-    raise ConfigError(f'There is no reading strategy "{strategy}". Strategies: {known_names}.')
+    names = listed(["auto", *get_args(Strategy)])
+    raise ConfigError(f'There is no reading strategy "{choice}". Strategies: {names}.')

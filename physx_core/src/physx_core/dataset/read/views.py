@@ -1,4 +1,4 @@
-"""Views: a mode's fields and a field's rows, read when they are asked for."""
+"""Views of a mode's fields and of a field's rows, which are read when they are asked for."""
 
 from __future__ import annotations
 
@@ -9,21 +9,23 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from physx_core.dataset.read.cache import ColumnCache
-from physx_core.dataset.read.reader import Reader
 from physx_core.fields import Field
-from physx_core.typing import Array
+from physx_core.typing import Array, Index
 
 
 class FieldView:
-    """The rows of one field: takes a row's number, a slice, or an array of numbers or booleans.
+    """The rows of one field, indexed by a number, a slice, or an array of numbers or booleans.
 
-    Whatever is returned is a copy.
+    Every result is a copy.
+
+    Attributes:
+        field: The field.
     """
 
-    def __init__(self, reader: Reader, columns: ColumnCache, mode: str, field: Field) -> None:
+    def __init__(self, columns: ColumnCache, mode: str, field: Field) -> None:
         self.field = field
-        self._reader = reader
         self._columns = columns
+        self._reader = columns.reader
         self._mode = mode
 
     @property
@@ -49,11 +51,10 @@ class FieldView:
             start, stop, step = rows.indices(len(self))
             if step == 1:
                 return self._read(start, max(start, stop))
-            return self._gather(np.arange(start, stop, step))
-        if isinstance(rows, (list, np.ndarray)):
-            return self._gather(self._index(np.asarray(rows)))
+        if isinstance(rows, (slice, list, np.ndarray)):
+            return self._gather(row_numbers(rows, len(self)))
         raise IndexError(
-            f"Rows are taken by a number, a slice or an array of numbers, not by {rows!r}. "
+            f"Rows are selected by a number, a slice or an array of numbers, not by {rows!r}. "
             "For a part of each row, index the result."
         )
 
@@ -63,7 +64,7 @@ class FieldView:
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> Array:
         if copy is False:
-            raise ValueError("The rows lie on the disk: reading them makes a copy.")
+            raise ValueError("The rows are on the disk: reading them makes a copy.")
         rows = self._read(0, len(self))
         return rows if dtype is None else rows.astype(dtype, copy=False)
 
@@ -74,41 +75,29 @@ class FieldView:
     def _read(self, start: int, stop: int) -> Array:
         return self._reader.read(self._mode, self.field.name, start, stop)
 
-    def _gather(self, index: Array) -> Array:
+    def _gather(self, index: Index) -> Array:
         column = self._columns.map(self._mode, self.field.name)
         column.check()
         out = np.empty((len(index), *column.shape[1:]), column.dtype)
-        column.gather(index.astype(np.intp, copy=False), out)
+        column.gather(index, out)
         return out
-
-    def _index(self, rows: Array) -> Array:
-        """Return row numbers in range, from numbers that may be negative or from booleans."""
-        total = len(self)
-        if rows.dtype.kind == "b" and rows.shape == (total,):
-            return np.flatnonzero(rows)
-        if not rows.size:
-            return np.zeros(0, np.intp)
-        if rows.dtype.kind not in "iu" or rows.ndim != 1:
-            raise IndexError(
-                f"An index array has whole numbers and one axis, or {total} booleans; this one "
-                f"has type {rows.dtype} and shape {rows.shape}."
-            )
-        if rows.min() < -total or rows.max() >= total:
-            raise IndexError(f"Row numbers are out of range: there are {total} rows.")
-        return np.where(rows < 0, rows + total, rows)
 
 
 class ModeView:
-    """The fields of one mode by name; iterating gives the names."""
+    """The fields of one mode by name; iterating gives the names.
 
-    def __init__(self, reader: Reader, columns: ColumnCache, mode: str) -> None:
-        self._reader = reader
-        self._columns = columns
-        self._mode = mode
+    Attributes:
+        columns: Caches the columns.
+        mode: Name of the mode.
+    """
+
+    def __init__(self, columns: ColumnCache, mode: str) -> None:
+        self.columns = columns
+        self.mode = mode
 
     def __getitem__(self, name: str) -> FieldView:
-        field = self._reader.field(self._mode, name)
-        return FieldView(self._reader, self._columns, self._mode, field)
+        field = self.columns.reader.field(self.mode, name)
+        return FieldView(self.columns, self.mode, field)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.keys())
@@ -121,11 +110,38 @@ class ModeView:
 
     def keys(self) -> list[str]:
         """Return the names of the fields."""
-        return list(self._reader.mode(self._mode).fields)
+        return list(self.columns.reader.mode(self.mode).fields)
 
     def items(self) -> list[tuple[str, FieldView]]:
         """Return names and fields."""
         return [(name, self[name]) for name in self.keys()]
 
     def __repr__(self) -> str:
-        return f"<{self._mode}: {self._reader.rows(self._mode)} samples of {self.keys()}>"
+        return f"<{self.mode}: {self.columns.reader.rows(self.mode)} samples of {self.keys()}>"
+
+
+def row_numbers(index: Any, total: int) -> Index:
+    """Return the numbers of the rows that a number, a slice or an array selects.
+
+    Args:
+        index: A number, which may be negative, a slice, or an array of numbers or `total` booleans.
+        total: How many rows there are.
+
+    Raises:
+        IndexError: If there are no such rows, or the index is something else.
+    """
+    if isinstance(index, slice):
+        return np.arange(*index.indices(total))
+    numbers = np.atleast_1d(np.asarray(index))
+    if numbers.dtype.kind == "b" and numbers.shape == (total,):
+        return np.flatnonzero(numbers)
+    if not numbers.size:
+        return np.zeros(0, np.intp)
+    if numbers.dtype.kind not in "iu" or numbers.ndim != 1:
+        raise IndexError(
+            f"An index array has whole numbers and one axis, or {total} booleans; this one "
+            f"has type {numbers.dtype} and shape {numbers.shape}."
+        )
+    if numbers.min() < -total or numbers.max() >= total:
+        raise IndexError(f"Row numbers are out of range: there are {total} rows.")
+    return np.where(numbers < 0, numbers + total, numbers).astype(np.intp, copy=False)

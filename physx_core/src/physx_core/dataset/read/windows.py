@@ -1,14 +1,13 @@
-"""Reading blocks of rows from the disk, and shuffling within a window of many blocks."""
+"""Reads blocks of rows from the disk and shuffles them within a window of many blocks."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from physx_core.dataset.read.cache import Index
 from physx_core.dataset.read.disk import DiskColumn
-from physx_core.typing import Batch
+from physx_core.typing import Batch, Index
 
-# The order depends on these sizes, but never on the free memory: a seed gives it again anywhere.
+# The order depends on these sizes, never on the free memory: a seed reproduces it on any machine.
 _BLOCK = 2**19
 _WINDOW_BLOCKS = 64
 
@@ -16,10 +15,10 @@ _WINDOW_BLOCKS = 64
 class WindowedEpoch:
     """A pass over rows on the disk, block by block.
 
-    The blocks of consecutive rows, half a megabyte each, come in random order; the rows of 64 of
-    them at a time lie in memory and are shuffled. So each row comes once, and a batch draws from 64
-    places of the dataset. The order depends on the seed and on the fields that are read. Without
-    random numbers, the rows come in the order of writing.
+    Blocks of consecutive rows, half a megabyte each, come in random order; the rows of 64 of them
+    at a time are in memory and shuffled. So each row comes once, and a batch draws from 64 places
+    of the dataset. The order depends on the seed and on the fields that are read. Without a random
+    generator, the rows come in the order of writing.
 
     Attributes:
         rows: How many rows there are.
@@ -31,15 +30,15 @@ class WindowedEpoch:
         random: np.random.Generator | None,
         subset: Index | None = None,
     ) -> None:
-        """Draw the order of the blocks and ask for the first ones.
+        """Draw the order of the blocks and announce the first ones.
 
         Args:
             columns: The fields.
             random: Draws the order; None: that of writing.
-            subset: The only rows to give, rising; None: all.
+            subset: The only rows to read, ascending; None: all.
 
         Raises:
-            DatasetError: A partition is missing, truncated or damaged.
+            DatasetError: If a partition is missing, truncated or damaged.
         """
         self._total = columns[0].shape[0]
         self.rows = self._total if subset is None else len(subset)
@@ -48,7 +47,7 @@ class WindowedEpoch:
         self._block = max(1, _BLOCK // max(1, row_nbytes))
         number = -(-self._total // self._block)
         self._blocks = np.arange(number) if random is None else random.permutation(number)
-        if random is None:  # nothing is shuffled: a window of few megabytes will do
+        if random is None:  # nothing is shuffled: a window of a few megabytes suffices
             self._window_blocks = max(1, 8 * _BLOCK // max(1, self._block * row_nbytes))
         else:
             self._window_blocks = _WINDOW_BLOCKS
@@ -62,7 +61,7 @@ class WindowedEpoch:
         """Copy the next rows: see `Epoch`.
 
         Raises:
-            DatasetError: A partition is missing, truncated or damaged, or the disk fails.
+            DatasetError: If a partition is missing, truncated or damaged, or the disk fails.
         """
         outs = list(batch.values())
         done, count = 0, len(outs[0])
@@ -84,7 +83,7 @@ class WindowedEpoch:
             column.close()
 
     def _read_window(self) -> None:
-        """Read the next window, and ask the system for the one after it."""
+        """Read the next window, and announce the one after it."""
         held = 0
         for start, count in self._next_window():
             for column, window in zip(self._columns, self._windows, strict=True):
@@ -97,7 +96,7 @@ class WindowedEpoch:
             self._order = self._random.permutation(held)
 
     def _keep(self, start: int, count: int, held: int) -> int:
-        """Move the block's rows of the subset to its front and return how many there are."""
+        """Move the block's rows that are in the subset to its front; return how many there are."""
         subset = self._subset if self._subset is not None else np.arange(0)
         first, last = np.searchsorted(subset, (start, start + count))
         kept = subset[first:last] - start
@@ -111,7 +110,7 @@ class WindowedEpoch:
                 column.announce(start, count)
 
     def _next_window(self) -> list[tuple[int, int]]:
-        """Return first row and number of rows of each block of the next window."""
+        """Return the first row and the number of rows of each block of the next window."""
         blocks = self._blocks[self._next_block : self._next_block + self._window_blocks]
         starts = (blocks * self._block).tolist()
         return [(start, min(self._block, self._total - start)) for start in starts]

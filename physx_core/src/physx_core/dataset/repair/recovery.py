@@ -1,4 +1,4 @@
-"""Opening a dataset whatever happened to its last writer: no committed row is lost."""
+"""Opens datasets, even after the last writer was killed: no committed row is lost."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from physx_core.dataset.store.partition_format import (
     inspect,
     open_partition,
 )
-from physx_core.dataset.store.sealing import remove_files, scanned, seal, sync_files
+from physx_core.dataset.store.sealing import remove_files, scan, seal, sync_files
 from physx_core.dataset.write.definitions import compare_fields
 from physx_core.errors import DatasetError, DatasetNotFoundError, FieldsMismatchError, listed
 from physx_core.fields import Field
@@ -32,7 +32,7 @@ def locate(directory: str | Path) -> Path:
     """Return the folder of a dataset, given that folder or the session's folder around it.
 
     Raises:
-        DatasetNotFoundError: There is no dataset; the message says what there is.
+        DatasetNotFoundError: If there is no dataset; the message lists what is there.
     """
     given = Path(directory)
     for folder in (given, given / "dataset"):
@@ -41,9 +41,9 @@ def locate(directory: str | Path) -> Path:
     if not given.is_dir():
         parent = given.absolute().parent
         around = [p.name for p in parent.iterdir()] if parent.is_dir() else []
-        what = f"The folder does not exist. In {parent} there is: {listed(around)}."
+        what = f"The folder does not exist. {parent} contains: {listed(around)}."
     else:
-        what = f"The folder holds: {listed(p.name for p in given.iterdir())}."
+        what = f"The folder contains: {listed(p.name for p in given.iterdir())}."
     raise DatasetNotFoundError(f"There is no dataset in {given}. {what}")
 
 
@@ -51,7 +51,7 @@ def holds_dataset(folder: Path) -> bool:
     """Return whether a folder holds a manifest or partition files."""
     if (folder / manifest_file.FILE).is_file():
         return True
-    return folder.is_dir() and any(is_partition(path) for path in folder.glob("*.h5"))
+    return folder.is_dir() and any(_is_partition(path) for path in folder.glob("*.h5"))
 
 
 def load(directory: Path, *, edited: bool = False) -> Manifest:
@@ -61,28 +61,34 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
 
     Args:
         directory: The dataset's folder.
-        edited: Whether to take a manifest that was edited by hand.
+        edited: Whether to accept a manifest that was edited by hand.
 
     Raises:
-        DatasetError: The manifest is not valid, or is missing and a partition is damaged.
+        DatasetError: If the manifest is not valid, or is missing and a partition is damaged.
     """
     for _ in range(_ATTEMPTS):
         before = _state(directory)
-        manifest = _load(directory, edited)
+        try:
+            manifest = manifest_file.load(directory, edited=edited)
+        except FileNotFoundError:
+            manifest = load_from_files(directory)
+        else:
+            _adopt(directory, manifest, strict=False)
+            count_rows(directory, manifest)
         if _state(directory) == before:  # otherwise a writer has replaced it meanwhile
             break
     return manifest
 
 
 def load_from_files(directory: Path) -> Manifest:
-    """Make a manifest of the partition files alone; nothing on the disk is changed.
+    """Build a manifest from the partition files alone; nothing on the disk is changed.
 
     Raises:
-        DatasetError: A partition is damaged.
+        DatasetError: If a partition is damaged.
     """
     manifest = Manifest()
     _adopt(directory, manifest, strict=True)
-    count_all(directory, manifest)
+    count_rows(directory, manifest)
     return manifest
 
 
@@ -96,24 +102,15 @@ def damaged_files(directory: Path) -> Iterator[tuple[Path, DatasetError]]:
                 yield path, error
 
 
-def refresh(directory: Path, manifest: Manifest) -> bool:
-    """See what other processes have committed; return whether rows known before have moved.
-
-    Raises:
-        DatasetError: The manifest is not valid any more.
-    """
-    return manifest.take(load(directory))
-
-
-def repair(directory: Path, manifest: Manifest) -> list[str]:
-    """Seal what a killed writer left open and remove what it left half made.
+def recover(directory: Path, manifest: Manifest) -> list[str]:
+    """Seal what a killed writer left open and remove what it left unfinished.
 
     Returns:
         What was sealed, completed or removed from the manifest, as texts.
 
     Raises:
-        DatasetError: A partition is missing or damaged.
-        OSError: A partition cannot be rewritten; nothing is lost.
+        DatasetError: If a partition is missing or damaged.
+        OSError: If a partition cannot be rewritten; nothing is lost.
     """
     if manifest.problems:
         raise next(iter(manifest.problems.values()))
@@ -123,73 +120,83 @@ def repair(directory: Path, manifest: Manifest) -> list[str]:
     for name, mode in manifest.modes.items():
         for partition in [p for p in mode.partitions if not p.sealed]:
             if partition.rows:
-                mode.swap(seal(directory, name, mode.fields, partition))
-                what = f"of {partition.rows} rows was left open and is sealed now."
+                mode.swap(seal(directory, mode.fields, partition))
+                what = f"of {partition.rows} rows was left open and has been sealed."
             else:
                 mode.partitions.remove(partition)
                 mode.dropped.append(partition)
-                what = "had no committed row and is removed."
-            done.append(f"{_label(name, partition)} {what}")
+                what = "had no committed row and has been removed."
+            label = f"Partition {partition.index} of session {partition.session!r}"
+            done.append(f"{label} and mode {name!r} {what}")
     if complete_checksums(directory, manifest):
-        done.append("Rows were being updated in place: their checksums are computed anew.")
+        done.append("Rows were being updated in place: their checksums have been recomputed.")
     if any(mode.dropped for mode in manifest.modes.values()):
-        manifest_file.save(directory, manifest)  # now nothing refers to the files any more
-        clear_dropped(directory, manifest)
-        done = done or ["What was left of removed partitions is gone now."]
+        manifest_file.save(directory, manifest)  # from now on nothing refers to the files
+        _clear_dropped(directory, manifest)
+        done = done or ["The remains of removed partitions have been deleted."]
     for path in _unlisted(directory, manifest):
-        if is_partition(path) and not inspect(path).rows:
+        if _is_partition(path) and not inspect(path).rows:
             path.unlink()
     return done
 
 
-def clear_dropped(directory: Path, manifest: Manifest) -> None:
-    """Remove the files of dropped partitions, and forget them.
-
-    Raises:
-        OSError: A file cannot be removed.
-    """
-    for name, mode in manifest.modes.items():
+def _clear_dropped(directory: Path, manifest: Manifest) -> None:
+    for mode in manifest.modes.values():
         for partition in mode.dropped:
-            remove_files(directory, name, mode, partition)
+            remove_files(directory, mode.fields, partition)
         mode.dropped.clear()
 
 
 def complete_checksums(directory: Path, manifest: Manifest) -> bool:
-    """Compute the checksums that updates in place have made void; return whether there were any.
+    """Compute the checksums that updates in place have invalidated; return whether any were.
 
     Raises:
-        DatasetError: A partition is missing or damaged.
-        OSError: The rows cannot be brought to the disk.
+        DatasetError: If a partition is missing or damaged.
+        OSError: If the rows cannot be synced to the disk.
     """
     changed = False
-    for name, mode in manifest.modes.items():
+    for mode in manifest.modes.values():
         for partition in [p for p in mode.partitions if p.sealed and not p.checksums]:
             changed = True
-            sync_files(directory, name, mode, partition)
-            found = scanned(directory, name, mode.fields, partition)
+            sync_files(directory, mode.fields, partition)
+            found = scan(directory, mode.fields, partition)
             if partition.counted:
                 found = replace(found, counted=True, running={})
             mode.swap(found)
     return changed
 
 
-def is_partition(path: Path) -> bool:
-    """Return whether a file calls itself a partition, as far as its first bytes tell."""
+def count_rows(directory: Path, manifest: Manifest) -> None:
+    """Count what is committed; modes whose rows cannot be counted are noted as problems."""
+    for name, mode in manifest.modes.items():
+        try:
+            for partition in mode.partitions:
+                if not partition.sealed:
+                    partition.rows = _committed_rows(directory, mode, partition)
+        except DatasetError as error:
+            manifest.problems[name] = error
+
+
+def _committed_rows(directory: Path, mode: Mode, partition: Partition) -> int:
+    """Return how many rows are committed in all files of an open partition."""
+    rows = []
+    for name, field in mode.fields.items():
+        found = partition.inspect(directory, field)
+        have = found.identity.field
+        if have != field and field.shape is not None:
+            path = partition.path(directory, name)
+            raise DatasetError(f"{path} holds {have}, but the dataset says {field}.")
+        rows.append(found.rows)
+    return min(rows)
+
+
+def _is_partition(path: Path) -> bool:
+    """Return whether a file claims to be a partition, judging by its first bytes."""
     try:
         with open_partition(path) as file:
             return FORMAT.encode() in (file.read(2**14) or b"")
-    except DatasetError:  # a link, a pipe, or no right to read it
+    except DatasetError:  # a link, a pipe, or no permission to read it
         return False
-
-
-def _load(directory: Path, edited: bool) -> Manifest:
-    try:
-        manifest = manifest_file.load(directory, edited=edited)
-    except FileNotFoundError:
-        return load_from_files(directory)
-    _adopt(directory, manifest, strict=False)
-    count_all(directory, manifest)
-    return manifest
 
 
 def _state(directory: Path) -> tuple[int, int] | None:
@@ -199,36 +206,6 @@ def _state(directory: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return now.st_ino, now.st_mtime_ns
-
-
-def count_all(directory: Path, manifest: Manifest) -> None:
-    """Count what is committed; modes whose rows cannot be counted are noted as problems."""
-    for name, mode in manifest.modes.items():
-        try:
-            _count(directory, name, mode)
-        except DatasetError as error:
-            manifest.problems[name] = error
-
-
-def _count(directory: Path, mode_name: str, mode: Mode) -> None:
-    """Ask the files of unsealed partitions for their rows."""
-    for partition in mode.partitions:
-        if partition.sealed:
-            continue
-        found = {
-            name: inspect(
-                directory / partition.file_name(mode_name, name),
-                partition.offsets.get(name),
-                field.nbytes,
-            )
-            for name, field in mode.fields.items()
-        }
-        for name, field in mode.fields.items():
-            if found[name].identity.field != field and field.shape is not None:
-                path = directory / partition.file_name(mode_name, name)
-                have = found[name].identity.field
-                raise DatasetError(f"{path} holds {have}, but the dataset says {field}.")
-        partition.rows = min(inspection.rows for inspection in found.values())
 
 
 def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
@@ -251,10 +228,10 @@ def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
         fields = {name: found.identity.field for name, found in sorted(group.items(), key=_role)}
         mode = manifest.modes.get(mode_name)
         if mode is not None and not strict and not _fits(mode, fields):
-            continue  # a part of what was being removed, or nothing of this dataset
+            continue  # a part of what was being removed, or not part of this dataset
         mode = manifest.modes.setdefault(mode_name, Mode(fields))
         first_row = next(iter(group.values())).identity.first_row
-        mode.partitions.append(Partition(session, index, first_row))
+        mode.partitions.append(Partition(mode_name, session, index, first_row))
         mode.fields |= {
             name: field
             for name, field in fields.items()
@@ -268,10 +245,6 @@ def _fits(mode: Mode, fields: Mapping[str, Field]) -> bool:
     except FieldsMismatchError:
         return False
     return True
-
-
-def _label(mode_name: str, partition: Partition) -> str:
-    return f"Partition {partition.index} of session {partition.session!r} and mode {mode_name!r}"
 
 
 def _order(item: tuple[tuple[str, str, int], Group]) -> tuple[str, int, str, int]:
@@ -290,7 +263,7 @@ def _unlisted(directory: Path, manifest: Manifest) -> list[Path]:
 
 
 def _is_foreign(path: Path) -> bool:
-    """Return whether a file is no partition: by its name, or because it is other, sound HDF5."""
+    """Return whether a file is not a partition, by its name or because it is other, sound HDF5."""
     import h5py
 
     if not _NAME.fullmatch(path.name):

@@ -1,1 +1,1 @@
-"""Files of a dataset: partitions, manifest, virtual index."""
+"""The files of a dataset: partitions, manifest, virtual index."""

@@ -1,4 +1,4 @@
-"""What a dataset knows besides its rows: modes, fields, partitions, statistics, and its origin.
+"""The manifest: a dataset's modes, fields, partitions, statistics, and origin.
 
 `physx_core.dataset.store.manifest_file` stores it as ``dataset.json``.
 """
@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset.store.partition_format import Identity, partition_file
+from physx_core.dataset.store.partition_format import Identity, Inspection, inspect, partition_file
+from physx_core.dataset.store.segment import Segment
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.fields import RESERVED, Field
 from physx_core.statistics import RunningStatistics
@@ -26,19 +27,21 @@ class Partition:
     """Consecutive rows of one mode: one file for each field.
 
     Attributes:
+        mode: Name of the mode.
         session: Session that wrote it.
         index: Its number in the session and mode, counted from 0.
         first_row: Row of the mode that was its first when it was begun; it orders the partitions.
         rows: Committed rows, the same in all fields.
         sealed: Whether it is complete: every file has exactly these rows.
-        offsets: Place of the first row in the file, by field.
+        offsets: Byte of the file at which the rows begin, by field.
         checksums: CRC-32 of the rows, by field; empty until it is sealed, and while rows are
             updated in place.
-        counted: Whether the mode's statistics hold its rows.
+        counted: Whether the mode's statistics include its rows.
         writing: Whether this process writes it, so that `offsets` are right though not sealed.
         running: Statistics of its first rows while it is not counted, by field; not stored.
     """
 
+    mode: str
     session: str
     index: int
     first_row: int
@@ -55,16 +58,40 @@ class Partition:
         """What tells it from the other partitions of its mode."""
         return self.session, self.index
 
-    def file_name(self, mode: str, name: str) -> str:
+    def file_name(self, name: str) -> str:
         """Return the name of a field's file."""
-        return partition_file(self.session, mode, name, self.index)
+        return partition_file(self.session, self.mode, name, self.index)
 
-    def identity(self, mode: str, of: Field) -> Identity:
+    def path(self, directory: Path, name: str) -> Path:
+        """Return the path of a field's file."""
+        return directory / self.file_name(name)
+
+    def identity(self, of: Field) -> Identity:
         """Return what a field's file is part of."""
-        return Identity(self.session, mode, of, self.index, self.first_row)
+        return Identity(self.session, self.mode, of, self.index, self.first_row)
+
+    def inspect(self, directory: Path, of: Field) -> Inspection:
+        """Return what a field's file says of itself.
+
+        Raises:
+            DatasetError: If the file is missing, truncated or not a partition file.
+        """
+        return inspect(self.path(directory, of.name), self.offsets.get(of.name), of.nbytes)
+
+    def segment(self, directory: Path, of: Field, start: int = 0) -> Segment:
+        """Return the rows of a field, of which the first is row `start` of the mode."""
+        return Segment(
+            self.path(directory, of.name),
+            of,
+            start,
+            self.rows,
+            self.offsets.get(of.name, 0),
+            self.sealed or self.writing,
+            self.checksums.get(of.name),
+        )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON; an unfinished partition's rows are only in its files."""
+        """Return plain data for JSON; the row count of an open partition is only in its files."""
         plain: dict[str, Any] = {
             "session": self.session,
             "index": self.index,
@@ -83,10 +110,10 @@ class Mode:
     """The rows of one mode.
 
     Attributes:
-        fields: The fields by name; shapes are None until the first rows tell them.
-        partitions: In the order of the rows.
+        fields: The fields by name; a shape is None until the first rows determine it.
+        partitions: The partitions in the order of their rows.
         statistics: Statistics of floating fields, over the rows of all counted partitions.
-        dropped: Partitions that are no part of the mode though their files may be there: they are
+        dropped: Partitions that do not belong to the mode though their files may exist: they are
             being removed, or copied from another dataset.
     """
 
@@ -112,19 +139,19 @@ class Mode:
         return {name: of for name, of in self.fields.items() if has_statistics(of)}
 
     def place(self, partition: Partition) -> int:
-        """Return where in the order a partition is, whatever became of it meanwhile."""
+        """Return the position of a partition, even if it has been replaced by a later state."""
         return [p.key for p in self.partitions].index(partition.key)
 
     def start(self, partition: Partition) -> int:
-        """Return the row of the mode that is a partition's first now."""
+        """Return the row of the mode with which a partition now begins."""
         return sum(before.rows for before in self.partitions[: self.place(partition)])
 
     def swap(self, partition: Partition) -> None:
-        """Put a partition in the place of its earlier state."""
+        """Replace the earlier state of a partition."""
         self.partitions[self.place(partition)] = partition
 
     def forget_statistics(self) -> None:
-        """Let the statistics be computed anew from all rows."""
+        """Have the statistics recomputed from all rows."""
         self.statistics = {}
         for place, partition in enumerate(self.partitions):
             partition.running = {}
@@ -132,7 +159,7 @@ class Mode:
                 self.partitions[place] = replace(partition, counted=False)
 
     def continues(self, earlier: Mode) -> bool:
-        """Return whether all rows of an earlier state are still here, at the same places."""
+        """Return whether all rows of an earlier state are still there, with the same numbers."""
         before = [p for p in earlier.partitions if p.rows]
         now = [p for p in self.partitions if p.rows]
         grown = all(
@@ -144,7 +171,7 @@ class Mode:
         return grown and len(now) >= len(before) and self.rows >= earlier.rows
 
     def copy(self) -> Mode:
-        """Return a mode that can be changed while this one stays; partitions are shared."""
+        """Return a copy to change while this one stays; the partitions are shared."""
         return Mode(
             dict(self.fields), list(self.partitions), dict(self.statistics), list(self.dropped)
         )
@@ -162,12 +189,12 @@ class Mode:
 
 
 def has_statistics(of: Field) -> bool:
-    """Return whether statistics of a field are kept: of floating ones that users define."""
+    """Return whether a field has statistics: floating ones do, unless physx adds them."""
     return of.name not in RESERVED and np.dtype(of.dtype).kind == "f"
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what writes datasets."""
+    """Return the versions of the software that writes datasets."""
     packages = ("physx-core", "numpy", "h5py")
     return {"python": platform.python_version()} | {
         package: metadata.version(package) for package in packages
@@ -183,16 +210,19 @@ class Manifest:
         info: Where the data came from: environment, its keyword arguments, seed and the like.
         versions: Versions of Python and of the packages that made the dataset.
         problems: Modes whose rows cannot be counted, and why; not stored.
+        generation: Increases whenever rows known before have changed or have other numbers now,
+            so that rows kept in memory are stale; not stored.
     """
 
     modes: dict[str, Mode] = field(default_factory=dict)
     info: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=versions)
     problems: dict[str, DatasetError] = field(default_factory=dict)
+    generation: int = 0
 
     @property
     def sessions(self) -> list[str]:
-        """Names of the sessions that wrote rows, in their order."""
+        """Names of the sessions that wrote rows, in the order of their rows."""
         found = [p.session for mode in self.modes.values() for p in mode.partitions]
         return list(dict.fromkeys(found))
 
@@ -200,34 +230,33 @@ class Manifest:
     def file_names(self) -> set[str]:
         """Names of all partition files, also of dropped ones."""
         return {
-            partition.file_name(name, of)
-            for name, mode in self.modes.items()
+            partition.file_name(of)
+            for mode in self.modes.values()
             for partition in (*mode.partitions, *mode.dropped)
             for of in mode.fields
         }
 
     def copy(self) -> Manifest:
-        """Return a manifest that can be changed while this one stays; partitions are shared."""
+        """Return a copy to change while this one stays; the partitions are shared."""
         modes = {name: mode.copy() for name, mode in self.modes.items()}
         return Manifest(modes, dict(self.info), dict(self.versions), dict(self.problems))
 
-    def take(self, other: Manifest) -> bool:
-        """Become what `other` is; return whether rows known before are now at other places."""
-        moved = any(
+    def take(self, other: Manifest) -> None:
+        """Become what `other` is."""
+        self.generation += any(
             name not in other.modes or not other.modes[name].continues(mode)
             for name, mode in self.modes.items()
             if name not in self.problems
         )
         self.modes, self.info = other.modes, other.info
         self.versions, self.problems = other.versions, other.problems
-        return moved
 
 
-def plain_info(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values as the manifest will give them back: tuples and arrays become lists.
+def to_plain_info(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values as the manifest will return them: tuples and arrays become lists.
 
     Raises:
-        ConfigError: A value is nothing that JSON can hold.
+        ConfigError: If JSON cannot represent a value.
     """
 
     def convert(value: Any) -> Any:
@@ -237,7 +266,7 @@ def plain_info(values: Mapping[str, Any]) -> dict[str, Any]:
             return str(value)
         if isinstance(value, type):
             return f"{value.__module__}:{value.__qualname__}"
-        raise TypeError(f"{value!r} is nothing that JSON can hold")
+        raise TypeError(f"JSON cannot represent {value!r}")
 
     try:
         plain: dict[str, Any] = json.loads(json.dumps(dict(values), default=convert))

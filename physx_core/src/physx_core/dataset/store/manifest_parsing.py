@@ -1,11 +1,11 @@
-"""Making a manifest from plain data that nothing is known of: every value is checked."""
+"""Parses and validates an untrusted manifest."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,122 +14,119 @@ from physx_core.fields import Field
 from physx_core.statistics import RunningStatistics
 
 SESSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}")
-"""What can begin the names of files; no path can be made of it."""
+"""What file names can begin with; no path can be built from it."""
 
 _MOST = 2**62
 _WIDEST_ROW = 2**40
 _MOST_AXES = 32
 _LONGEST_NAME = 200
-_ROLES = ("training", "additional")
+
+T = TypeVar("T")
 
 
-def manifest_of(plain: Mapping[str, Any]) -> Manifest:
+def parse_manifest(plain: Mapping[str, Any]) -> Manifest:
     """Return the manifest that plain data of format version 1 describe.
 
     Raises:
-        ValueError: A value is not possible; says which.
-        KeyError: A value is missing.
-        ConfigError: A field is not valid.
+        ValueError: If a value is invalid; names it.
+        KeyError: If a value is missing.
+        ConfigError: If a field is not valid.
     """
-    modes = {_name(name, "a mode"): _mode(mode) for name, mode in table(plain, "modes").items()}
-    versions = {
-        _text(name, "a package"): _text(version, "a version")
-        for name, version in table(plain, "versions").items()
+    modes = {
+        _name(name, "a mode"): _mode(name, mode)
+        for name, mode in checked(dict, plain["modes"], "'modes'").items()
     }
-    return Manifest(modes, table(plain, "info"), versions)
+    versions = checked(dict, plain["versions"], "'versions'")
+    for version in versions.values():
+        checked(str, version, "a version")
+    return Manifest(modes, checked(dict, plain["info"], "'info'"), versions)
 
 
-def whole(value: Any, what: str, most: int = _MOST) -> int:
-    """Return a whole number between 0 and `most`.
+def checked(kind: type[T], value: Any, what: str) -> T:
+    """Return a value that is of exactly one type.
 
     Raises:
-        ValueError: It is none.
+        ValueError: If it is of another type.
     """
-    if type(value) is not int or not 0 <= value <= most:
+    if type(value) is not kind:
         raise ValueError(f"{what} cannot be {value!r:.60}")
     return value
 
 
-def table(plain: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """Return an entry that is a table.
+def whole(value: Any, what: str, most: int = _MOST) -> int:
+    """Return an integer between 0 and `most`.
 
     Raises:
-        ValueError: It is something else.
+        ValueError: If it is out of range or not an integer.
     """
-    value = plain[key]
-    if not isinstance(value, dict):
-        raise ValueError(f"{key!r} cannot be {value!r:.60}")
-    return value
+    if not 0 <= checked(int, value, what) <= most:
+        raise ValueError(f"{what} cannot be {value!r:.60}")
+    return int(value)
 
 
-def _mode(plain: Any) -> Mode:
+def _mode(mode_name: str, plain: Any) -> Mode:
     fields: dict[str, Field] = {}
     for entry in plain["fields"]:
         field = _field(entry)
         if field.name in fields:
-            raise ValueError(f"the field {field.name!r} is there twice")
+            raise ValueError(f"the field {field.name!r} is listed twice")
         fields[field.name] = field
     if not fields:
         raise ValueError("a mode has no fields")
     mode = Mode(
         fields,
-        [_partition(entry, fields) for entry in plain["partitions"]],
-        dropped=[_partition(entry, fields) for entry in plain.get("dropped", ())],
+        [_partition(mode_name, entry, fields) for entry in plain["partitions"]],
+        dropped=[_partition(mode_name, entry, fields) for entry in plain.get("dropped", ())],
     )
     keys = [partition.key for partition in (*mode.partitions, *mode.dropped)]
     if len(set(keys)) != len(keys):
-        raise ValueError("a partition is there twice")
+        raise ValueError("a partition is listed twice")
     whole(mode.rows, "the number of rows")
-    _add_statistics(mode, table(plain, "normalization"))
+    _add_statistics(mode, checked(dict, plain["normalization"], "'normalization'"))
     return mode
 
 
 def _field(plain: Any) -> Field:
-    name, shape = _name(plain["name"], "a field"), plain.get("shape")
+    name, shape, role = _name(plain["name"], "a field"), plain.get("shape"), plain["role"]
     if shape is not None:
-        if not isinstance(shape, list) or len(shape) > _MOST_AXES:
+        if len(checked(list, shape, f"the shape of {name!r}")) > _MOST_AXES:
             raise ValueError(f"the shape of {name!r} cannot be {shape!r:.60}")
         shape = tuple(whole(count, f"the shape of {name!r}") for count in shape)
-    role = plain["role"]
-    if role not in _ROLES:
+    if role not in ("training", "additional"):
         raise ValueError(f"the role of {name!r} cannot be {role!r:.60}")
-    unit = _text(plain.get("unit", ""), f"the unit of {name!r}")
-    field = Field(name, shape, _text(plain["dtype"], f"the type of {name!r}"), unit, role)
+    unit = checked(str, plain.get("unit", ""), f"the unit of {name!r}")
+    field = Field(name, shape, checked(str, plain["dtype"], f"the type of {name!r}"), unit, role)
     if math.prod(shape or ()) * np.dtype(field.dtype).itemsize > _WIDEST_ROW:
         raise ValueError(f"the shape of {name!r} cannot be {shape!r:.60}")
     return field
 
 
-def _partition(plain: Any, fields: Mapping[str, Field]) -> Partition:
-    session = _text(plain["session"], "a session")
+def _partition(mode_name: str, plain: Any, fields: Mapping[str, Field]) -> Partition:
+    session = checked(str, plain["session"], "a session")
     if not SESSION.fullmatch(session):
         raise ValueError(f"a session cannot be {session!r:.60}")
-    sealed = plain["sealed"]
-    if type(sealed) is not bool:
-        raise ValueError(f"'sealed' cannot be {sealed!r:.60}")
-    offsets = {
-        _known(name, fields): whole(place, "an offset")
-        for name, place in table(plain, "offsets").items()
-    }
-    checksums = {
-        _known(name, fields): int(_text(crc, "a checksum"), 16)
-        for name, crc in plain.get("crc32", {}).items()
-    }
-    if sealed and (len(offsets) != len(fields) or len(checksums) not in (0, len(fields))):
+    sealed = checked(bool, plain["sealed"], "'sealed'")
+    offsets = checked(dict, plain["offsets"], "'offsets'")
+    crc32 = checked(dict, plain.get("crc32", {}), "'crc32'")
+    unknown = (offsets.keys() | crc32.keys()) - fields.keys()
+    if unknown:
+        raise ValueError(f"there is no field {min(unknown)!r:.60}")
+    if sealed and (len(offsets) != len(fields) or len(crc32) not in (0, len(fields))):
         raise ValueError("a sealed partition lacks offsets or checksums")
     if sealed and any(field.shape is None for field in fields.values()):
         raise ValueError("a sealed partition has fields of unknown shape")
     rows = whole(plain["rows"], "a number of rows") if sealed else 0
-    for name, place in offsets.items():
-        whole(place + rows * fields[name].nbytes, "the end of the rows")
+    for name, offset in offsets.items():
+        whole(whole(offset, "an offset") + rows * fields[name].nbytes, "the end of the rows")
     return Partition(
+        mode=mode_name,
         session=session,
         index=whole(plain["index"], "the number of a partition", 2**31),
         first_row=whole(plain["first_row"], "a first row"),
         rows=rows,
         sealed=sealed,
         offsets=offsets,
-        checksums=checksums,
+        checksums={n: int(checked(str, crc, "a checksum"), 16) for n, crc in crc32.items()},
         counted=sealed and plain.get("counted") is True,
     )
 
@@ -138,15 +135,16 @@ def _add_statistics(mode: Mode, plain: Mapping[str, Any]) -> None:
     """Give a mode its statistics, if they cover the partitions that are marked as counted."""
     counted = sum(partition.rows for partition in mode.partitions if partition.counted)
     for name, values in plain.items():
-        field = mode.fields[_known(name, mode.fields)]
+        if name not in mode.fields:
+            raise ValueError(f"there is no field {name!r:.60}")
         whole(values["count"], f"the count of {name!r}")
-        components = {}
+        shape, components = mode.fields[name].shape, {}
         for key in values.keys() - {"count"}:
             array = np.asarray(values[key], np.float64)
-            if field.shape is not None and not array.size and 0 in field.shape:
-                array = array.reshape(field.shape)  # JSON loses the shape of empty arrays
-            if array.shape != field.shape or not np.isfinite(array).all():
-                raise ValueError(f"the normalization of {name!r} has a {key} that cannot be")
+            if shape is not None and not array.size and 0 in shape:
+                array = array.reshape(shape)  # JSON loses the shape of empty arrays
+            if array.shape != shape or not np.isfinite(array).all():
+                raise ValueError(f"the normalization of {name!r} has an invalid {key}")
             components[key] = array
         mode.statistics[name] = RunningStatistics.from_dict({**values, **components})
     have = (mode.statistics.get(name) for name in mode.counted_fields)
@@ -155,19 +153,7 @@ def _add_statistics(mode: Mode, plain: Mapping[str, Any]) -> None:
 
 
 def _name(value: Any, what: str) -> str:
-    name = _text(value, what)
+    name = checked(str, value, f"the name of {what}")
     if not name.isidentifier() or len(name) > _LONGEST_NAME:
         raise ValueError(f"the name of {what} cannot be {name!r:.60}")
     return name
-
-
-def _known(name: str, fields: Mapping[str, Field]) -> str:
-    if name not in fields:
-        raise ValueError(f"there is no field {name!r:.60}")
-    return name
-
-
-def _text(value: Any, what: str) -> str:
-    if not isinstance(value, str):
-        raise ValueError(f"{what} cannot be {value!r:.60}")
-    return value

@@ -1,4 +1,4 @@
-"""The store: the manifest in memory and on the disk, changed in whole steps."""
+"""Keeps the manifest in memory and on the disk, and changes both atomically."""
 
 from __future__ import annotations
 
@@ -14,30 +14,27 @@ from physx_core.dataset.store.manifest import Manifest, Mode
 
 @dataclass
 class ManifestStore:
-    """The manifest of a dataset that is written, by one writer or by several.
+    """The manifest of a dataset that is written by one process or by several.
 
-    Where several writers share a dataset, they take turns: each step begins with what the others
-    have stored. The partitions that this process writes stay its own all the while.
+    If several writers share a dataset, they take turns: each change begins with what the others
+    have stored. The partitions that this process writes remain its own throughout.
 
     Attributes:
         directory: The dataset's folder.
         manifest: What the dataset holds, as far as this process knows.
         shared: Whether other processes write to it too.
-        moved: Whether rows that were known before have been changed or are at other places now;
-            whoever keeps rows in memory sets it back.
     """
 
     directory: Path
     manifest: Manifest
     shared: bool = False
-    moved: bool = False
 
     @contextlib.contextmanager
     def change(self) -> Iterator[Manifest]:
-        """Give the manifest to be changed, and store it at the end; or leave all as it was.
+        """Give the manifest to be changed and store it at the end; after an error, restore it.
 
         Raises:
-            OSError: It cannot be stored.
+            OSError: If it cannot be stored.
         """
         with files.turn(self.directory) if self.shared else contextlib.nullcontext():
             if self.shared:
@@ -55,11 +52,11 @@ class ManifestStore:
         for name, mode in self.manifest.modes.items():
             if name in now.modes:
                 _keep_known(now.modes[name], mode)
-        self.moved |= self.manifest.take(now)
+        self.manifest.take(now)
 
 
 def _keep_known(mode: Mode, before: Mode) -> None:
-    """Keep own partitions as they are, and the rows that others were known to have."""
+    """Keep this process's own partitions, and the rows that others were known to have."""
     known = {partition.key: partition for partition in before.partitions}
     for place, partition in enumerate(mode.partitions):
         earlier = known.get(partition.key)

@@ -1,4 +1,4 @@
-"""One field's file of the partition that is being written."""
+"""Writes one field's file of the open partition."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _COPY = 2**23
 
 
 class PartitionFile:
-    """Writes rows to their places and commits them with the row count.
+    """Writes rows to their offsets and commits them with the row count.
 
     Attributes:
         identity: What the file is part of.
-        data_offset: Place of the first row.
+        data_offset: Offset of the first row.
     """
 
     def __init__(self, path: Path, identity: Identity, header: Header, descriptor: int) -> None:
@@ -44,7 +44,7 @@ class PartitionFile:
             capacity: How many rows fit in.
 
         Raises:
-            OSError: The file cannot be written; nothing of it is left.
+            OSError: If the file cannot be written; nothing of it is left.
         """
         header = make_header(identity, capacity)
         path = directory / identity.file_name
@@ -55,16 +55,16 @@ class PartitionFile:
         files.temporary(self._path).rename(self._path)
 
     def discard(self) -> None:
-        """Close the file and remove it, whether it has its name or not."""
+        """Close the file and remove it, whether it is published or not."""
         self.close()
         files.temporary(self._path).unlink(missing_ok=True)
         self._path.unlink(missing_ok=True)
 
     def reserve(self, rows: int) -> None:
-        """Take the space on the disk for the first `rows` rows, and for some more.
+        """Allocate disk space for the first `rows` rows, and for some more.
 
         Raises:
-            OSError: The disk is full; nothing was changed.
+            OSError: If the disk is full; nothing was changed.
         """
         needed = self.data_offset + rows * self._row_nbytes
         if needed <= self._reserved:
@@ -74,7 +74,7 @@ class PartitionFile:
         try:
             self._allocate(ample)
         except OSError as error:
-            if error.errno in (errno.EOPNOTSUPP, errno.EINVAL):  # nothing can be reserved here
+            if error.errno in (errno.EOPNOTSUPP, errno.EINVAL):  # not supported here
                 self._reserved = self._size
             elif error.errno in files.FULL:
                 self._allocate(needed)
@@ -85,7 +85,7 @@ class PartitionFile:
         """Write rows, not yet committed.
 
         Args:
-            row: Place of the first one.
+            row: Number of the first one in the file.
             block: Contiguous rows of the field's own type, shape (count, *field shape).
         """
         if self._row_nbytes:
@@ -111,7 +111,7 @@ class PartitionFile:
             os.close(self.hand_over())
 
     def hand_over(self) -> int:
-        """Return the open file to somebody else, who closes it."""
+        """Return the open file to the caller, who closes it."""
         descriptor, self._descriptor = self._descriptor, -1
         return descriptor
 
@@ -127,13 +127,13 @@ def rewrite(path: Path, identity: Identity, rows: int, data_offset: int) -> int:
         path: The file.
         identity: What it is part of.
         rows: How many rows it keeps.
-        data_offset: Where they begin in the present file.
+        data_offset: Offset of the first one in the present file.
 
     Returns:
-        Where they begin in the new file.
+        Offset of the first row in the new file.
 
     Raises:
-        OSError: The new file cannot be written; the present one is left as it is.
+        OSError: If the new file cannot be written; the present one is left as it is.
     """
     return copy(path, data_offset, path, identity, rows)[0]
 
@@ -141,20 +141,20 @@ def rewrite(path: Path, identity: Identity, rows: int, data_offset: int) -> int:
 def copy(
     source: Path, source_offset: int, path: Path, identity: Identity, rows: int
 ) -> tuple[int, int]:
-    """Make a partition file of the rows of another; it has its name when it is complete.
+    """Copy the rows of a partition file to a new one, which gets its name when it is complete.
 
     Args:
         source: The other file.
-        source_offset: Where its rows begin.
-        path: The file to make; one of this name is replaced.
+        source_offset: Offset of its first row.
+        path: The new file; an existing one is replaced.
         identity: What it is part of.
         rows: How many rows it gets.
 
     Returns:
-        Where they begin in the file, and their CRC-32.
+        Offset of the first row in the new file, and the CRC-32 of the rows.
 
     Raises:
-        OSError: The file cannot be written; nothing was changed.
+        OSError: If the file cannot be written; nothing was changed.
     """
     header = make_header(identity, rows, rows)
     draft = files.temporary(path)
@@ -195,7 +195,7 @@ def _copy(source: Path, source_offset: int, target: int, target_offset: int, cou
             shared = files.copied(origin, here, target, there, len(part))
             descriptor, offset = (target, there) if shared else (origin, here)
             if not files.read_at(descriptor, part, offset):
-                raise OSError(errno.EIO, f"{source} became shorter while it was read")
+                raise OSError(errno.EIO, f"{source} became shorter while it was being read")
             if not shared:
                 files.write_at(target, part, there)
             crc, done = crc32(part, crc), done + len(part)

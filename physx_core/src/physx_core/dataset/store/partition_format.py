@@ -2,8 +2,8 @@
 
 It holds two contiguous datasets: ``data`` (capacity, *field shape) and the scalar ``rows``, the
 number of committed rows. Its attributes say what it is part of. h5py makes the header once, in
-memory; from then on rows are written to known places of the file, so that HDF5 never runs while
-samples arrive and the file can be opened with h5py at any moment.
+memory; from then on rows are written at known offsets of the file, so that HDF5 never runs while
+samples arrive, and h5py can open the file at any moment.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from physx_core.fields import Field
 FORMAT = "physx partition"
 VERSION = 1
 READABLE = (1,)
-"""Versions of the partition file that this physx reads."""
+"""Versions of the partition file that can be read."""
 UNREADABLE = (
     OSError, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError,
     MemoryError,
 )  # fmt: skip
-"""What h5py raises at files that are damaged."""
+"""What h5py raises for damaged files."""
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _PAGE = 4096
-_END_OF_FILE = 40  # place of the file's size in an HDF5 superblock of version 0
+_END_OF_FILE = 40  # where the file's size stands in an HDF5 superblock of version 0
 
 
 @dataclass(frozen=True)
@@ -80,8 +80,8 @@ class Header:
 
     Attributes:
         content: Beginning of the file; the rows may begin before its end.
-        rows_offset: Place of the committed row count, 8 bytes.
-        data_offset: Place of the first row.
+        rows_offset: Offset of the committed row count, 8 bytes.
+        data_offset: Offset of the first row.
         size: Size of the whole file in bytes.
     """
 
@@ -99,8 +99,8 @@ class Inspection:
         identity: What it is part of.
         capacity: How many rows fit in.
         rows: How many rows are committed.
-        rows_offset: Place of the row count.
-        data_offset: Place of the first row.
+        rows_offset: Offset of the row count.
+        data_offset: Offset of the first row.
     """
 
     identity: Identity
@@ -116,12 +116,12 @@ def partition_file(session: str, mode: str, field: str, index: int) -> str:
 
 
 def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
-    """Let h5py make the header of a partition file.
+    """Have h5py make the header of a partition file.
 
     Args:
         identity: What the file is part of.
         capacity: How many rows fit in.
-        rows: Committed rows that the header says.
+        rows: Number of committed rows that the header states.
     """
     import h5py
     from h5py import h5d, h5p, h5s, h5t
@@ -154,11 +154,11 @@ def inspect(path: Path, offset: int | None = None, row_nbytes: int = 0) -> Inspe
 
     Args:
         path: The file.
-        offset: Where its rows begin, if that is known; only for the text of an error.
+        offset: Where its rows begin, if that is known; only for error messages.
         row_nbytes: Bytes of one row, likewise.
 
     Raises:
-        DatasetError: The file is missing, truncated or no partition file.
+        DatasetError: If the file is missing, truncated or not a partition file.
     """
     with open_partition(path) as file:
         return inspect_open(file, path, offset, row_nbytes)
@@ -168,24 +168,24 @@ def open_partition(path: Path) -> io.FileIO:
     """Open a partition file for reading.
 
     Raises:
-        DatasetError: It is missing, or cannot be opened, or is no regular file.
+        DatasetError: If it is missing, cannot be opened, or is not a regular file.
     """
     try:
         return io.FileIO(str(path), opener=files.open_regular)
     except FileNotFoundError:
         raise DatasetError(
-            f"The partition {path.name} is missing from {path.parent}. Put it back: the rows of "
-            "all fields of this partition cannot be read without it."
+            f"The partition {path.name} is missing from {path.parent}. Restore it: without it, "
+            "the rows of this partition cannot be read in any field."
         ) from None
     except OSError as error:
-        raise cannot_open(path, error) from error
+        raise cannot_read(path, error) from error
 
 
-def cannot_open(path: Path, error: OSError) -> DatasetError:
-    """Return the error for a partition file that the system does not open."""
+def cannot_read(path: Path, error: OSError) -> DatasetError:
+    """Return the error for a partition file that the system cannot open, map or read."""
     full = error.errno in (errno.EMFILE, errno.ENFILE)
     advice = " Raise the limit of open files (ulimit -n)." if full else ""
-    return DatasetError(f"The partition {path} cannot be opened: {error.strerror}.{advice}")
+    return DatasetError(f"The partition {path} cannot be read: {error.strerror}.{advice}")
 
 
 def inspect_open(
@@ -199,7 +199,7 @@ def inspect_open(
         with h5py.File(file, "r") as content:
             found = _inspection(content)
     except (*UNREADABLE, PhysxError) as error:
-        raise DatasetError(f"{path} is no partition of a dataset, or damaged: {error}.") from error
+        raise DatasetError(f"{path} is damaged or not a dataset's partition: {error}.") from error
     size, field = os.fstat(file.fileno()).st_size, found.identity.field
     expected = found.data_offset + found.capacity * field.nbytes
     if size < expected:
@@ -212,19 +212,18 @@ def truncated(path: Path, actual: int, expected: int, offset: int, row_nbytes: i
     kept = max(0, actual - offset) // row_nbytes if row_nbytes else 0
     return DatasetError(
         f"The partition {path} is truncated: it has {actual} bytes, {expected} were expected. "
-        f"{kept} rows of this file are still there. Put the whole file back from a copy."
+        f"{kept} rows of this file are still there. Restore the whole file from a copy."
     )
 
 
 def _check_superblock(file: io.FileIO, path: Path, offset: int | None, row_nbytes: int) -> None:
     head = os.pread(file.fileno(), 48, 0)
     if not head.startswith(SIGNATURE):
-        raise DatasetError(f"{path} is no partition of a dataset, or damaged: it is not HDF5.")
+        raise DatasetError(f"{path} is damaged or not a dataset's partition: it is not HDF5.")
     actual = os.fstat(file.fileno()).st_size
     expected = int.from_bytes(head[_END_OF_FILE : _END_OF_FILE + 8], "little")
     if head[8] == 0 and actual < expected:
-        place = _PAGE if offset is None else offset
-        raise truncated(path, actual, expected, place, row_nbytes)
+        raise truncated(path, actual, expected, _PAGE if offset is None else offset, row_nbytes)
 
 
 def _inspection(content: Any) -> Inspection:
@@ -236,7 +235,7 @@ def _inspection(content: Any) -> Inspection:
         raise ValueError(f"its format has version {version}; this physx reads {list(READABLE)}")
     data, counter = _plain_dataset(content, "data"), _plain_dataset(content, "rows")
     if counter.shape != () or counter.dtype != np.dtype("<u8") or not data.shape:
-        raise ValueError("its datasets have other shapes or types than a partition's")
+        raise ValueError("its datasets do not have the shapes or types of a partition's")
     field = Field(
         str(attributes["field"]),
         data.shape[1:],
@@ -245,10 +244,10 @@ def _inspection(content: Any) -> Inspection:
         str(attributes["role"]),  # type: ignore[arg-type]
     )
     if np.dtype(field.dtype) != data.dtype or field.role not in ("training", "additional"):
-        raise ValueError(f"{data.dtype} and {field.role!r} are no type and role of a field")
+        raise ValueError(f"{data.dtype} and {field.role!r} are not the type and role of a field")
     rows_offset, data_offset = counter.id.get_offset(), data.id.get_offset()
     if rows_offset is None or (data_offset is None and data.size * field.nbytes):
-        raise ValueError("it has no space for rows")
+        raise ValueError("it has no space allocated for rows")
     identity = Identity(
         str(attributes["session"]),
         str(attributes["mode"]),
@@ -266,15 +265,15 @@ def _inspection(content: Any) -> Inspection:
 
 
 def _plain_dataset(content: Any, name: str) -> Any:
-    """Return a dataset whose bytes lie side by side in this very file."""
+    """Return a dataset whose bytes are contiguous in this very file."""
     import h5py
 
     if not isinstance(content.get(name, getlink=True), h5py.HardLink):
-        raise ValueError(f"{name!r} is a link to somewhere else")
+        raise ValueError(f"{name!r} is a link")
     dataset = content[name]
     if not isinstance(dataset, h5py.Dataset):
-        raise ValueError(f"{name!r} holds no rows")
+        raise ValueError(f"{name!r} is not an array")
     layout = dataset.id.get_create_plist()
     if layout.get_layout() != h5py.h5d.CONTIGUOUS or layout.get_external_count():
-        raise ValueError(f"{name!r} is not stored as plain rows in this file")
+        raise ValueError(f"{name!r} is not stored contiguously in this file")
     return dataset

@@ -1,4 +1,4 @@
-"""Bringing what was written to the disk about once a second, beside the writer."""
+"""Syncs written files to the disk about once a second, in a thread beside the writer."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ PERIOD = 1.0
 
 
 class Syncer:
-    """Syncs files that were written to, in a thread that begins with the first of them.
+    """Syncs files that were written to, in a thread that starts with the first of them.
 
-    So a power cut costs at most the rows of about the last second, while the writer never waits
-    for the disk.
+    A power cut costs at most the rows of about the last second, while the writer never waits for
+    the disk.
     """
 
     def __init__(self, period: float = PERIOD) -> None:
@@ -26,7 +26,7 @@ class Syncer:
         self._error: OSError | None = None
 
     def note(self, descriptor: int) -> None:
-        """Have a file synced soon."""
+        """Schedule a file for the next sync."""
         if descriptor not in self._changed:
             with self._lock:
                 self._changed[descriptor] = None
@@ -36,10 +36,10 @@ class Syncer:
                 self._thread.start()
 
     def check(self) -> None:
-        """Tell what went wrong since the last time.
+        """Report a failure since the last call.
 
         Raises:
-            OSError: The disk did not take what was written.
+            OSError: If something that was written did not reach the disk.
         """
         if self._error is not None:
             error, self._error = self._error, None
@@ -55,10 +55,10 @@ class Syncer:
         os.close(descriptor)
 
     def close(self) -> None:
-        """Sync everything that is left, and end.
+        """Sync everything that is left, and end the thread.
 
         Raises:
-            OSError: The disk does not take it.
+            OSError: If something that was written did not reach the disk.
         """
         self._end.set()
         self._wake.set()

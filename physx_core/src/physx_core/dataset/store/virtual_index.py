@@ -1,8 +1,8 @@
-"""The virtual index ``<session>.h5``: all sealed rows of a dataset in one file for other tools.
+"""Writes the virtual index ``<session>.h5``: all sealed rows in one file, for other tools.
 
-Where several sessions wrote a dataset, the index under the name of each of them shows all rows.
-It holds ``/<mode>/<field>`` as virtual datasets that refer to the partitions beside it. physx
-itself never reads it.
+It holds ``/<mode>/<field>`` as virtual datasets that refer to the partitions beside it. If several
+sessions wrote the dataset, there is one index named after each, and each shows all rows. physx
+itself never reads them.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ FORMAT = "physx index"
 
 
 def write_index(directory: Path, session: str, manifest: Manifest) -> None:
-    """Write the index of everything that is sealed so far.
+    """Write the index of all rows that are sealed.
 
     Args:
         directory: The dataset's folder.
         session: Session that writes it; it gets an index even if it has no rows yet.
-        manifest: What the dataset holds.
+        manifest: The dataset's manifest.
 
     Raises:
-        OSError: The index cannot be written; an old one is still there.
+        OSError: If the index cannot be written; the old one is still there.
     """
     import h5py
 
@@ -40,12 +40,12 @@ def write_index(directory: Path, session: str, manifest: Manifest) -> None:
             group = file.create_group(name)
             for field in mode.fields.values():
                 if field.shape is not None:
-                    _add(group, name, mode, field)
+                    _add(group, mode, field)
     for name in {session, *manifest.sessions}:
         files.replace(directory / f"{name}.h5", image.getvalue(), sync=False)
 
 
-def _add(group: Any, mode_name: str, mode: Mode, field: Field) -> None:
+def _add(group: Any, mode: Mode, field: Field) -> None:
     import h5py
 
     sealed = [partition for partition in mode.partitions if partition.sealed]
@@ -57,10 +57,10 @@ def _add(group: Any, mode_name: str, mode: Mode, field: Field) -> None:
         layout, start = h5py.VirtualLayout(shape, dtype), 0
         for partition in sealed:
             source_shape = (partition.rows, *shape[1:])
-            source_file = partition.file_name(mode_name, field.name)
+            source_file = partition.file_name(field.name)
             source = h5py.VirtualSource(source_file, "data", source_shape, dtype)
             layout[start : start + partition.rows] = source
             start += partition.rows
-        missing = np.nan if dtype.kind == "f" else None  # what rows of a lost partition read as
+        missing = np.nan if dtype.kind == "f" else None  # how rows of a lost partition read
         entry = group.create_virtual_dataset(field.name, layout, fillvalue=missing)
     entry.attrs["unit"], entry.attrs["role"] = field.unit, field.role

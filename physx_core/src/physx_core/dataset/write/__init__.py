@@ -1,1 +1,1 @@
-"""Appending, updating, and merging rows."""
+"""Appends, updates and merges rows."""

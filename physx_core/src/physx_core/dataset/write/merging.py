@@ -1,7 +1,7 @@
-"""Taking whole partitions into a dataset, and out of it.
+"""Adds whole partitions of another dataset, and removes partitions.
 
-In both cases one step of the manifest decides: the files of partitions that come or go are listed
-as dropped, so that whoever opens the dataset after a crash removes what is left of them.
+Both take effect with one change of the manifest: the files of partitions that are being added or
+removed are listed as dropped, so that the next writer after a crash removes what is left of them.
 """
 
 from __future__ import annotations
@@ -10,35 +10,35 @@ import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 
-from physx_core.dataset.store import mode_statistics as coverage
+from physx_core.dataset.read.mode_statistics import merge_statistics
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition_file import copy
-from physx_core.dataset.store.partition_format import inspect
 from physx_core.dataset.store.sealing import remove_files
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError
+from physx_core.fields import Field
 
 Pairs = list[tuple[Partition, Partition]]
 
 
-def take_partitions(writer: Writer, source: Path, given: Manifest) -> None:
+def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
     """Copy all partitions of another dataset; afterwards all of its rows are there, or none.
 
     Args:
-        writer: Writes the dataset; nothing is open in the modes that get rows, which have the
-            other's fields.
+        writer: Writes the dataset; the modes that get rows have the other's fields and no open
+            partition.
         source: Folder of the other dataset.
-        given: What the other dataset holds.
+        given: Manifest of the other dataset.
 
     Raises:
-        DatasetError: A partition of the other is missing or damaged.
-        OSError: The disk is full or fails; nothing has changed.
+        DatasetError: If a partition of the other is missing or damaged.
+        OSError: If the disk is full or fails; nothing has changed.
     """
     pairs = _reserve(writer, given)
     try:
         for name, partitions in pairs.items():
             for old, new in partitions:
-                _copy_files(writer.store.directory, source, name, given.modes[name], old, new)
+                _copy_files(writer.store.directory, source, given.modes[name].fields, old, new)
         with writer.store.change() as manifest:
             for name, partitions in pairs.items():
                 _accept(manifest.modes[name], given.modes[name], partitions)
@@ -52,8 +52,8 @@ def drop_partition(writer: Writer, mode_name: str, session: str | None, index: i
     """Remove a partition and return how many rows it had.
 
     Raises:
-        DatasetError: There is no such partition, or there are several.
-        OSError: The manifest cannot be written; nothing has changed.
+        DatasetError: If there is no such partition, or there are several.
+        OSError: If the manifest cannot be written; nothing has changed.
     """
     mode = writer.store.manifest.modes[mode_name]
     found = [p for p in mode.partitions if p.index == index and session in (None, p.session)]
@@ -62,7 +62,7 @@ def drop_partition(writer: Writer, mode_name: str, session: str | None, index: i
         what = "several partitions" if found else "no partition"
         raise DatasetError(
             f"Mode {mode_name!r} has {what} {index}"
-            f"{'' if session is None else f' of session {session!r}'}. There are: {there}."
+            f"{'' if session is None else f' of session {session!r}'}. Partitions: {there}."
         )
     with writer.store.change() as manifest:
         mode = manifest.modes[mode_name]
@@ -70,13 +70,13 @@ def drop_partition(writer: Writer, mode_name: str, session: str | None, index: i
         mode.dropped.append(found[0])
         if found[0].counted:
             mode.forget_statistics()
-    writer.store.moved = True
+    writer.store.manifest.generation += 1
     _forget(writer, {mode_name: [found[0]]})
     return found[0].rows
 
 
 def _reserve(writer: Writer, given: Manifest) -> dict[str, Pairs]:
-    """List the partitions to come as dropped, so that their names are taken."""
+    """List the partitions to add as dropped, so that their names are taken."""
     pairs: dict[str, Pairs] = {}
     with writer.store.change() as manifest:
         for name, other in given.modes.items():
@@ -91,13 +91,12 @@ def _reserve(writer: Writer, given: Manifest) -> dict[str, Pairs]:
 
 
 def _copy_files(
-    target: Path, source: Path, mode_name: str, mode: Mode, old: Partition, new: Partition
+    target: Path, source: Path, fields: Mapping[str, Field], old: Partition, new: Partition
 ) -> None:
-    for name, field in mode.fields.items():
-        path = source / old.file_name(mode_name, name)
-        offset = inspect(path, old.offsets.get(name), field.nbytes).data_offset
-        place = target / new.file_name(mode_name, name)
-        new.offsets[name], crc = copy(path, offset, place, new.identity(mode_name, field), old.rows)
+    for name, field in fields.items():
+        path, offset = old.path(source, name), old.inspect(source, field).data_offset
+        place, identity = new.path(target, name), new.identity(field)
+        new.offsets[name], crc = copy(path, offset, place, identity, old.rows)
         new.checksums[name] = crc
         if old.checksums and crc != old.checksums[name]:
             wanted = old.checksums[name]
@@ -108,7 +107,7 @@ def _copy_files(
 
 
 def _accept(mode: Mode, other: Mode, pairs: Pairs) -> None:
-    """Make copied partitions part of the mode, with the statistics that the other has."""
+    """Make copied partitions part of the mode, with the statistics that the other knows."""
     arrived = {new.key: new for _, new in pairs}
     mode.dropped = [partition for partition in mode.dropped if partition.key not in arrived]
     known = all(old.counted for old, _ in pairs)
@@ -116,15 +115,15 @@ def _accept(mode: Mode, other: Mode, pairs: Pairs) -> None:
         new.sealed, new.counted = True, known
         mode.partitions.append(new)
     if known:
-        mode.statistics = coverage.merged(mode.statistics, other.statistics)
+        mode.statistics = merge_statistics(mode.statistics, other.statistics)
 
 
 def _forget(writer: Writer, partitions: Mapping[str, list[Partition]]) -> None:
-    """Remove the files of dropped partitions, and then their entries."""
+    """Remove the files of dropped partitions, then their entries."""
     for name, dropped in partitions.items():
         mode = writer.store.manifest.modes[name]
         for partition in dropped:
-            remove_files(writer.store.directory, name, mode, partition)
+            remove_files(writer.store.directory, mode.fields, partition)
     with writer.store.change() as manifest:
         for name, dropped in partitions.items():
             keys = {partition.key for partition in dropped}

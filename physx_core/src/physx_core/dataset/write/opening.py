@@ -1,4 +1,4 @@
-"""Taking the lock of a dataset and getting it ready for its writer."""
+"""Locks a dataset and prepares it for its writer."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 from physx_core import files
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.store import manifest_file
-from physx_core.dataset.store.manifest import Manifest, plain_info
+from physx_core.dataset.store.manifest import Manifest, to_plain_info
 from physx_core.dataset.store.manifest_parsing import SESSION
 from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.virtual_index import write_index
@@ -27,36 +27,39 @@ class WriterOptions:
     session: str | None
     max_file_size: float
     durable: bool
-    shared: bool = False
+    shared: bool
 
     def __post_init__(self) -> None:
         """Check the options.
 
         Raises:
-            ConfigError: The session's name cannot begin file names, or the size is not positive.
+            ConfigError: If file names cannot begin with the session's name, or the size is not
+                positive.
         """
         if self.session is not None and not SESSION.fullmatch(self.session):
             raise ConfigError(
-                f"{self.session!r} cannot begin file names: use letters, digits, '_', '-', '.'."
+                f"File names cannot begin with {self.session!r}: "
+                "use letters, digits, '_', '-', '.'."
             )
         if not self.max_file_size > 0:
             raise ConfigError(f"max_file_size is {self.max_file_size} GB but must be positive.")
 
-    def writer(self, store: ManifestStore) -> Writer:
-        """Return the writer; without a session's name, it goes on in the last session."""
-        session = self.session or next(reversed(store.manifest.sessions), "run")
-        return Writer(store, session, self.max_file_size, self.durable)
+    def writer(self, folder: Path, manifest: Manifest, lock: int) -> Writer:
+        """Return the writer; without a session's name, it continues the last session."""
+        session = self.session or next(reversed(manifest.sessions), "run")
+        store = ManifestStore(folder, manifest, self.shared)
+        return Writer(store, session, self.max_file_size, self.durable, lock)
 
 
-def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> tuple[Writer, int]:
-    """Make a dataset; return its writer and the lock's descriptor.
+def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> Writer:
+    """Create a dataset and return its writer.
 
     Raises:
-        DatasetError: There is one already, or the folder cannot be written.
-        DatasetLockedError: Another process is making one there.
-        ConfigError: The info cannot be stored.
+        DatasetError: If there is one already, or the folder cannot be written.
+        DatasetLockedError: If another process is creating one there.
+        ConfigError: If the info cannot be stored.
     """
-    manifest = Manifest(info=plain_info(info))
+    manifest = Manifest(info=to_plain_info(info))
     with files.storing(f"A dataset in {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         with files.turn(folder) if options.shared else contextlib.nullcontext():
@@ -73,39 +76,31 @@ def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> tup
             except BaseException:
                 os.close(lock)
                 raise
-    return options.writer(ManifestStore(folder, manifest, options.shared)), lock
+    return options.writer(folder, manifest, lock)
 
 
-def extend(folder: Path, options: WriterOptions) -> tuple[Writer, int]:
-    """Lock a dataset that exists and repair what its last writer left open.
-
-    Returns:
-        Its writer and the lock's descriptor.
+def extend(folder: Path, options: WriterOptions) -> Writer:
+    """Lock an existing dataset, recover what its last writer left open, and return its writer.
 
     Raises:
-        DatasetLockedError: Another process writes to it.
-        DatasetError: It is damaged, or the folder cannot be written.
+        DatasetLockedError: If another process writes to it.
+        DatasetError: If it is damaged, or the folder cannot be written.
     """
-    with files.storing(f"Rows in {folder}"):
-        if not options.shared:
-            lock = files.lock(folder)
-            return _extended(folder, options, lock, alone=True), lock
-        with files.turn(folder):
-            lock, alone = files.lock_shared(folder)
-            return _extended(folder, options, lock, alone), lock
-
-
-def _extended(folder: Path, options: WriterOptions, lock: int, alone: bool) -> Writer:
-    try:
-        manifest = recovery.load(folder)
-        writer = options.writer(ManifestStore(folder, manifest, options.shared))
-        if alone:
-            if recovery.repair(folder, manifest):
-                write_index(folder, writer.session, manifest)
-            manifest_file.save(folder, manifest)
-            if options.shared:
-                files.share(folder, lock)
-    except BaseException:
-        os.close(lock)
-        raise
+    with (
+        files.storing(f"Rows in {folder}"),
+        files.turn(folder) if options.shared else contextlib.nullcontext(),
+    ):
+        lock, alone = files.lock_shared(folder) if options.shared else (files.lock(folder), True)
+        try:
+            manifest = recovery.load(folder)
+            writer = options.writer(folder, manifest, lock)
+            if alone:
+                if recovery.recover(folder, manifest):
+                    write_index(folder, writer.session, manifest)
+                manifest_file.save(folder, manifest)
+                if options.shared:
+                    files.share(folder, lock)
+        except BaseException:
+            os.close(lock)
+            raise
     return writer

@@ -1,4 +1,4 @@
-"""Updating rows in place, in the files where they lie."""
+"""Updates rows in place, in the files that hold them."""
 
 from __future__ import annotations
 
@@ -10,42 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from physx_core import files
 from physx_core.dataset.store.manifest import Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
-from physx_core.dataset.store.partition_format import inspect
 from physx_core.dataset.write.checks import check_rows
 from physx_core.errors import FieldShapeError, MissingFieldError
 from physx_core.fields import Field
 from physx_core.rows import check_names
-from physx_core.typing import Array, Batch
-
-Index = NDArray[np.intp]
+from physx_core.typing import Array, Batch, Index
 
 
-def row_numbers(index: Any, total: int) -> Index:
-    """Return the numbers of the rows that a number, a slice or an array stands for.
-
-    Raises:
-        IndexError: There are no such rows, or the index is something else.
-    """
-    if isinstance(index, slice):
-        return np.arange(*index.indices(total))
-    numbers = np.atleast_1d(np.asarray(index))
-    if numbers.dtype.kind == "b" and numbers.shape == (total,):
-        return np.flatnonzero(numbers)
-    if not numbers.size:
-        return np.zeros(0, np.intp)
-    if numbers.dtype.kind not in "iu" or numbers.ndim != 1:
-        raise IndexError(f"Rows are taken by a number, a slice or an array, not by {index!r}.")
-    if numbers.min() < -total or numbers.max() >= total:
-        raise IndexError(f"Row numbers are out of range: there are {total} rows.")
-    return np.where(numbers < 0, numbers + total, numbers).astype(np.intp)
-
-
-def checked(
+def check_update(
     fields: Mapping[str, Field], index: Index, values: Mapping[str, Any], *, single: bool
 ) -> Batch:
     """Return the new values of some fields as contiguous rows of the fields' types.
@@ -57,10 +33,10 @@ def checked(
         single: Whether the index was a single number.
 
     Raises:
-        SampleError: A field is unknown, or none is given, or its rows do not fit.
+        SampleError: If a field is unknown, none is given, or the rows do not fit.
     """
     if not values:
-        raise MissingFieldError("No field is given whose rows are to be updated.")
+        raise MissingFieldError("No field to update is given.")
     unknown = [name for name in values if name not in fields]
     if unknown:
         check_names(fields, unknown)
@@ -69,43 +45,43 @@ def checked(
         values = {name: field.convert(values[name])[None] for name, field in given.items()}
     rows, count = check_rows(given, values)
     if count != len(index):
-        raise FieldShapeError(f"{count} rows are given for {len(index)} places.")
+        raise FieldShapeError(f"{count} rows are given, but {len(index)} are selected.")
     return rows
 
 
 def update_rows(
     store: ManifestStore, mode_name: str, index: Index, rows: Batch, *, durable: bool
 ) -> None:
-    """Write rows over others; sealed partitions lose their checksums until the dataset is closed.
+    """Overwrite rows; sealed partitions lose their checksums until the dataset is closed.
 
     Args:
-        store: What the dataset holds.
+        store: The dataset's manifest.
         mode_name: Name of the mode.
         index: Numbers of the rows, all in range.
         rows: Field name to new rows, checked.
         durable: Whether to wait for the disk.
 
     Raises:
-        DatasetError: A partition is missing or damaged.
-        OSError: The storage fails; rows before may have been updated.
+        DatasetError: If a partition is missing or damaged.
+        OSError: If the storage fails; some rows may have been updated.
     """
     mode = store.manifest.modes[mode_name]
     starts = np.cumsum([0, *(partition.rows for partition in mode.partitions)])
     owners = np.searchsorted(starts, index, side="right") - 1
     touched = [mode.partitions[owner] for owner in np.unique(owners)]
-    _announce(store, mode_name, touched)
-    for partition in touched:
-        partition = mode.partitions[mode.place(partition)]
-        here = np.flatnonzero(owners == mode.place(partition))
-        places = index[here] - starts[mode.place(partition)]
+    _invalidate(store, mode_name, touched)
+    for place in map(mode.place, touched):
+        partition = mode.partitions[place]
+        here = np.flatnonzero(owners == place)
         for name, block in rows.items():
-            path = store.directory / partition.file_name(mode_name, name)
-            offset = _offset(path, partition, mode.fields[name])
-            _write(path, offset, places, block[here], durable=durable)
+            path, offset = partition.path(store.directory, name), partition.offsets.get(name)
+            if offset is None or not (partition.sealed or partition.writing):
+                offset = partition.inspect(store.directory, mode.fields[name]).data_offset
+            _write(path, offset, index[here] - starts[place], block[here], durable=durable)
 
 
-def _announce(store: ManifestStore, mode_name: str, touched: list[Partition]) -> None:
-    """Note, before anything is written, that checksums and statistics do not hold any more."""
+def _invalidate(store: ManifestStore, mode_name: str, touched: list[Partition]) -> None:
+    """Drop, before anything is written, the checksums and statistics of the rows."""
     mode = store.manifest.modes[mode_name]
     for partition in touched:
         partition.running = {}
@@ -116,17 +92,11 @@ def _announce(store: ManifestStore, mode_name: str, touched: list[Partition]) ->
                 mode.forget_statistics()
             for partition in touched:
                 mode.swap(replace(partition, checksums={}, counted=False))
-    store.moved = True
-
-
-def _offset(path: Path, partition: Partition, field: Field) -> int:
-    if partition.sealed or partition.writing:
-        return partition.offsets[field.name]
-    return inspect(path, partition.offsets.get(field.name), field.nbytes).data_offset
+    store.manifest.generation += 1
 
 
 def _write(path: Path, offset: int, places: Index, rows: Array, *, durable: bool) -> None:
-    """Write rows to places counted from `offset`, those side by side at once."""
+    """Write rows to places counted from `offset`, consecutive ones at once."""
     row_nbytes = rows[:1].nbytes
     descriptor = files.open_regular(path, os.O_WRONLY)
     try:

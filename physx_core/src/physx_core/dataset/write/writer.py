@@ -1,8 +1,9 @@
-"""Writing rows to partitions, which begin and end at the same row in all fields of a mode."""
+"""Writes rows to partitions, which begin and end at the same row in all fields of a mode."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,10 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from physx_core import files
+from physx_core.dataset.read.mode_statistics import compute_statistics, count_sealed
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.store import manifest_file
-from physx_core.dataset.store import mode_statistics as coverage
 from physx_core.dataset.store.manifest import Mode, Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.partition_file import PartitionFile
@@ -28,7 +29,7 @@ _HEADER = 2**14
 
 
 class OpenPartition:
-    """The partition of one mode that is being written.
+    """The files of the partition of one mode that is being written.
 
     Attributes:
         partition: Its entry in the manifest.
@@ -56,7 +57,7 @@ class OpenPartition:
         """Write and commit rows `start` to `start + count` of a block; all of them, or none.
 
         Raises:
-            OSError: The disk is full; no row of the block was committed.
+            OSError: If the disk is full; no row of the block was committed.
         """
         if self._syncer is not None:
             self._syncer.check()
@@ -71,7 +72,7 @@ class OpenPartition:
             for file in self._files.values():
                 file.commit(last)
             self._wait()
-        except BaseException:  # an interrupt, too: the next rows go to the same place
+        except BaseException:  # an interrupt, too: the next rows go to the same offsets
             for file in self._files.values():
                 file.commit(first)
             raise
@@ -81,7 +82,7 @@ class OpenPartition:
                 self._syncer.note(file.descriptor)
 
     def close(self) -> None:
-        """Close the files, now or after their last sync."""
+        """Close the files, immediately or after their last sync."""
         for file in self._files.values():
             if self._syncer is not None:
                 self._syncer.retire(file.hand_over())
@@ -89,37 +90,45 @@ class OpenPartition:
                 file.close()
 
     def _wait(self) -> None:
-        """Wait for the disk, if no syncer comes by."""
+        """Wait for the disk, unless a syncer does."""
         if self._syncer is None:
             for file in self._files.values():
                 file.sync()
 
 
 class Writer:
-    """Appends checked rows to the modes of a dataset."""
+    """Appends checked rows to the modes of a dataset.
+
+    Attributes:
+        store: The manifest, kept up to date in memory and on the disk.
+        session: Name of the session that writes.
+        durable: Whether a commit waits for the disk.
+    """
 
     def __init__(
-        self, store: ManifestStore, session: str, max_file_size: float, durable: bool = False
+        self, store: ManifestStore, session: str, max_file_size: float, durable: bool, lock: int
     ) -> None:
-        """Keep where and how to write.
+        """Start without an open partition.
 
         Args:
-            store: What the dataset holds; kept up to date here and on the disk.
+            store: The manifest.
             session: Name of the session that writes.
             max_file_size: Size in GB at which a partition is full.
             durable: Whether a commit waits for the disk; otherwise files are synced about once a
                 second.
+            lock: Descriptor of the dataset's lock, which `close` releases.
         """
+        self.store = store
         self.session = session
         self.durable = durable
-        self.store = store
+        self._lock = lock
         self._directory = store.directory
         self._max_nbytes = int(max_file_size * 1e9) - _HEADER
         self._syncer = None if durable else Syncer()
         self._reader = Reader(store.directory, store.manifest)
         self._open: dict[str, OpenPartition] = {}
-        self._sealing: deque[tuple[str, Future[Partition]]] = deque()
-        self._sealed: list[tuple[str, Partition]] = []
+        self._sealing: deque[Future[Partition]] = deque()
+        self._sealed: list[Partition] = []
         self._sealer = ThreadPoolExecutor(1, "physx-seal")
 
     def append(self, mode_name: str, rows: Batch, count: int) -> None:
@@ -131,17 +140,19 @@ class Writer:
             count: How many rows there are.
 
         Raises:
-            DatasetError: The disk is full or fails; says how many of the rows are stored.
+            DatasetError: If the disk is full or fails; says how many of the rows are stored.
         """
         if self._sealing:
-            with contextlib.suppress(OSError):  # it is noted later; the rows below tell
+            with contextlib.suppress(OSError):  # noted later; storing the rows fails, too
                 self._collect(wait=False)
         done = 0
         while done < count:
             try:
                 partition = self._open.get(mode_name)
                 if partition is None or not partition.free:
-                    partition = self._next(mode_name)
+                    if partition is not None:
+                        self._retire(mode_name)
+                    partition = self._open[mode_name] = self._begin(mode_name)
                 part = min(partition.free, count - done)
                 partition.append(rows, done, part)
                 done += part
@@ -150,46 +161,44 @@ class Writer:
                 safe = f"The {self.store.manifest.modes[mode_name].rows} samples before them"
                 raise files.not_stored(what, error, safe) from error
 
-    def refresh(self) -> bool:
-        """See what other writers have committed; return whether rows known before have moved.
+    def refresh(self) -> None:
+        """Learn what other writers have committed.
 
         Raises:
-            DatasetError: The manifest is not valid any more.
+            DatasetError: If the manifest is no longer valid.
         """
         if self.store.shared:
             with files.storing("What other writers did"), files.turn(self._directory):
                 self.store.reload(recovery.load(self._directory))
-        moved, self.store.moved = self.store.moved, False
-        return moved
 
     def finish(self, mode_name: str) -> None:
-        """Seal the open partition of a mode, if there is one, and all that wait for it.
+        """Seal the open partition of a mode, if there is one, and wait until all are sealed.
 
         Raises:
-            DatasetError: It is damaged.
-            OSError: The storage fails; its rows can be read, and it is sealed later.
+            DatasetError: If a partition is damaged.
+            OSError: If the storage fails; the rows can be read, and are sealed later.
         """
         if mode_name in self._open:
             self._retire(mode_name)
         self.wait()
 
     def wait(self) -> None:
-        """Wait until everything that is full is sealed.
+        """Wait until all full partitions are sealed.
 
         Raises:
-            DatasetError: A partition is damaged.
-            OSError: The storage fails; its rows can be read, and it is sealed later.
+            DatasetError: If a partition is damaged.
+            OSError: If the storage fails; the rows can be read, and are sealed later.
         """
         self._collect(wait=True)
 
     def close(self) -> None:
-        """Seal what is open, and write manifest and index.
+        """Seal what is open, write manifest and index, and release the lock.
 
-        On a full disk the last partitions stay unsealed: all their rows can be read, and the next
-        writer seals them.
+        On a full disk the last partitions remain unsealed: all their rows can be read, and the
+        next writer seals them.
 
         Raises:
-            DatasetError: A partition is damaged, or the storage fails.
+            DatasetError: If a partition is damaged, or the storage fails.
         """
         try:
             with files.storing("The dataset's last partition"):
@@ -206,50 +215,45 @@ class Writer:
             for opened in self._open.values():
                 opened.close()
             self._open.clear()
-            if self._syncer is not None:
-                with files.storing("The last rows"):
-                    self._syncer.close()
-
-    def _next(self, mode_name: str) -> OpenPartition:
-        """Have the full partition of a mode sealed, if there is one, and begin the next."""
-        if mode_name in self._open:
-            self._retire(mode_name)
-        opened = self._open[mode_name] = self._begin(mode_name)
-        return opened
+            try:
+                if self._syncer is not None:
+                    with files.storing("The last rows"):
+                        self._syncer.close()
+            finally:
+                os.close(self._lock)
 
     def _retire(self, mode_name: str) -> None:
-        """Close the open partition of a mode and have it sealed, beside the writing."""
+        """Close the open partition of a mode and have it sealed in the background."""
         opened = self._open.pop(mode_name)
         entry = opened.partition
         entry.writing = not opened.free  # one that is full keeps its files as they are
         opened.close()
         fields = self.store.manifest.modes[mode_name].fields
-        work = self._sealer.submit(_sealed, self._directory, mode_name, fields, replace(entry))
-        self._sealing.append((mode_name, work))
+        work = self._sealer.submit(_seal, self._directory, fields, replace(entry))
+        self._sealing.append(work)
 
     def _collect(self, *, wait: bool) -> None:
         """Note in the manifest which partitions have been sealed."""
-        while self._sealing and (wait or self._sealing[0][1].done()):
-            mode_name, work = self._sealing.popleft()
-            self._sealed.append((mode_name, work.result()))
+        while self._sealing and (wait or self._sealing[0].done()):
+            self._sealed.append(self._sealing.popleft().result())
         if not self._sealed:
             return
         with self.store.change() as manifest:
-            for mode_name, entry in self._sealed:
-                mode = manifest.modes[mode_name]
+            for entry in self._sealed:
+                mode = manifest.modes[entry.mode]
                 if entry.rows:
                     mode.swap(entry)
-                    coverage.settle(mode)
+                    count_sealed(mode)
                 else:
                     del mode.partitions[mode.place(entry)]
             write_index(self._directory, self.session, manifest)
-        empty = [(name, entry) for name, entry in self._sealed if not entry.rows]
+        empty = [entry for entry in self._sealed if not entry.rows]
         self._sealed.clear()
-        for mode_name, entry in empty:
-            remove_files(self._directory, mode_name, self.store.manifest.modes[mode_name], entry)
+        for entry in empty:
+            remove_files(self._directory, self.store.manifest.modes[entry.mode].fields, entry)
 
     def _begin(self, mode_name: str) -> OpenPartition:
-        """Create the files of a partition, then list it; only then rows may be committed."""
+        """Create the files of a partition, then list it; only then may rows be committed."""
         parts: dict[str, PartitionFile] = {}
         try:
             with self.store.change() as manifest:
@@ -259,7 +263,7 @@ class Writer:
                 entry = self.new_partition(mode_name, mode)
                 entry.writing = True
                 for name, field in mode.fields.items():
-                    identity = entry.identity(mode_name, field)
+                    identity = entry.identity(field)
                     parts[name] = PartitionFile.create(self._directory, identity, capacity)
                     entry.offsets[name] = parts[name].data_offset
                 for part in parts.values():
@@ -275,10 +279,8 @@ class Writer:
         """Return a partition with the first number whose files do not exist yet."""
         listed = (*mode.partitions, *mode.dropped)
         used = [partition.index for partition in listed if partition.session == self.session]
-        entry = Partition(self.session, max(used, default=-1) + 1, mode.next_row)
-        while any(
-            (self._directory / entry.file_name(mode_name, name)).exists() for name in mode.fields
-        ):
+        entry = Partition(mode_name, self.session, max(used, default=-1) + 1, mode.next_row)
+        while any(entry.path(self._directory, name).exists() for name in mode.fields):
             entry = replace(entry, index=entry.index + 1)
         return entry
 
@@ -292,13 +294,11 @@ class Writer:
             if any(partition.sealed and not partition.counted for partition in mode.partitions):
                 changed = True
                 with contextlib.suppress(DatasetError):  # a partition is damaged: not now
-                    coverage.statistics_of(self._reader, name)
+                    compute_statistics(self._reader, name)
         if changed:
             manifest_file.save(self._directory, manifest)
         write_index(self._directory, self.session, manifest)
 
 
-def _sealed(
-    directory: Path, mode_name: str, fields: Mapping[str, Field], partition: Partition
-) -> Partition:
-    return seal(directory, mode_name, fields, partition) if partition.rows else partition
+def _seal(directory: Path, fields: Mapping[str, Field], partition: Partition) -> Partition:
+    return seal(directory, fields, partition) if partition.rows else partition

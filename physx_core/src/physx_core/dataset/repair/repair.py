@@ -1,4 +1,4 @@
-"""Repairing a dataset: whatever can be put right without losing a row or deleting a file."""
+"""Repairs a dataset without losing a sound row or deleting a file."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from physx_core import files
-from physx_core.dataset.read.reader import Reader, Segment
+from physx_core.dataset.read.mode_statistics import compute_statistics
+from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.repair import recovery
-from physx_core.dataset.repair.report import find_problems, problem_of
+from physx_core.dataset.repair.report import find_problem, find_problems
 from physx_core.dataset.store import manifest_file
-from physx_core.dataset.store import mode_statistics as coverage
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition_file import rewrite
-from physx_core.dataset.store.sealing import checksum
 from physx_core.dataset.store.virtual_index import write_index
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
@@ -25,30 +24,30 @@ ASIDE = "damaged"
 
 def repair(folder: Path) -> list[str]:
     """Repair a dataset and return what was done: see `Dataset.repair`."""
-    with _locked(folder):
-        manifest, done = _sound_manifest(folder)
-        for name, mode in manifest.modes.items():
+    with _lock(folder):
+        manifest, done = _load_sound_manifest(folder)
+        for mode in manifest.modes.values():
             for partition in list(mode.partitions):
-                done += _repair_partition(folder, name, mode, partition)
+                done += _repair_partition(folder, mode, partition)
         manifest.problems.clear()
-        recovery.count_all(folder, manifest)  # a damaged partition kept later ones from it
-        done += recovery.repair(folder, manifest)
+        recovery.count_rows(folder, manifest)  # a damaged partition may have hidden later ones
+        done += recovery.recover(folder, manifest)
         if done:
             _store(folder, manifest)
     return done
 
 
 def rebuild(folder: Path) -> None:
-    """Make the manifest from the partition files alone: see `Dataset.rebuild`."""
-    with _locked(folder):
+    """Rebuild the manifest from the partition files alone: see `Dataset.rebuild`."""
+    with _lock(folder):
         manifest = recovery.load_from_files(folder)
-        recovery.repair(folder, manifest)
+        recovery.recover(folder, manifest)
         _keep_old(folder)
         _store(folder, manifest)
 
 
 @contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _lock(folder: Path) -> Iterator[None]:
     with files.storing(f"The repaired dataset in {folder}"):
         lock = files.lock(folder)
         try:
@@ -60,16 +59,16 @@ def _locked(folder: Path) -> Iterator[None]:
 def _store(folder: Path, manifest: Manifest) -> None:
     reader = Reader(folder, manifest)
     for name in manifest.modes:
-        coverage.statistics_of(reader, name)
+        compute_statistics(reader, name)
     write_index(folder, next(reversed(manifest.sessions), "run"), manifest)
     manifest_file.save(folder, manifest)
 
 
-def _sound_manifest(folder: Path) -> tuple[Manifest, list[str]]:
-    """Return the manifest, or make it from the files, setting aside those that are damaged."""
+def _load_sound_manifest(folder: Path) -> tuple[Manifest, list[str]]:
+    """Return the manifest, or rebuild it from the files, setting aside those that are damaged."""
     path = folder / manifest_file.FILE
     if not path.exists():
-        what = f"{path} was missing: it is made anew from the partition files, without the info."
+        what = f"{path} was missing: it has been rebuilt from the partition files, without info."
     else:
         try:
             return recovery.load(folder), []
@@ -80,7 +79,7 @@ def _sound_manifest(folder: Path) -> tuple[Manifest, list[str]]:
             if not manifest.problems and not find_problems(folder, manifest):
                 for mode in manifest.modes.values():
                     mode.forget_statistics()
-                return manifest, [f"{path} was edited by hand; it fits the files and is kept."]
+                return manifest, [f"{path} was edited by hand; it matches the files and is kept."]
     done = [what] + [
         _set_aside(folder, [damaged], str(error))
         for damaged, error in recovery.damaged_files(folder)
@@ -92,13 +91,13 @@ def _sound_manifest(folder: Path) -> tuple[Manifest, list[str]]:
 
 
 def _keep_old(folder: Path) -> Path:
-    """Move the manifest out of the way; return where it is."""
+    """Rename the old manifest, if there is one; return its path."""
     path = folder / manifest_file.FILE
-    return path.rename(_free(path)) if path.exists() else path
+    return path.rename(_unused(path)) if path.exists() else path
 
 
-def _free(path: Path) -> Path:
-    """Return a name that no file has: the given one, or with a number behind it."""
+def _unused(path: Path) -> Path:
+    """Return a path that does not exist: the given one, or with a number appended."""
     found, number = path, 0
     while found.exists():
         number += 1
@@ -106,40 +105,39 @@ def _free(path: Path) -> Path:
     return found
 
 
-def _repair_partition(folder: Path, name: str, mode: Mode, partition: Partition) -> list[str]:
+def _repair_partition(folder: Path, mode: Mode, partition: Partition) -> list[str]:
     """Give damaged files of a partition a new header, or else set all its files aside."""
     done = []
-    for field in mode.fields.values():
-        problem = problem_of(folder, name, partition, field)
+    for name, field in mode.fields.items():
+        problem = find_problem(folder, partition, field)
         if problem is None:
             continue
-        path = folder / partition.file_name(name, field.name)
-        if not _has_sound_rows(path, partition, field):
+        if not _has_sound_rows(folder, partition, field):
             mode.partitions.remove(partition)
             mode.forget_statistics()
-            paths = [folder / partition.file_name(name, each) for each in mode.fields]
+            paths = [partition.path(folder, each) for each in mode.fields]
             return [_set_aside(folder, paths, problem, partition.rows)]
-        offset = partition.offsets[field.name]
-        identity = partition.identity(name, field)
-        partition.offsets[field.name] = rewrite(path, identity, partition.rows, offset)
+        path, identity = partition.path(folder, name), partition.identity(field)
+        offset = partition.offsets[name]
+        partition.offsets[name] = rewrite(path, identity, partition.rows, offset)
         done.append(f"{problem} Its rows are sound and have a new header.")
     return done
 
 
-def _has_sound_rows(path: Path, partition: Partition, field: Field) -> bool:
+def _has_sound_rows(folder: Path, partition: Partition, field: Field) -> bool:
     if not partition.sealed or field.name not in partition.checksums:
         return False
-    rows = Segment(path, 0, partition.rows, partition.offsets[field.name], certain=True)
     try:
-        return checksum(rows, field.nbytes) == partition.checksums[field.name]
+        found = partition.segment(folder, field).compute_checksum()
     except DatasetError:
         return False
+    return found == partition.checksums[field.name]
 
 
 def _set_aside(folder: Path, paths: list[Path], problem: str, rows: int = 0) -> str:
     (folder / ASIDE).mkdir(exist_ok=True)
     for path in paths:
         with contextlib.suppress(FileNotFoundError):
-            path.rename(_free(folder / ASIDE / path.name))
-    what = f"{rows} rows" if rows else "What is left of it"
-    return f"{problem} {what} of the partition cannot be used and lie in {folder / ASIDE} now."
+            path.rename(_unused(folder / ASIDE / path.name))
+    what = f"{rows} rows" if rows else "The remains"
+    return f"{problem} {what} of the partition cannot be used and were moved to {folder / ASIDE}."

@@ -1,0 +1,63 @@
+"""Statistics of a mode's rows: computed once for each partition, and merged when it is sealed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from physx_core.dataset.read.reader import Reader
+from physx_core.dataset.store.manifest import Mode, Partition
+from physx_core.statistics import RunningStatistics
+
+Statistics = dict[str, RunningStatistics]
+
+
+def compute_statistics(reader: Reader, mode_name: str) -> Statistics:
+    """Return the statistics of a mode's floating fields, over all its committed rows.
+
+    Raises:
+        DatasetError: If there is no such mode, or a partition is missing or damaged.
+    """
+    mode = reader.mode(mode_name)
+    for partition in mode.partitions:
+        if not partition.counted:
+            _update_running(reader, mode, partition)
+    count_sealed(mode)
+    found = mode.statistics
+    for partition in mode.partitions:
+        if not partition.counted:
+            found = merge_statistics(found, partition.running)
+    return found
+
+
+def count_sealed(mode: Mode) -> None:
+    """Merge into the mode's statistics those of sealed partitions that cover all their rows."""
+    for place, partition in enumerate(mode.partitions):
+        have = (partition.running.get(name) for name in mode.counted_fields)
+        complete = all(s is not None and s.count == partition.rows for s in have)
+        if partition.sealed and not partition.counted and complete:
+            mode.statistics = merge_statistics(mode.statistics, partition.running)
+            mode.partitions[place] = replace(partition, counted=True, running={})
+
+
+def merge_statistics(
+    one: Mapping[str, RunningStatistics], two: Mapping[str, RunningStatistics]
+) -> Statistics:
+    """Return the statistics of the rows of both; neither is changed."""
+    found = {}
+    for name in {**one, **two}:
+        total = found[name] = RunningStatistics()
+        for part in (one, two):
+            if name in part:
+                total.merge(part[name])
+    return found
+
+
+def _update_running(reader: Reader, mode: Mode, partition: Partition) -> None:
+    """Bring the running statistics of a partition up to its last committed row."""
+    start = mode.start(partition)
+    for name in mode.counted_fields:
+        statistics = partition.running.setdefault(name, RunningStatistics())
+        first, stop = start + statistics.count, start + partition.rows
+        for block in reader.blocks(partition.mode, name, first, stop):
+            statistics.update(block)

@@ -1,0 +1,118 @@
+"""Reads the committed rows of one field from one partition file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+
+import numpy as np
+
+from physx_core import files
+from physx_core.dataset.store.checksums import crc32
+from physx_core.dataset.store.partition_format import (
+    SIGNATURE,
+    cannot_read,
+    inspect_open,
+    open_partition,
+    truncated,
+)
+from physx_core.errors import DatasetError
+from physx_core.fields import Field
+from physx_core.typing import Array
+
+BLOCK = 2**20
+"""Bytes of the blocks that rows are read in."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The committed rows of one field in one partition.
+
+    Attributes:
+        path: The file.
+        field: The field, with a known shape.
+        start: Row of the mode that is the first one here.
+        rows: How many rows to read.
+        offset: Byte of the file at which they begin.
+        certain: Whether `offset` can be relied on; otherwise it is read from the file, because
+            another process may replace the file by its final form at any moment.
+        checksum: CRC-32 of all its rows; None if it is not known.
+    """
+
+    path: Path
+    field: Field
+    start: int
+    rows: int
+    offset: int
+    certain: bool
+    checksum: int | None = None
+
+    def open(self) -> tuple[FileIO, int]:
+        """Open the file; return it with the offset of the first row.
+
+        Raises:
+            DatasetError: If the file is missing, truncated or damaged.
+        """
+        file = open_partition(self.path)
+        try:
+            offset, row_nbytes = self.offset, self.field.nbytes
+            if not self.certain:
+                offset = inspect_open(file, self.path, offset, row_nbytes).data_offset
+            size = os.fstat(file.fileno()).st_size
+            expected = offset + self.rows * row_nbytes
+            if size < expected:
+                raise truncated(self.path, size, expected, offset, row_nbytes)
+            if os.pread(file.fileno(), len(SIGNATURE), 0) != SIGNATURE:
+                raise DatasetError(f"{self.path} is damaged: it is no longer an HDF5 file.")
+        except BaseException:
+            file.close()
+            raise
+        return file, offset
+
+    def read(self, file: FileIO, offset: int, view: memoryview) -> None:
+        """Fill a buffer from the open file.
+
+        Raises:
+            DatasetError: If the file has become shorter, or the disk fails.
+        """
+        try:
+            complete = files.read_at(file.fileno(), view, offset)
+        except OSError as error:
+            raise cannot_read(self.path, error) from error
+        if not complete:
+            raise DatasetError(f"{self.path} became shorter while it was being read.")
+
+    def blocks(self) -> Iterator[Array]:
+        """Yield all rows in blocks of about a megabyte, each valid until the next.
+
+        Raises:
+            DatasetError: If the file is missing, truncated or damaged.
+        """
+        row_nbytes = self.field.nbytes
+        count = rows_per_block(row_nbytes)
+        buffer = np.empty((min(count, self.rows), *(self.field.shape or ())), self.field.dtype)
+        file, offset = self.open()
+        with file:
+            for first in range(0, self.rows, count):
+                block = buffer[: self.rows - first]
+                self.read(file, offset + first * row_nbytes, files.raw(block))
+                yield block
+
+    def compute_checksum(self) -> int:
+        """Return the CRC-32 of all rows.
+
+        Raises:
+            DatasetError: If the file is missing, truncated or damaged.
+        """
+        crc = 0
+        for block in self.blocks():
+            crc = crc32(files.raw(block), crc)
+        return crc
+
+
+def rows_per_block(row_nbytes: int, nbytes: int = BLOCK) -> int:
+    """Return how many rows of a size make a block of about `nbytes` bytes, at least one."""
+    return max(1, nbytes // max(1, row_nbytes))
