@@ -68,11 +68,11 @@ def test_the_first_row_is_named_whatever_its_field():
 
 def test_a_row_that_is_checked_at_once_leaves_the_buffer_as_it_was():
     buffer = RowBuffer(FIELDS, 3, numbered=False)
-    buffer.put_checked({"x": [1, 2], "n": 1})
+    buffer.put({"x": [1, 2], "n": 1}, finite=True)
     for x in ([np.nan, 0], [0, np.inf], [0, 0, 0]):
         with pytest.raises(SampleError):
-            buffer.put_checked({"x": x, "n": 2})
-    buffer.put_checked({"x": [3, 4], "n": 3})
+            buffer.put({"x": x, "n": 2}, finite=True)
+    buffer.put({"x": [3, 4], "n": 3}, finite=True)
     assert {name: rows.tolist() for name, rows in buffer.take().items()} == {
         "x": [[1, 2], [3, 4]],
         "n": [1, 3],

@@ -76,10 +76,15 @@ class Field:
             object.__setattr__(self, "shape", tuple(int(n) for n in shape))
 
     @cached_property
+    def numpy_dtype(self) -> np.dtype[Any]:
+        """The type as an object of NumPy."""
+        return np.dtype(self.dtype)
+
+    @cached_property
     def nbytes(self) -> int:
         """Bytes of one sample's value; 0 while the shape is unknown."""
         count = math.prod(self.shape) if self.shape is not None else 0
-        return count * np.dtype(self.dtype).itemsize
+        return count * self.numpy_dtype.itemsize
 
     def convert(self, values: Any, *, axes: int = 0, instance_id: int = 0, step: int = -1) -> Array:
         """Return values as an array of the field's shape and type.
@@ -109,34 +114,27 @@ class Field:
             FieldShapeError: If the values are ragged or have another shape.
             FieldTypeError: If the field's type cannot hold the values.
         """
-        place = {"instance_id": instance_id, "step": step}
+        error: type[FieldShapeError | FieldTypeError] = FieldShapeError
         try:
             array: Array = np.asarray(values)
-        except ValueError as error:
-            text = f'field "{self.name}" is ragged or malformed: {error}.'
-            raise FieldShapeError(text, field=self.name, **place) from error
-        except NO_ARRAY as error:
-            text = f'field "{self.name}" is not convertible to an array: {error}.'
-            raise FieldTypeError(text, field=self.name, **place) from error
-        shape, dtype = array.shape[axes:], np.dtype(self.dtype)
-        if array.ndim < axes or (self.shape is not None and shape != self.shape):
-            text = f"has shape {shape} but is defined as {self.shape}"
+        except ValueError as cause:
+            text = f"is ragged or malformed: {cause}"
+        except NO_ARRAY as cause:
+            error, text = FieldTypeError, f"is not convertible to an array: {cause}"
+        else:
             if array.ndim < axes:
                 text = "is a single value; rows have shape (n, *field shape)"
-            raise FieldShapeError(f'field "{self.name}" {text}.', field=self.name, **place)
-        if array.dtype == dtype:
-            return array
-        if array.dtype.kind not in _FITTING[dtype.kind]:
-            text = f"holds {array.dtype} but is defined as {dtype}, which cannot hold it"
-            raise FieldTypeError(f'field "{self.name}" {text}.', field=self.name, **place)
-        if dtype.kind not in "fc":
-            wrong = _out_of_range(array, dtype)
-            if wrong is not None:
-                text = f"holds {wrong} but is defined as {dtype}, which cannot hold it"
-                raise FieldTypeError(f'field "{self.name}" {text}.', field=self.name, **place)
-            return array.astype(dtype)
-        with np.errstate(over="ignore"):
-            return array.astype(dtype)
+            elif self.shape is not None and array.shape[axes:] != self.shape:
+                text = f"has shape {array.shape[axes:]} but is defined as {self.shape}"
+            elif array.dtype == self.numpy_dtype:
+                return array
+            else:
+                error, text = FieldTypeError, _misfit(array, self.numpy_dtype)
+                if not text:
+                    return _cast(array, self.numpy_dtype)
+        raise error(
+            f'field "{self.name}" {text}.', field=self.name, instance_id=instance_id, step=step
+        )
 
     def not_finite(
         self, *, instance_id: int = 0, step: int = -1, where: str = ""
@@ -149,8 +147,7 @@ class Field:
             where: Further description of the place, with a leading space.
         """
         return NotFiniteError(
-            f'field "{self.name}" holds NaN or an infinite number as '
-            f"{np.dtype(self.dtype)}{where}.",
+            f'field "{self.name}" holds NaN or an infinite number as {self.numpy_dtype}{where}.',
             field=self.name,
             instance_id=instance_id,
             step=step,
@@ -242,10 +239,29 @@ def first_not_finite(rows: Array) -> int | None:
     return int(np.argmin(finite))
 
 
-def _out_of_range(array: Array, dtype: np.dtype[Any]) -> int | None:
-    """Return an integer of the array that an integer type cannot hold; None: it holds all."""
-    if array.dtype.kind == "b" or not array.size:
-        return None
-    limits = np.iinfo(dtype)
-    extremes = (array.item(),) if array.size == 1 else (int(array.min()), int(array.max()))
-    return next((n for n in extremes if not limits.min <= n <= limits.max), None)
+def _misfit(array: Array, dtype: np.dtype[Any]) -> str:
+    """Return why a type cannot hold the values of an array; empty if it can."""
+    kind = array.dtype.kind
+    if kind not in _FITTING[dtype.kind]:
+        return f"holds {array.dtype} but is defined as {dtype}, which cannot hold it"
+    if dtype.kind in "iu" and kind != "b" and array.size:
+        limits = np.iinfo(dtype)
+        extremes = (array.item(),) if array.size == 1 else (int(array.min()), int(array.max()))
+        for number in extremes:
+            if not limits.min <= number <= limits.max:
+                return f"holds {number} but is defined as {dtype}, which cannot hold it"
+    return ""
+
+
+def _cast(array: Array, dtype: np.dtype[Any]) -> Array:
+    """Return an array in a type that can hold it; what is too large for it becomes infinite."""
+    size, given = _real_size(dtype), _real_size(array.dtype)
+    if dtype.kind in "fc" and (size < given or size == 2):
+        with np.errstate(over="ignore"):
+            return array.astype(dtype)
+    return array.astype(dtype)
+
+
+def _real_size(dtype: np.dtype[Any]) -> int:
+    """Return the bytes of a number of a type, or of each part of a complex one."""
+    return dtype.itemsize // 2 if dtype.kind == "c" else dtype.itemsize

@@ -35,7 +35,7 @@ class RowBuffer:
     """Rows of samples, one preallocated array for each field; each row is checked once.
 
     Names, shapes and types are checked when a row is put in. Whether its values are finite is
-    checked by `put_checked` at once, or else by `take` for all rows together, which is faster.
+    checked then, too, or by `take` for all rows together, which is faster.
 
     Attributes:
         fields: Fields of the rows, those that physx adds at the end.
@@ -67,7 +67,7 @@ class RowBuffer:
         self._names = {field.name for field in fields}
         known = [field if field.shape is not None else replace(field, shape=()) for field in fields]
         self._slots = [
-            (field.name, self._arrays[field.name], field.shape, np.dtype(field.dtype), field)
+            (field.name, self._arrays[field.name], field.shape, field.numpy_dtype, field)
             for field in known
         ]
         self._floating = [
@@ -81,21 +81,30 @@ class RowBuffer:
         return self.count == self.capacity
 
     def put(
-        self, sample: Mapping[str, Any], instance_id: int = 0, episode: int = 0, step: int = -1
+        self,
+        sample: Mapping[str, Any],
+        instance_id: int = 0,
+        episode: int = 0,
+        step: int = -1,
+        *,
+        finite: bool = False,
     ) -> None:
-        """Copy a sample into the next row; whether it is finite is checked by `take`.
+        """Copy a sample into the next row; after an error the buffer is as it was.
 
         Args:
             sample: Field name to value, exactly the fields that the buffer was made with.
             instance_id: Instance that made the sample; 0: unknown.
             episode: The instance's trajectory that the sample belongs to.
             step: The instance's step that made it.
+            finite: Whether to check now that all values are finite; if not, `take` does so.
 
         Raises:
             MissingFieldError: If a field is missing.
             UnknownFieldError: If a field was not defined.
             FieldShapeError: If a value has another shape than its field.
             FieldTypeError: If the field's type cannot hold a value: see `Field.convert`.
+            NotFiniteError: If `finite` is set and a value is NaN, infinite or too large for its
+                field's type.
         """
         row = self.count
         if sample.keys() != self._names:
@@ -104,31 +113,17 @@ class RowBuffer:
             value = sample[name]
             if type(value) is not np.ndarray or value.shape != shape or value.dtype != dtype:
                 value = field.convert(value, instance_id=instance_id, step=step)
+            if finite and not is_finite(value):
+                raise field.not_finite(instance_id=instance_id, step=step)
             array[row] = value
         if self._numbers:
             env_ids, episodes, steps = self._numbers
             env_ids[row] = instance_id
             episodes[row] = episode
             steps[row] = step
-        self.count = row + 1
-
-    def put_checked(
-        self, sample: Mapping[str, Any], instance_id: int = 0, episode: int = 0, step: int = -1
-    ) -> None:
-        """Copy a sample into the next row if it is valid and finite: see `put`.
-
-        Raises:
-            NotFiniteError: If a value is NaN or infinite, or too large for its field's type.
-            SampleError: If the sample does not fit the fields. The buffer is as it was.
-        """
-        row = self.count
-        self.put(sample, instance_id, episode, step)
-        for field, array in self._floating:
-            if not is_finite(array[row : row + 1]):
-                self.count = row
-                raise field.not_finite(instance_id=instance_id, step=step)
-        if self._finite == row:
+        if finite and self._finite == row:
             self._finite = row + 1
+        self.count = row + 1
 
     def take(self) -> Batch:
         """Return the rows as views, valid until the next `put`, and empty the buffer.
@@ -199,7 +194,7 @@ class RejectedSamples:
         buffer = RowBuffer(fields, len(waiting))
         for sample, episode, step in waiting:
             with contextlib.suppress(SampleError):
-                buffer.put_checked(sample, instance_id, episode, step)
+                buffer.put(sample, instance_id, episode, step, finite=True)
         return buffer.take()
 
 

@@ -56,7 +56,7 @@ class Appender:
         if buffer is None:
             buffer = self._begin(mode, sample)
         else:
-            buffer.put_checked(sample)
+            buffer.put(sample, finite=True)
         if buffer.full:
             self._flush(mode)
 
@@ -71,7 +71,7 @@ class Appender:
         fields = known.fields.values() if known else infer_fields(sample, axes=0)
         shaped = infer_shapes(fields, sample)
         buffer = RowBuffer(shaped, numbered=False)
-        buffer.put_checked(sample)
+        buffer.put(sample, finite=True)
         if not self._is_settled(mode):
             self.define_fields(mode, shaped)
         self._buffers[mode] = buffer
