@@ -290,20 +290,20 @@ def test_an_environment_is_served_once(start, scene_class):
         start(environment)
     closed = scene_class()
     closed.close()
-    with pytest.raises(UsageError, match="make another environment"):
+    with pytest.raises(UsageError, match="create another environment"):
         start(closed)
 
 
 @pytest.mark.parametrize(("name", "value"), [("repeat_action", -1), ("frame_steps", 0)])
 def test_a_mistake_in_a_setting(scene_class, name, value):
-    with pytest.raises(PhysxError, match=f"{name} is a whole number"):
+    with pytest.raises(PhysxError, match=f"{name} must be an integer"):
         setattr(scene_class(), name, value)
 
 
 def test_a_speed_that_is_none(start, scene_class):
     environment = scene_class()
     environment.time_speed = 0
-    with pytest.raises(PhysxError, match="time_speed is a number greater than 0"):
+    with pytest.raises(PhysxError, match="time_speed must be a positive number"):
         start(environment)
 
 
@@ -314,7 +314,7 @@ CONNECTED = [
     ({"max_answer": "1 MB"}, "max_answer is '1 MB'"),
     ({"action_space": 3}, "not a gymnasium.Space"),
     ({"requested_observation": ["state"]}, "must be a dictionary"),
-    ({"repeat_action": -1}, "repeat_action is a whole number"),
+    ({"repeat_action": -1}, "repeat_action must be an integer"),
     ({"time_speed": "fast"}, "time_speed is a number"),
 ]
 

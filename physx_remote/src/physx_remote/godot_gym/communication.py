@@ -1,4 +1,4 @@
-"""Communication: the server of an `RLEnvironment`, and what goes over its wire."""
+"""Communication: the server of an `RLEnvironment`."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ Errors = Literal["tell", "close"]
 
 
 class Communication(SocketService):
-    """Serves clients that send requests as JSON, one after the other.
+    """Serves JSON requests of clients, one at a time.
 
-    A request is answered exactly once: with what `put_message` is given, and otherwise with an
-    empty message. One that cannot be carried out is logged, and answered with the part ``error``
-    of `physx_remote.godot_gym.messages`; the environment lives on.
+    A request is answered exactly once: with the message passed to `put_message`, or with an empty
+    one. A request that cannot be carried out is logged, and answered with the part ``error`` of
+    `physx_remote.godot_gym.messages`; the environment goes on.
 
     Attributes:
-        got_connection: Signal with a request, a dictionary. A function that is connected may
-            return a generator: it yields how long it wants to be left alone, in s.
+        got_connection: Signal with a request, a dictionary. A connected function may return a
+            generator, which yields how long to wait before it goes on, in s.
     """
 
     def __init__(
@@ -46,22 +46,21 @@ class Communication(SocketService):
         """Keep the options.
 
         Args:
-            clients: What happens to a second client while one is served, which is from its first
+            clients: Treatment of a second client while one is served, which is from its first
                 request until it leaves: ``"queue"``, it waits; ``"refuse"``, it is closed at once;
                 ``"serve"``, its requests are answered in turn with those of the first.
-            reply: ``"always"``, or ``"observation-only"``: only requests for an observation are
+            reply: ``"always"``, or ``"observation-only"``: only requests with an observation are
                 answered, as in the first version of the protocol.
-            request_framing: ``"framed"``, or ``"bare-json"``: requests have no length before them,
-                as in the first version.
-            errors: ``"tell"``, or ``"close"``: who sends a request that cannot be carried out is
-                closed.
-            max_request: Longest request in bytes; who sends a longer one is closed.
-            patience: How long a client may be silent, in s, while another waits for it; None: for
-                ever.
-            max_clients: How many clients are connected at most; who comes then is closed at once.
+            request_framing: ``"framed"``, or ``"bare-json"``: requests have no length prefix, as in
+                the first version.
+            errors: ``"tell"``, or ``"close"``: a request that cannot be carried out ends the
+                connection.
+            max_request: Longest request in bytes; a client that sends a longer one is closed.
+            patience: How long a client may be silent, in s, while another waits; None: forever.
+            max_clients: How many clients may be connected; further ones are closed at once.
 
         Raises:
-            ConfigError: A value is none of these.
+            ConfigError: If a value is out of range.
         """
         super().__init__(max_clients=max_clients)
         choices = (
@@ -93,9 +92,9 @@ class Communication(SocketService):
 
     @property
     def is_abandoned(self) -> bool:
-        """Whether nobody waits for the answer to the request that is being carried out.
+        """Whether the client left whose request is being carried out.
 
-        A client that sends no more may still read; it counts as gone once another one waits.
+        A client that has shut down sending may still read; it counts as gone once another waits.
         """
         asking = self._asking
         if asking is None or not asking.ended:
@@ -106,20 +105,22 @@ class Communication(SocketService):
         """Begin to listen.
 
         Args:
-            port: Port, 0 for any that is free.
-            address: Address of this machine. Whoever reaches it drives the environment: nobody has
-                to say who he is.
+            port: Port; 0: any free one.
+            address: Address of this machine. There is no authentication: anyone who reaches it can
+                drive the environment.
 
         Raises:
-            UsageError: It listens already, or is closed.
-            ConfigError: Port or address is none.
-            RemoteError: It cannot listen there.
+            UsageError: If it listens already, or is closed.
+            ConfigError: If the port or address is not valid.
+            RemoteError: If it cannot listen there.
         """
         check_address(address, port)
         if self.is_listening:
             raise UsageError(f"The server listens already, at {self.address}.")
         if self._over:
-            raise UsageError("What was closed does not serve again: make another environment.")
+            raise UsageError(
+                "A closed environment cannot be served again: create another environment."
+            )
         self.listen(address, port)
         LOG.info("Listening at %s:%s", *self.address)
         if self._patience is not None:
@@ -133,15 +134,15 @@ class Communication(SocketService):
         """Answer the request that is being carried out.
 
         Args:
-            message: A message of protobuf, or its bytes; None: nothing was asked for.
+            message: A protobuf message, or its bytes; None: no data were requested.
 
         Raises:
-            UsageError: No request is being carried out, or it is answered already.
+            UsageError: If no request is being carried out, or it is answered already.
         """
         if self._asking is None:
-            raise UsageError("put_message() answers a request, and there is none.")
+            raise UsageError("put_message() answers a request, but there is none.")
         if self._answered:
-            raise UsageError("A request is answered once, and this one is answered already.")
+            raise UsageError("This request is answered already.")
         self._answered = True
         if message is None:
             if self._reply == "observation-only":
@@ -150,15 +151,15 @@ class Communication(SocketService):
         body = message if isinstance(message, bytes) else message.SerializeToString()
         self.send(self._asking, add_prefix(body))
 
-    # What the loop calls --------------------------------------------------------------------
+    # Events of the loop -----------------------------------------------------------------------
 
     def new_reader(self) -> Reader:
-        """Return what cuts requests out of a stream."""
+        """Return a reader of requests."""
         kind = JsonReader if self._framing == "bare-json" else PrefixReader
         return kind(self._max_request)
 
     def opened(self, connection: RequestConnection) -> None:
-        """Turn a client away, or tell the log that it waits."""
+        """Close a further client, or log that it waits."""
         if self._served is None or self._clients == "serve":
             LOG.info("%s connected", connection.name)
         elif self._clients == "refuse" and not self._served.ended:
@@ -203,7 +204,7 @@ class Communication(SocketService):
                     self.drop(other, f"turned away while {connection.name} is served")
 
     def _report(self, connection: RequestConnection, error: Exception) -> None:
-        """Say what went wrong, here and to the client."""
+        """Report an error in the log and to the client."""
         expected = isinstance(error, RequestError)
         text = str(error) if expected else f"{type(error).__name__}: {error}"
         LOG.error(
@@ -220,7 +221,7 @@ class Communication(SocketService):
             self.put_message(encode_extension(ERROR, text))
 
     def _look_for_silence(self) -> None:
-        """Close a client that keeps others waiting."""
+        """Close a silent client that keeps others waiting."""
         patience, served = self._patience or 0.0, self._served
         self.after(patience / 4, self._look_for_silence)
         others = any(c is not served for c in self.connections)

@@ -1,4 +1,4 @@
-"""PhysicsFramesTimer: time in physics frames; and signals, which tell that something happened."""
+"""PhysicsFramesTimer, which counts physics frames, and Signal, a list of callbacks."""
 
 from __future__ import annotations
 
@@ -7,42 +7,42 @@ from typing import Any, Self
 
 
 class Signal:
-    """Functions that are called when something happens, in the order in which they came."""
+    """Functions to call on an event, in the order of their connection."""
 
     def __init__(self) -> None:
         self._functions: list[Callable[..., Any]] = []
 
     def connect(self, function: Callable[..., Any]) -> None:
-        """Call a function from now on; one that is called already is not called twice."""
+        """Add a function, unless it is connected already."""
         if function not in self._functions:
             self._functions.append(function)
 
     def disconnect(self, function: Callable[..., Any]) -> None:
-        """Call a function no longer; one that is not called is left alone."""
+        """Remove a function, if it is connected."""
         if function in self._functions:
             self._functions.remove(function)
 
     def emit(self, *arguments: Any) -> list[Any]:
-        """Call the functions and return what they return."""
+        """Call the functions and return their results."""
         return [function(*arguments) for function in self._functions]
 
 
 class PhysicsFramesTimer:
-    """Counts physics frames and tells once more of them begin than it was set to.
+    """Counts physics frames and emits a signal when more have begun than its limit.
 
-    Within `RLEnvironment._step` it can be waited for: ``yield timer.start()`` in a generator,
-    ``await timer.start()`` in a coroutine. Physics runs meanwhile.
+    Within `RLEnvironment._step`, ``yield timer.start()`` in a generator or ``await timer.start()``
+    in a coroutine waits for it while physics runs.
 
     Attributes:
-        timer_end: Signal without arguments, when a frame beyond the limit begins.
-        is_started: Whether it counts.
+        timer_end: Signal without arguments, emitted when a frame beyond the limit begins.
+        is_started: Whether it is counting.
     """
 
     def __init__(self, limit: int = 4) -> None:
-        """Keep the limit; `start` begins to count.
+        """Set the limit; `start` begins to count.
 
         Args:
-            limit: How many frames pass until the end, 0 or more.
+            limit: Number of frames until the end, 0 or more.
         """
         self.timer_end = Signal()
         self.is_started = False
@@ -50,16 +50,16 @@ class PhysicsFramesTimer:
         self._count = 0
 
     def set_limit(self, limit: int) -> None:
-        """Set how many frames pass until the end."""
+        """Set the number of frames until the end."""
         self._limit = limit
 
     def start(self) -> Self:
-        """Count from 0 again; return the timer itself."""
+        """Restart from 0; return the timer itself."""
         self._count, self.is_started = 0, True
         return self
 
     def step(self) -> None:
-        """Count a frame that begins."""
+        """Count the frame that begins."""
         if not self.is_started:
             return
         self._count += 1

@@ -1,4 +1,4 @@
-"""Requests: how they are cut out of a stream, read and checked."""
+"""Requests of godot-gym: their boundaries in a stream, parsing and validation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def parse_request(body: bytes) -> dict[str, Any]:
     """Return a request; an empty body is an empty request.
 
     Raises:
-        RequestError: The body is no object of JSON.
+        RequestError: If the body is not a JSON object.
     """
     if not body:
         return {}
@@ -28,35 +28,35 @@ def parse_request(body: bytes) -> dict[str, Any]:
         text = str(body, "utf-8").strip(_BLANKS)
         request, end = _DECODER.raw_decode(text)
         if end != len(text):
-            raise ValueError(f"something follows after {end} characters")
+            raise ValueError(f"extra data after {end} characters")
     except (ValueError, RecursionError) as error:
         raise RequestError(f"A request of {len(body)} bytes is not valid JSON: {error}.") from None
     if not isinstance(request, dict):
         raise RequestError(
-            f'A request is an object of JSON such as {{"reset": 1}}, not {type(request).__name__}.'
+            f'A request must be a JSON object such as {{"reset": 1}}, not {type(request).__name__}.'
         )
     return request
 
 
 def as_object(key: str, value: Any) -> dict[str, Any]:
-    """Return the value of a key that has to be an object.
+    """Return a value that must be a JSON object.
 
     Raises:
-        RequestError: It is none.
+        RequestError: If it is not one.
     """
     if not isinstance(value, dict):
-        raise RequestError(f'The value of "{key}" is an object of JSON, not {value!r:.60}.')
+        raise RequestError(f'The value of "{key}" must be a JSON object, not {value!r:.60}.')
     return value
 
 
 def as_count(key: str, value: Any, least: int = 0) -> int:
-    """Return how many physics frames or steps are meant.
+    """Return a number of physics frames or steps.
 
     Raises:
-        RequestError: It is no whole number, or too small.
+        RequestError: If it is not an integer, or less than `least`.
     """
     if not _is_number(value) or value != int(value) or value < least:
-        raise RequestError(f"{key} is a whole number of at least {least}, not {value!r:.60}.")
+        raise RequestError(f"{key} must be an integer of at least {least}, not {value!r:.60}.")
     return int(value)
 
 
@@ -64,25 +64,25 @@ def as_seed(value: Any) -> int:
     """Return a seed.
 
     Raises:
-        RequestError: It is no whole number of at least 0.
+        RequestError: If it is not a non-negative integer.
     """
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise RequestError(f"A seed is a whole number of at least 0, not {value!r:.60}.")
+        raise RequestError(f"A seed must be a non-negative integer, not {value!r:.60}.")
     return value
 
 
 def as_speed(value: Any) -> float | None:
-    """Return how much faster than the clock time passes; None for as fast as it can.
+    """Return how many times faster than real time to run; None: as fast as possible.
 
     Raises:
-        RequestError: It is no number greater than 0.
+        RequestError: If it is not a positive number or None.
     """
     if value is None:
         return None
     if not _is_number(value) or value <= 0:
         raise RequestError(
-            "time_speed is a number greater than 0, or null for as fast as it can, "
-            f"not {value!r:.60}."
+            "time_speed must be a positive number, or null for as fast as possible, not "
+            f"{value!r:.60}."
         )
     return float(value)
 
@@ -93,13 +93,13 @@ def _is_number(value: Any) -> bool:
 
 
 class JsonReader(BufferReader):
-    """Cuts objects of JSON that follow each other without anything that tells their lengths."""
+    """Splits a stream of JSON objects without length prefixes."""
 
     def __init__(self, limit: int) -> None:
-        """Begin in front of an object.
+        """Begin before an object.
 
         Args:
-            limit: Longest object in bytes that is taken.
+            limit: Size of the longest accepted object in bytes.
         """
         super().__init__()
         self._limit = limit
@@ -110,13 +110,15 @@ class JsonReader(BufferReader):
         """Return the next whole object, or None until more has arrived.
 
         Raises:
-            RemoteProtocolError: What has arrived is no object, or one that is too long.
+            RemoteProtocolError: If the data are not an object, or it is too long.
         """
         if self._depth == 0:
             space = len(self.buffer) - len(self.buffer.lstrip())
             del self.buffer[:space]
             if self.buffer and self.buffer[0] != ord("{"):
-                raise RemoteProtocolError("The other side sent what is no object of JSON.")
+                raise RemoteProtocolError(
+                    "The other side sent something that is not a JSON object."
+                )
         for end in self._ends():
             if end <= self._limit:
                 body = bytes(self.buffer[:end])
@@ -125,16 +127,16 @@ class JsonReader(BufferReader):
                 return body
         if len(self.buffer) > self._limit:
             raise RemoteProtocolError(
-                f"The other side sent more than the {self._limit} bytes that a request may have."
+                f"The other side sent a request of more than {self._limit} bytes."
             )
         return None
 
     def _ends(self) -> Iterator[int]:
-        """Look at what is new; yield where an object ends."""
+        """Scan new data; yield the end of each object."""
         while (found := _PARTS.search(self.buffer, self._looked)) is not None:
             mark, end = found.group(), found.end()
             if mark == b"\\":
-                if end == len(self.buffer):  # what is escaped has not arrived
+                if end == len(self.buffer):  # the escaped character has not arrived
                     self._looked = found.start()
                     return
                 end += 1
