@@ -33,7 +33,7 @@ CALLS = {
     "World().period": "float",
     'EnvironmentConfig("toy/spring").num_clients': "int",
     'Field("x").name': "str",
-    "RobotEnv.step_dt": "",
+    "RobotEnv.step_dt": "float",
     'StoredDataset("folder")': "StoredDataset",
 }
 HEADER = """

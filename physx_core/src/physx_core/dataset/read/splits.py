@@ -44,7 +44,7 @@ class SubsetField:
     def __len__(self) -> int:
         return len(self._rows)
 
-    def __getitem__(self, rows: Any) -> Any:
+    def __getitem__(self, rows: Any) -> Array:
         chosen = self._rows[rows]
         return self._view[int(chosen) if chosen.ndim == 0 else chosen]
 

@@ -41,12 +41,13 @@ class FieldView:
     def __len__(self) -> int:
         return self._reader.rows(self._mode)
 
-    def __getitem__(self, rows: Any) -> Any:
+    def __getitem__(self, rows: Any) -> Array:
         if isinstance(rows, (int, np.integer)) and not isinstance(rows, bool):
             row = int(rows) + (len(self) if rows < 0 else 0)
             if not 0 <= row < len(self):
                 raise IndexError(f"Row {rows} is out of range: there are {len(self)} rows.")
-            return self._read(row, row + 1)[0]
+            single: Array = self._read(row, row + 1)[0]
+            return single
         if isinstance(rows, slice):
             start, stop, step = rows.indices(len(self))
             if step == 1:
