@@ -315,7 +315,7 @@ CONNECTED = [
     ({"action_space": 3}, "not a gymnasium.Space"),
     ({"requested_observation": ["state"]}, "must be a dictionary"),
     ({"repeat_action": -1}, "repeat_action must be an integer"),
-    ({"time_speed": "fast"}, "time_speed is a number"),
+    ({"time_speed": "fast"}, "time_speed must be a positive"),
 ]
 
 
