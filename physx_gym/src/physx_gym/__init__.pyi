@@ -11,10 +11,10 @@ from .blocks import PDController as PDController
 from .blocks import QuantityObserver as QuantityObserver
 from .bridge.gym_environment import GymEnvironment as GymEnvironment
 from .bridge.policy import Policy as Policy
+from .env.layers.block_layers import ControlledEnv as ControlledEnv
+from .env.layers.block_layers import ObservedEnv as ObservedEnv
 from .env.layers.composed import ComposedEnv as ComposedEnv
-from .env.layers.controlled import ControlledEnv as ControlledEnv
 from .env.layers.layer import Layer as Layer
-from .env.layers.observed import ObservedEnv as ObservedEnv
 from .env.pipeline_env import PipelineEnv as PipelineEnv
 from .env.robot_env import RobotEnv as RobotEnv
 from .pipeline.recipe import build_pipeline as build_pipeline

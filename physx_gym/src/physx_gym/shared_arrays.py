@@ -1,4 +1,4 @@
-"""Pickling and copying objects whose arrays are parts of each other's memory."""
+"""Pickling and copying of objects whose arrays are views of each other."""
 
 from __future__ import annotations
 
@@ -10,15 +10,7 @@ from numpy.typing import NDArray
 
 
 class Window:
-    """A part of an array's memory, written with the array; so it is a part of it again when read.
-
-    Attributes:
-        whole: The array that owns the memory.
-        offset: Where the part begins, in bytes.
-        shape: Of the part.
-        strides: Of the part, in bytes.
-        dtype: Of the part.
-    """
+    """A view of an array, pickled with the array, so that it is a view again afterwards."""
 
     def __init__(self, whole: NDArray[Any], part: NDArray[Any]) -> None:
         self.whole = whole
@@ -26,34 +18,31 @@ class Window:
         self.shape, self.strides, self.dtype = part.shape, part.strides, part.dtype
 
     def open(self) -> NDArray[Any]:
-        """Return the part of the array as it is now."""
+        """Return the view."""
         return np.ndarray(self.shape, self.dtype, self.whole, self.offset, self.strides)
 
 
 class SharedArrays:
-    """Pickled and copied with arrays that stay parts of each other, in attributes and containers.
-
-    Subclasses name in `_left_out` what is made anew by whoever reads them.
-    """
+    """An object that is pickled so that views of its arrays, also in containers, stay views."""
 
     _left_out: ClassVar[frozenset[str]] = frozenset()
-    """Attributes that are not written."""
+    """Attributes that are not pickled; they become None."""
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes, parts of arrays as windows."""
+        """Return the attributes, with windows instead of views."""
         kept = {name: value for name, value in vars(self).items() if name not in self._left_out}
-        return {name: _closed(value) for name, value in kept.items()}
+        return {name: _close(value) for name, value in kept.items()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take up the attributes; those that were not written are None."""
+        """Restore the attributes."""
         self.__dict__.update(dict.fromkeys(self._left_out))
-        self.__dict__.update({name: _opened(value) for name, value in state.items()})
+        self.__dict__.update({name: _open(value) for name, value in state.items()})
 
 
-def _closed(value: Any) -> Any:
-    """Return a value with a window in the place of each part of another array."""
+def _close(value: Any) -> Any:
+    """Return a value with windows instead of views."""
     if type(value) is not np.ndarray:
-        return _mapped(_closed, value)
+        return _map(_close, value)
     whole = value
     while type(whole.base) is np.ndarray:
         whole = whole.base
@@ -61,13 +50,13 @@ def _closed(value: Any) -> Any:
     return Window(whole, value) if owns and whole is not value else value
 
 
-def _opened(value: Any) -> Any:
-    """Return a value with the parts of arrays in the place of their windows."""
-    return value.open() if isinstance(value, Window) else _mapped(_opened, value)
+def _open(value: Any) -> Any:
+    """Return a value with views instead of windows."""
+    return value.open() if isinstance(value, Window) else _map(_open, value)
 
 
-def _mapped(function: Callable[[Any], Any], value: Any) -> Any:
-    """Return a container with its values changed by a function; itself, where none changes."""
+def _map(function: Callable[[Any], Any], value: Any) -> Any:
+    """Apply a function to the values of a container; return itself if none changes."""
     if type(value) is dict:
         changed = {key: function(each) for key, each in value.items()}
         same = all(changed[key] is each for key, each in value.items())

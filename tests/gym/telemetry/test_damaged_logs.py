@@ -168,7 +168,7 @@ def test_no_code_of_a_file_is_run(tmp_path):
     for reference in (f"{script}:Backend", "evil:Backend", ["dart"]):
         log = Log({**data["constants"], "backend": reference}, data["variables"])
         log.write(tmp_path / "a.h5")
-        with pytest.raises(LogError, match="is no installed plugin"):
+        with pytest.raises(LogError, match="is not an installed plugin"):
             replay(tmp_path / "a.h5", path=tmp_path / "a.rrd")
     assert not (tmp_path / "ran").exists()
 

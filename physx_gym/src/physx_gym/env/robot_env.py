@@ -165,11 +165,7 @@ class RobotEnv(PipelineEnv):
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
         """Update `observation` in place: by default it is the measurement.
 
-        Called every `observe_dt` and at the end of each step and reset. Rely on nothing but
-        `measurement` for the state.
-
-        Args:
-            measurement: The latest measurement: ``t``, ``states``, ``measurements``.
+        See `PipelineEnv.refresh_observation`. Rely on nothing but `measurement` for the state.
         """
         if self._flat_observation is not None:
             self.simulator.values.take(self._observed_index, None, self._flat_observation, "clip")
@@ -177,12 +173,8 @@ class RobotEnv(PipelineEnv):
     def compute_command(self, action: Any, command: Vector) -> None:
         """Write the torques of the motors, in place: by default the action.
 
-        Called every `control_dt`, and never before the first step.
-
-        Args:
-            action: The buffer `action`, within its space.
-            command: Torques of the motors' shafts, shape (motors,), in N m or N; the motors clip
-                them.
+        See `PipelineEnv.compute_command`. Never called before the first step; the motors clip the
+        torques.
         """
         command[:] = action
 
@@ -191,10 +183,7 @@ class RobotEnv(PipelineEnv):
 
         By default nothing terminates, and an observation outside of its space truncates. Episodes
         longer than `simulation_duration_max` are truncated in any case. Called after `observation`
-        was updated.
-
-        Args:
-            info: Information of this step, to be extended.
+        was updated; see `PipelineEnv.has_terminated`.
 
         Raises:
             EpisodeError: If no episode runs.
@@ -213,11 +202,7 @@ class RobotEnv(PipelineEnv):
     def compute_reward(self, terminated: bool, info: Info) -> float:
         """Return the reward of this step: by default 0.
 
-        Called once a step after `has_terminated`.
-
-        Args:
-            terminated: Whether this step terminated the episode.
-            info: Information of this step, to be extended.
+        Called once a step after `has_terminated`; see `PipelineEnv.compute_reward`.
         """
         return 0.0
 
@@ -248,10 +233,7 @@ class RobotEnv(PipelineEnv):
         return positions, np.zeros(len(self.robot_state.v))
 
     def _initialize_buffers(self) -> None:
-        """Prepare for the episode: the simulation runs, but nothing is observed yet.
-
-        Called once at every reset, before `_refresh_buffers`.
-        """
+        """Prepare for the episode; called once at every reset, before `_refresh_buffers`."""
 
     def _refresh_buffers(self) -> None:
         """Update what `has_terminated` and `compute_reward` share.
@@ -333,15 +315,11 @@ class RobotEnv(PipelineEnv):
 
     @property
     def training(self) -> bool:
-        """Whether this is for training; otherwise for evaluation, where episodes are recorded."""
+        """Whether this is for training; see `PipelineEnv.training`."""
         return self._is_training
 
     def train(self, mode: bool = True) -> None:
-        """Switch between training and evaluation.
-
-        Raises:
-            EpisodeError: If an episode runs.
-        """
+        """Switch between training and evaluation; see `PipelineEnv.train`."""
         if bool(mode) is not self._is_training and self.is_simulation_running:
             raise EpisodeError("An episode runs: call stop() before train() or eval().")
         self._is_training = bool(mode)

@@ -24,25 +24,24 @@ def construct_next(kind: type[Any], env: Any, options: Mapping[str, Any]) -> Non
         UnknownOptionError: If there are options, but no class takes them.
     """
     order = type(env).__mro__
-    after = order[order.index(kind) + 1 :]
-    takes = [each for each in after if "__init__" in vars(each) and each is not object]
-    if options and not takes:
-        raise UnknownOptionError(type(env).__name__, options, _names(kind, type(env)))
+    place = order.index(kind) + 1
+    accepting = [each for each in order[place:-1] if "__init__" in vars(each)]
+    if options and not accepting:
+        raise UnknownOptionError(type(env).__name__, options, _options(order[:place]))
     super(kind, env).__init__(**options)
 
 
-def _names(kind: type[Any], own: type[Any]) -> list[str]:
-    """Return the options of a class; of those that it passes on, the ones with a default."""
+def _options(kinds: Sequence[type[Any]]) -> list[str]:
+    """Return the options of the first of some classes; of the others, those with a default."""
     found: dict[str, None] = {}
-    for each in own.__mro__[: own.__mro__.index(kind) + 1]:
-        if "__init__" not in vars(each):
-            continue
-        first = not found
-        parameters = [*inspect.signature(vars(each)["__init__"]).parameters.values()][1:]
-        several = [one for one in parameters if one.kind in (one.VAR_KEYWORD, one.VAR_POSITIONAL)]
-        named = [one for one in parameters if one not in several]
-        found |= {one.name: None for one in named if first or one.default is not one.empty}
-        if not several:
+    for each in (kind for kind in kinds if "__init__" in vars(kind)):
+        first, passes_on = not found, False
+        for one in [*inspect.signature(vars(each)["__init__"]).parameters.values()][1:]:
+            if one.kind in (one.VAR_KEYWORD, one.VAR_POSITIONAL):
+                passes_on = True
+            elif first or one.default is not one.empty:
+                found[one.name] = None
+        if not passes_on:
             break
     return list(found)
 

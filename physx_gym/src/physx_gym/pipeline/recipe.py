@@ -13,8 +13,7 @@ from typing import Any
 from physx_core.config import read_toml
 from physx_core.errors import ConfigError, ConfigFileError
 from physx_gym.blocks.block import ControllerBlock, ObserverBlock
-from physx_gym.env.layers.controlled import ControlledEnv
-from physx_gym.env.layers.observed import ObservedEnv
+from physx_gym.env.layers.block_layers import ControlledEnv, ObservedEnv
 from physx_gym.pipeline.tables import build, check_table, find, find_environment
 
 

@@ -1,4 +1,4 @@
-"""A simulated world as a scene: what a viewer draws of it, and how it moves."""
+"""Drawing of simulated worlds."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physx_core.components import Factory
+from physx_core.rotations import rotate_rows
 from physx_core.simulation import (
     Backend,
     Box,
@@ -49,15 +50,15 @@ class WorldDrawing:
         *,
         follow: bool = True,
     ) -> None:
-        """Keep what is to be drawn; `add` draws it.
+        """Keep the world; `add` draws it.
 
         Args:
-            factory: What to draw with.
-            world: What to draw.
-            backend: Engine that knows the robots' names.
+            factory: Factory to draw with.
+            world: The world to draw.
+            backend: Engine that provides the robots given by name.
             layout: Order of the bodies.
-            title: What stands above the window.
-            follow: Whether the camera moves along with the first robot whose base floats.
+            title: Title of the window.
+            follow: Whether the camera follows the first robot whose base floats.
         """
         self._factory, self._world, self._layout, self._backend = factory, world, layout, backend
         floating = (robot.name for robot in world.robots if not robot.fixed_base)
@@ -79,7 +80,7 @@ class WorldDrawing:
             self._add_object(each, self._pose(each, poses))
 
     def move(self, poses: Vector) -> None:
-        """Bring everything that moves to its place; see `add`."""
+        """Move everything to its present pose; see `add`."""
         parts, factory = self._layout.parts, self._factory
         for robot in self._world.robots:
             factory.update_robot(robot.name, poses=poses[parts[robot.name].bodies])
@@ -88,13 +89,13 @@ class WorldDrawing:
                 self._move_object(each, self._pose(each, poses))
 
     def close(self) -> None:
-        """Delete what was only there to be drawn."""
+        """Delete temporary files."""
         if self._folder is not None:
             self._folder.cleanup()
             self._folder = None
 
     def _pose(self, each: WorldObject, poses: Vector) -> Vector:
-        """Return where an object is: x, y, z and quaternion x, y, z, w."""
+        """Return the pose of an object: x, y, z and quaternion x, y, z, w."""
         if each.static:
             return np.array([*each.position, *each.orientation])
         pose: Vector = poses[self._layout.parts[each.name].bodies.start]
@@ -108,7 +109,7 @@ class WorldDrawing:
         self._factory.add_robot(robot.name, urdf, names, package_dirs=packages, poses=poses)
 
     def _model(self, urdf: str | Path) -> Path:
-        """Return the file of a robot, which may be given by a name that the backend knows."""
+        """Return the file of a robot, which may be given by its name in the backend."""
         path = Path(urdf)
         if isinstance(urdf, Path) or urdf.lower().endswith(".urdf") or path.is_file():
             return path
@@ -122,7 +123,7 @@ class WorldDrawing:
             factory.add_robot(each.name, urdf, ["mesh"], color=color, poses=pose[None])
         elif isinstance(each, Cylinder):
             points, cells = cylinder(each.radius, each.length)
-            factory.add_mesh(each.name, _moved(points, pose), cells, color=color)
+            factory.add_mesh(each.name, _transform(points, pose), cells, color=color)
         else:
             look: dict[str, Any] = {"position": pose[:3], "orientation": pose[3:], "color": color}
             if isinstance(each, Box):
@@ -133,7 +134,7 @@ class WorldDrawing:
                 factory.add_capsule(each.name, each.radius, each.length, **look)
 
     def _as_robot(self, each: Mesh) -> Path:
-        """Return a URDF file with a mesh, as that is the form in which viewers load mesh files."""
+        """Return a URDF file of a mesh, as viewers load mesh files in this form."""
         if self._folder is None:
             self._folder = TemporaryDirectory(prefix="physx-drawing-")
         file = Path(self._folder.name) / f"{len(list(Path(self._folder.name).iterdir()))}.urdf"
@@ -147,7 +148,7 @@ class WorldDrawing:
             factory.update_robot(each.name, poses=pose[None])
         elif isinstance(each, Cylinder):
             corners = cylinder(each.radius, each.length)[0]
-            factory.update_mesh(each.name, positions=_moved(corners, pose))
+            factory.update_mesh(each.name, positions=_transform(corners, pose))
         else:
             place = {"position": pose[:3], "orientation": pose[3:]}
             if isinstance(each, Box):
@@ -168,7 +169,7 @@ def _add_ground(factory: Factory, ground: Ground | Stairs | HeightField) -> None
             half = 0.5 * np.array(size)
             factory.add_box(f"stairs/{number}", half, position=center, color=_RESTING)
     normal = np.array(plane.normal)
-    # Slightly below what it stands for, so that a viewer's own grid stays visible.
+    # Slightly below the ground, so that a viewer's own grid stays visible.
     place = normal * (plane.height - 0.5 * _THICKNESS - 1e-3)
     look: dict[str, Any] = {"position": place, "orientation": _upright(normal), "color": _GROUND}
     factory.add_box("ground", (_REACH, _REACH, 0.5 * _THICKNESS), **look)
@@ -183,7 +184,7 @@ def _upright(normal: Vector) -> Vector:
 
 
 def _field(ground: HeightField) -> tuple[Vector, NDArray[np.int32]]:
-    """Return vertices and triangles of a field of heights."""
+    """Return vertices and triangles of a height field."""
     nx, ny = ground.heights.shape
     begin, spacing = ground.corner(), ground.spacing
     x, y = (begin[i] + spacing[i] * np.arange(n) for i, n in enumerate((nx, ny)))
@@ -212,9 +213,6 @@ def cylinder(radius: float, length: float) -> tuple[Vector, NDArray[np.int32]]:
     return points, cells.astype(np.int32)
 
 
-def _moved(points: Vector, pose: Vector) -> Vector:
+def _transform(points: Vector, pose: Vector) -> Vector:
     """Return points, shape (n, 3), at a pose: x, y, z and quaternion x, y, z, w."""
-    axis, w = pose[3:6], pose[6]
-    across = 2 * np.cross(axis, points)
-    moved: Vector = points + w * across + np.cross(axis, across) + pose[:3]
-    return moved
+    return rotate_rows(pose[3:], points) + pose[:3]

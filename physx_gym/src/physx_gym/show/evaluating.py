@@ -57,7 +57,16 @@ def evaluate(
     env.stop()
     env.train(False)
     try:
-        _run(env, policy_fn, seed, steps, rewards, infos)
+        observation, info = env.reset(seed=seed)
+        infos.append(info)
+        action, reward, terminated, truncated = None, None, False, False
+        while True:
+            action = policy_fn(observation, action, reward, terminated, truncated, info)
+            if terminated or truncated or len(rewards) >= steps:
+                break
+            observation, reward, terminated, truncated, info = env.step(action)
+            rewards.append(reward)
+            infos.append(info)
     except KeyboardInterrupt:
         pass  # the user has seen enough
     finally:
@@ -89,24 +98,3 @@ def _check(policy_fn: Any) -> None:
             "The policy is called with observation, previous action, reward, terminated, truncated "
             f"and information, and returns an action; {policy_fn!r} cannot be: {error}."
         ) from error
-
-
-def _run(
-    env: Playable,
-    policy_fn: PolicyFn,
-    seed: int | None,
-    steps: float,
-    rewards: list[float],
-    infos: list[Info],
-) -> None:
-    """Run an episode; rewards and information are appended, so that they survive Ctrl-C."""
-    observation, info = env.reset(seed=seed)
-    infos.append(info)
-    action, reward, terminated, truncated = None, None, False, False
-    while True:
-        action = policy_fn(observation, action, reward, terminated, truncated, info)
-        if terminated or truncated or len(rewards) >= steps:
-            return
-        observation, reward, terminated, truncated, info = env.step(action)
-        rewards.append(reward)
-        infos.append(info)

@@ -1,4 +1,4 @@
-"""Plots of what was recorded: one figure of many, for one log or for several to compare."""
+"""Plots of logs: one figure with a plot for each group of columns."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _WIDTH, _HEIGHT = 5.0, 2.6  # of each plot, in inches
 _COLUMNS = 3
-_LEGEND = 8  # so many names fit into a plot
+_LEGEND = 8  # number of names that fit into a plot
 _STYLES: tuple[Any, ...] = ("-", "--", ":", "-.")
 _ORDER = ("state.q", "state.v", "state.a", "sensor", "motor", "action")
 
@@ -37,22 +37,22 @@ def plot(
     """Plot columns over time: states, sensors, motors, then registered variables.
 
     Args:
-        logs: Logs, their files, or what `RobotEnv.log_data` gave; one or several.
+        logs: Logs, their files, or values of `RobotEnv.log_data`; one or several.
         enable_block_states: Whether states of blocks are shown too.
-        compare: More logs. Several are drawn into the same plots, each with its own kind of line.
-        columns: Only those whose names begin so: one text or several.
+        compare: More logs. All are drawn into the same plots, each with its own line style.
+        columns: Prefixes of the names of the columns to plot: one or several.
         path: File to write, for example ``.png`` or ``.pdf``.
-        show: Whether to open a window; None: where there is a display and no path.
+        show: Whether to open a window; None: if there is a display and no path.
 
     Returns:
         The figure.
 
     Raises:
-        LogError: A log cannot be read, or there is nothing to plot.
-        MissingLibraryError: Matplotlib is not installed; the message says how to install it.
+        LogError: If a log cannot be read, or there is nothing to plot.
+        MissingLibraryError: If Matplotlib is not installed.
     """
     chosen = as_logs(logs, compare)
-    groups = groups_of(chosen, columns, enable_block_states)
+    groups = _groups(chosen, columns, enable_block_states)
     if show is None:
         show = path is None and has_display()
     figure = _figure(len(groups), show)
@@ -70,20 +70,17 @@ def plot(
     return figure
 
 
-def groups_of(
+def _groups(
     logs: Sequence[Log], columns: str | Iterable[str] | None, enable_block_states: bool
 ) -> Groups:
-    """Return which columns are drawn into which plot, by its title.
-
-    Raises:
-        LogError: There are none.
-    """
+    """Return the columns of each plot by its title."""
     wanted = (columns,) if isinstance(columns, str) else tuple(columns or ("",))
     known = list(dict.fromkeys(name for log in logs for name in log.variables if name != TIME))
     groups: Groups = {}
     for name in known:
-        if name.startswith(wanted) and (enable_block_states or not is_block_state(name)):
-            groups.setdefault(_group(name), []).append(name)
+        is_block_state = not name.startswith("state.") and ".state." in name
+        if name.startswith(wanted) and (enable_block_states or not is_block_state):
+            groups.setdefault(_title(name), []).append(name)
     if not groups:
         first = {name.partition(".")[0] for name in known}
         raise LogError(
@@ -93,15 +90,10 @@ def groups_of(
     return dict(sorted(groups.items(), key=lambda group: _rank(group[0])))
 
 
-def is_block_state(name: str) -> bool:
-    """Return whether a column is of a block's state: ``<block>.state. ...``."""
-    return not name.startswith("state.") and ".state." in name
-
-
-def _group(name: str) -> str:
+def _title(name: str) -> str:
     """Return the title of the plot that a column belongs to.
 
-    Sensors of a kind share a plot for each quantity; everything else is by the name's beginning.
+    Sensors of a kind share a plot for each quantity; everything else is grouped by prefix.
     """
     parts = name.split(".")
     if parts[0] == "state" and parts[-1] in (*BASE_POSITION, *BASE_VELOCITY):
@@ -116,7 +108,7 @@ def _group(name: str) -> str:
 
 
 def _label(name: str, title: str) -> str:
-    """Return what a curve is called in its plot: the column's name without the plot's."""
+    """Return the label of a curve: the name of its column without the title of the plot."""
     if title.startswith("sensor."):
         kind, _, quantity = title.rpartition(".")
         rest = name.removeprefix(f"{kind}.")
@@ -131,7 +123,7 @@ def _rank(title: str) -> int:
 
 
 def _figure(count: int, show: bool) -> Figure:
-    """Return a figure with plots; one that is not shown needs no window system."""
+    """Return a figure with plots; without a window system if it is not shown."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -140,16 +132,14 @@ def _figure(count: int, show: bool) -> Figure:
     high = -(-count // wide)
     size = (wide * _WIDTH, high * _HEIGHT)
     options: dict[str, Any] = {"figsize": size, "layout": "constrained"}
-    figure = _window(options) if show else Figure(**options)
+    if show:
+        from matplotlib import pyplot as plt
+
+        figure: Figure = plt.figure(**options)
+    else:
+        figure = Figure(**options)
     for number in range(count):
         figure.add_subplot(high, wide, number + 1)
-    return figure
-
-
-def _window(options: dict[str, Any]) -> Figure:
-    from matplotlib import pyplot as plt
-
-    figure: Figure = plt.figure(**options)
     return figure
 
 

@@ -1,4 +1,4 @@
-"""Replaying: recorded episodes in a viewer, in a recording's file, or as a film."""
+"""Replays of logs: in a viewer, in a file for a viewer, or as a film."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ def replay(
     backend: Any = None,
     **viewer: Any,
 ) -> Path | None:
-    """Show episodes side by side, all from their beginning.
+    """Show episodes side by side, all from their start.
 
     Without a path they are shown in a viewer's window.
 
     Args:
-        logs: Logs, their files, or what `RobotEnv.log_data` gave; one or several.
+        logs: Logs, their files, or values of `RobotEnv.log_data`; one or several.
         compare: More of them.
         path: Recording to write for the viewer, ``.rrd``.
         record_video_path: Film to write: ``.gif``, ``.webp`` or ``.png``.
-        frame_rate: Frames for each simulated second. The viewer plays 30 a second.
-        backend: Reference of the engine that knows the robots' links; None: the log's.
+        frame_rate: Frames per simulated second. The viewer plays 30 per second.
+        backend: Reference of the engine that provides the robots; None: the log's.
         viewer: Options of the viewer, as in ``RobotEnv.viewer_kwargs``.
 
     Returns:
-        The file, None where none is written.
+        The written file; None if there is none.
 
     Raises:
-        LogError: A log cannot be read, or holds no states.
-        PluginNotFoundError: The viewer is not installed; the message says how to install it.
-        VisualizerError: The viewer cannot be opened, or cannot draw.
-        ConfigError: An option makes no sense.
+        LogError: If a log cannot be read, or contains no states.
+        PluginNotFoundError: If the viewer is not installed.
+        VisualizerError: If the viewer cannot be opened, or cannot draw.
+        ConfigError: If an option is invalid.
     """
     checks.positive("frame_rate", frame_rate)
     chosen = as_logs(logs, compare)
@@ -79,7 +79,7 @@ def replay(
 def _frames(
     shown: Visualizer, motions: Sequence[_Motion], count: int, frame_rate: float
 ) -> Iterator[Visualizer]:
-    """Draw one frame after another."""
+    """Draw the frames one by one."""
     for frame in range(count):
         for motion in motions:
             motion.draw(shown, frame, frame / frame_rate)
@@ -89,15 +89,15 @@ def _frames(
 def _picture(shown: Visualizer) -> Picture:
     picture = shown.capture()
     if picture is None:
-        raise VisualizerError(f"{type(shown).__name__} makes no pictures, so there is no film.")
+        raise VisualizerError(f"{type(shown).__name__} cannot render pictures for a film.")
     return picture
 
 
 class _Motion:
-    """A log on its way to a viewer."""
+    """The motion in a log, drawn frame by frame."""
 
     def __init__(self, number: int, log: Log, backend: Any) -> None:
-        """Work out where all bodies are."""
+        """Rebuild the world of the log."""
         self._number = number
         states = log.trajectory()
         self._times, self._positions = states.times, states.positions
@@ -108,14 +108,14 @@ class _Motion:
         if layout.nq != self._positions.shape[1]:
             raise LogError(
                 f'The log "{log.label}" has {self._positions.shape[1]} positions, but its world '
-                f"has {layout.nq}: the robot's file is another one than it was."
+                f"has {layout.nq}: the robot's file has changed since."
             )
         self._factory = Factory()
         title = f"{number}: {log.label}"
         self._drawing = WorldDrawing(self._factory, world, engine, layout, title)
 
     def draw(self, shown: Visualizer, frame: int, time: float) -> None:
-        """Draw what was at a time after the beginning, in s."""
+        """Draw the state at a time after the start, in s."""
         moment = self._times[0] + time + 1e-9
         row = max(int(np.searchsorted(self._times, moment, "right")) - 1, 0)
         poses = self._simulation.body_poses(None, self._positions[row])
@@ -126,7 +126,7 @@ class _Motion:
         shown.events(self._number, frame, self._factory.take_events())
 
     def close(self) -> None:
-        """Free what it took."""
+        """Free its resources."""
         self._drawing.close()
         self._simulation.close()
 
@@ -137,8 +137,8 @@ def _backend(log: Log, given: Any) -> Backend:
     is_told = given is not None or log.path is None
     if not is_told and not (isinstance(reference, str) and ":" not in reference):
         raise LogError(
-            f"The log {log.path} is of the engine {reference!r}, which is no installed plugin. If "
-            'you trust it, name it: replay(..., backend="...").'
+            f"The log {log.path} is of the engine {reference!r}, which is not an installed plugin. "
+            'If you trust it, name it: replay(..., backend="...").'
         )
     found: Backend = plugins.resolve("backend", reference)
     return found

@@ -1,4 +1,4 @@
-"""Layers that run a block."""
+"""Layers that run a block: observers and controllers."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from physx_core.typing import Vector
 from physx_gym.blocks.block import ControllerBlock, ObserverBlock
 from physx_gym.env.layers.layer import Layer
 from physx_gym.env.pipeline_env import PipelineEnv
+from physx_gym.spaces import neutral
 
 
 class Schedule:
@@ -132,6 +133,99 @@ class BlockLayer(Layer):
         self.observation_space, self.observation = add_part(
             self.observation_space, self.observation, (group, self.block.name), space, value
         )
+
+
+class ObservedEnv(BlockLayer):
+    """Adds an observer's features to the observation, as ``features.<block>``.
+
+    The observer's state, if it has one, is added as ``states.<block>``.
+
+    Attributes:
+        observer: The block.
+    """
+
+    def __init__(self, env: PipelineEnv, observer: ObserverBlock) -> None:
+        """Put an observer on the environment that it was created for.
+
+        Raises:
+            ConfigError: If it is not an observer, was created for another environment, or its name
+                is taken.
+        """
+        if not isinstance(observer, ObserverBlock):
+            raise ConfigError(f"ObservedEnv needs an ObserverBlock, not {observer!r}.")
+        self.observer = observer
+        super().__init__(env, observer)
+
+    @property
+    def observe_dt(self) -> float:  # type: ignore[override]
+        """Time between two observations of the block, in s."""
+        return self.observer.period or self.env.observe_dt
+
+    def _add_parts(self) -> None:
+        observer = self.observer
+        self._add_part("features", observer.observation_space, observer.observation)
+        self.register_variable("feature", observer.observation, observer.fieldnames, observer.name)
+
+    def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
+        """Update the observation of the layers below, then run the block, if it is due."""
+        schedule = self._schedule
+        schedule.observe(measurement)
+        frame = schedule.stepper.iter
+        if frame != schedule.last and frame % schedule.every == 0:
+            schedule.last = frame
+            schedule.run(measurement)
+
+
+class ControlledEnv(BlockLayer):
+    """Takes a controller's actions instead of those of the environment below.
+
+    The controller's state, if it has one, is added to the observation as ``states.<block>``, and,
+    with `augment_observation`, its action as ``actions.<block>``.
+
+    Attributes:
+        controller: The block.
+        augment_observation: Whether the action is observed.
+    """
+
+    def __init__(
+        self, env: PipelineEnv, controller: ControllerBlock, augment_observation: bool = False
+    ) -> None:
+        """Put a controller on the environment that it was created for.
+
+        Raises:
+            ConfigError: If it is not a controller, was created for another environment, or its name
+                is taken.
+        """
+        if not isinstance(controller, ControllerBlock):
+            raise ConfigError(f"ControlledEnv needs a ControllerBlock, not {controller!r}.")
+        self.controller, self.augment_observation = controller, augment_observation
+        super().__init__(env, controller)
+
+    @property
+    def control_dt(self) -> float:  # type: ignore[override]
+        """Time between two commands of the block, in s."""
+        return self.controller.period or self.env.control_dt
+
+    def _initialize_actions(self) -> None:
+        controller = self.controller
+        if self._build >= 0 and self.action_space is controller.action_space:
+            return
+        self.action_space = controller.action_space
+        self.action = neutral(self.action_space)
+        self.register_variable("action", self.action, controller.fieldnames, controller.name)
+
+    def _add_parts(self) -> None:
+        if self.augment_observation:
+            self._add_part("actions", self.action_space, self.action)
+
+    def compute_command(self, action: Any, command: Vector) -> None:
+        """Run the block, if it is due, then let the layer below command the motors."""
+        schedule = self._schedule
+        target, frame = schedule.target, schedule.stepper.iter
+        if frame != schedule.last and frame % schedule.every == 0:
+            schedule.last = frame
+            schedule.run(action, target)
+        schedule.act(target, command)
 
 
 def add_part(
