@@ -1,4 +1,4 @@
-"""The page about environments: its files and its code, as a program of its own."""
+"""docs/gym.md: its files are written, and its code runs as a program."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ import pytest
 from physx_core.config import read_toml
 from physx_gym import RobotEnv, read_log
 
-PAGE = Path(__file__).parents[2] / "docs" / "gym.md"
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "gym.md"
+README = ROOT / "physx_gym" / "README.md"
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -51,14 +53,20 @@ def test_all_code_of_the_page_runs(page, tmp_path):
     assert len(read_toml(tmp_path / "walker.toml")["layers_config"]) == 4
 
 
-def test_the_table_lists_what_is_registered(page):
-    assert re.findall(r"^\| `(physx/\w+-v0)`", page, re.MULTILINE) == [
+def test_the_example_of_the_readme_runs():
+    [code] = [text for kind, text in BLOCK.findall(README.read_text()) if kind == "python"]
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=100)
+
+
+@pytest.mark.parametrize("path", [PAGE, README])
+def test_the_tables_list_what_is_registered(path):
+    assert re.findall(r"^\| `(physx/\w+-v0)`", path.read_text(), re.MULTILINE) == [
         each for each in gymnasium.registry if each.startswith("physx/")
     ]
 
 
 def test_names_of_methods_exist(page):
-    named = set(re.findall(r"`(_?[a-z]+(?:_[a-z]+)+)`", page.split("## What is called when")[1]))
+    named = set(re.findall(r"`(_?[a-z]+(?:_[a-z]+)+)`", page.split("## Order of calls")[1]))
     assert {name for name in named if not hasattr(RobotEnv, name)} == {
         "control_dt", "observe_dt", "reset_options",
     } & named  # fmt: skip
