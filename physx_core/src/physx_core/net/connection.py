@@ -89,8 +89,10 @@ class Connection:
         """
         sent = 0
         if not self.outgoing:
-            with contextlib.suppress(BlockingIOError):
+            try:
                 sent = self.socket.send(parts[0]) if len(parts) == 1 else self.socket.sendmsg(parts)
+            except BlockingIOError:
+                sent = 0
             if len(parts) == 1 and sent == len(parts[0]):
                 return
         for part in parts:

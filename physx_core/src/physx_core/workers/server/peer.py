@@ -121,8 +121,10 @@ class Peer(Connection):
             self.outgoing += message
             self.flush()
         else:
-            with contextlib.suppress(OSError):  # reading finds its end
+            try:
                 self.write(message)
+            except OSError:  # reading finds its end
+                self.outgoing.clear()
         self.heard = time.monotonic()  # its time to react begins now
 
     def flush(self) -> int:
