@@ -1,7 +1,7 @@
-"""What the dataset asks of the file system: whole writes, atomic replacement, the writers' locks.
+"""File operations of datasets: complete writes, atomic replacement, and the writers' locks.
 
-No link is ever followed, and nothing but regular files is opened: a dataset may come from a
-stranger.
+No link is ever followed, and only regular files are opened: a dataset may come from an untrusted
+source.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from physx_core.errors import DatasetError, DatasetLockedError
 from physx_core.typing import Array
 
 LOCK = "dataset.lock"
-TURN = "dataset.json.lock"
+MANIFEST_LOCK = "dataset.json.lock"
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Error numbers that say: nothing more can be stored here."""
+"""Error numbers of a disk that is full, a quota or a file size that is reached."""
 
 _SAFELY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 @contextlib.contextmanager
 def storing(what: str) -> Iterator[None]:
-    """Turn the system's errors into a `DatasetError` that says what could not be stored."""
+    """Translate the system's errors into a `DatasetError` that says what could not be stored."""
     try:
         yield
     except OSError as error:
-        raise not_stored(what, error, "All rows committed before") from error
+        raise storage_error(what, error, "All rows committed before") from error
 
 
-def not_stored(what: str, error: OSError, safe: str) -> DatasetError:
+def storage_error(what: str, error: OSError, safe: str) -> DatasetError:
     """Return the error for something that could not be stored.
 
     Args:
-        what: What it was.
-        error: What the system says.
-        safe: What is intact all the same.
+        what: What was to be stored.
+        error: The system's error.
+        safe: What is intact nevertheless.
     """
     full = error.errno in FULL
     reason = "the disk is full" if full else (error.strerror or str(error))
-    advice = " Free some space and go on, or open the dataset again." if full else ""
+    advice = " Free some space and continue, or open the dataset again." if full else ""
     return DatasetError(f"{what} cannot be stored: {reason}. {safe} are intact.{advice}")
 
 
@@ -52,31 +52,31 @@ def open_regular(path: Path | str, flags: int = os.O_RDONLY) -> int:
     """Open a file and return its descriptor.
 
     Raises:
-        OSError: It cannot be opened, or is a link, a folder, a pipe or a device.
+        OSError: If it cannot be opened, or is a link, a folder, a pipe or a device.
     """
     try:
         descriptor = os.open(path, flags | _SAFELY, 0o666)
     except OSError as error:
         if error.errno in (errno.ELOOP, errno.ENXIO):
-            error.strerror = "it is a link or no regular file"
+            error.strerror = "it is not a regular file"
         raise
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise OSError(errno.EINVAL, "it is a link or no regular file", str(path))
+        raise OSError(errno.EINVAL, "it is not a regular file", str(path))
     return descriptor
 
 
 def create_new(path: Path) -> int:
-    """Make an empty file, instead of whatever has its name, and return its descriptor."""
+    """Create an empty file, replacing any of that name, and return its descriptor."""
     path.unlink(missing_ok=True)
     return open_regular(path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
 
 
-def content(path: Path, limit: int) -> bytes:
+def read_content(path: Path, limit: int) -> bytes:
     """Return the bytes of a file.
 
     Raises:
-        OSError: It cannot be read, or is larger than `limit` bytes.
+        OSError: If it cannot be read, or is larger than `limit` bytes.
     """
     with os.fdopen(open_regular(path), "rb") as file:
         size = os.fstat(file.fileno()).st_size
@@ -103,13 +103,13 @@ def read_at(descriptor: int, view: memoryview, offset: int) -> bool:
     return True
 
 
-def copied(origin: int, place: int, target: int, target_place: int, count: int) -> bool:
-    """Have the system copy bytes from one open file to another; return whether it could.
+def copy_range(origin: int, place: int, target: int, target_place: int, count: int) -> bool:
+    """Let the system copy bytes from one open file to another; return whether it could.
 
-    Where the file system knows how, as Btrfs and XFS do, the files share the bytes on the disk.
+    File systems such as Btrfs and XFS let the files share the bytes on the disk.
 
     Raises:
-        OSError: The disk is full.
+        OSError: If the disk is full.
     """
     done = 0
     try:
@@ -127,25 +127,25 @@ def copied(origin: int, place: int, target: int, target_place: int, count: int) 
     return True
 
 
-def raw(array: Array) -> memoryview:
-    """Return the bytes of a contiguous array, without a copy."""
+def as_bytes(array: Array) -> memoryview:
+    """Return the memory of a contiguous array as bytes."""
     return array.reshape(-1).view("u1").data
 
 
-def temporary(path: Path) -> Path:
-    """Return the name under which a file is written before it takes its place."""
+def temporary_path(path: Path) -> Path:
+    """Return the path that a file is written to before it replaces `path`."""
     return path.with_name(path.name + ".tmp")
 
 
 def replace(path: Path, content: bytes, *, sync: bool = True) -> None:
-    """Write a file that is either the old or the new one, whole, whenever the process dies.
+    """Replace a file atomically: if the process dies, either the old or the new one is there.
 
     Args:
         path: The file.
-        content: What it holds then.
-        sync: Whether to wait for the disk, so that this holds for a power cut too.
+        content: Its new content.
+        sync: Whether to wait for the disk, so that this holds after a power cut, too.
     """
-    draft = temporary(path)
+    draft = temporary_path(path)
     try:
         descriptor = create_new(draft)
         try:
@@ -164,7 +164,7 @@ def replace(path: Path, content: bytes, *, sync: bool = True) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring the folder's names to the disk, so that a renamed file survives a power cut."""
+    """Flush a folder's entries to the disk, so that a renamed file survives a power cut."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -173,10 +173,10 @@ def sync_folder(folder: Path) -> None:
 
 
 def lock(directory: Path) -> int:
-    """Take a dataset's lock for one writer alone; closing the descriptor releases it.
+    """Acquire a dataset's lock for a single writer; closing the descriptor releases it.
 
     Raises:
-        DatasetLockedError: There is another writer.
+        DatasetLockedError: If there is another writer.
     """
     descriptor = open_regular(directory / LOCK, os.O_RDWR | os.O_CREAT)
     try:
@@ -194,14 +194,14 @@ def lock(directory: Path) -> int:
 
 
 def lock_shared(directory: Path) -> tuple[int, bool]:
-    """Take a dataset's lock for one of several writers.
+    """Acquire a dataset's lock for one of several writers.
 
     Returns:
         The descriptor, whose closing releases the lock, and whether there is no other writer: the
-        lock is then this one's alone, until `share` lets others in.
+        lock is then exclusive until `share` admits others.
 
     Raises:
-        DatasetLockedError: There is a writer that shares the dataset with nobody.
+        DatasetLockedError: If an exclusive writer has the dataset open.
     """
     with contextlib.suppress(DatasetLockedError):
         return lock(directory), True
@@ -215,10 +215,10 @@ def lock_shared(directory: Path) -> tuple[int, bool]:
 
 
 def share(directory: Path, descriptor: int) -> None:
-    """Let others share the lock.
+    """Share the lock with other writers.
 
     Raises:
-        DatasetLockedError: A writer that shares with nobody was quicker.
+        DatasetLockedError: If an exclusive writer acquired it first.
     """
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -227,9 +227,9 @@ def share(directory: Path, descriptor: int) -> None:
 
 
 @contextlib.contextmanager
-def turn(directory: Path) -> Iterator[None]:
-    """Wait for one's turn to change the manifest, among writers that share a dataset."""
-    descriptor = open_regular(directory / TURN, os.O_RDWR | os.O_CREAT)
+def lock_manifest(directory: Path) -> Iterator[None]:
+    """Hold the manifest's lock, which writers that share a dataset take in turn."""
+    descriptor = open_regular(directory / MANIFEST_LOCK, os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
@@ -240,7 +240,7 @@ def turn(directory: Path) -> Iterator[None]:
 def _locked(directory: Path, descriptor: int) -> DatasetLockedError:
     owner = os.pread(descriptor, 20, 0).decode(errors="replace") or "unknown"
     return DatasetLockedError(
-        f"Process {owner} writes to the dataset in {directory}. Wait until it has closed the "
-        "dataset, or open it for reading only. For several writers at the same time, each opens "
-        "it with writable=True, shared=True."
+        f"Process {owner} is writing to the dataset in {directory}. Wait until it has closed the "
+        "dataset, or open it for reading only. For several writers at the same time, open it "
+        "with writable=True, shared=True in each."
     )

@@ -1,4 +1,4 @@
-"""Mean, standard deviation, minimum and maximum per component, accumulated block by block."""
+"""Running mean, standard deviation, minimum and maximum of each component of a field."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _WIDTH = 512
 
 @dataclass(frozen=True)
 class Normalization:
-    """What is known of each component of a field; mean and deviation normalize it.
+    """Statistics of each component of a field; mean and deviation normalize it.
 
     Attributes:
         mean: Mean, of the field's shape, float64, in the field's unit.
         std: Standard deviation, of the field's shape, float64, in the field's unit; 1 for a
-            component that never changes, so that normalizing only shifts it to 0.
-        minimum: Smallest value, of the field's shape, float64, in the field's unit; None where
-            nobody noted it, as in checkpoints of the first version.
+            constant component, so that normalizing only shifts it to 0.
+        minimum: Smallest value, of the field's shape, float64, in the field's unit; None if
+            unknown, as in checkpoints of the first version.
         maximum: Largest value, like `minimum`.
     """
 
@@ -41,21 +41,21 @@ class Normalization:
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Normalization:
-        """Make what `to_dict` described."""
+        """Return the normalization that `to_dict` described."""
         names = ("mean", "std", "minimum", "maximum")
         known = {name: np.asarray(plain[name], np.float64) for name in names if name in plain}
         return cls(**known)
 
 
 class RunningStatistics:
-    """Mean, standard deviation, minimum and maximum of the rows given so far, in float64.
+    """Mean, standard deviation, minimum and maximum of all rows so far, in float64.
 
     Blocks are combined by the update of Chan, Golub and LeVeque (1979), "Updating formulae and a
-    pairwise algorithm for computing sample variances". Values are taken relative to the first row,
-    so that a large offset costs no digits and a constant component has a deviation of exactly 0.
+    pairwise algorithm for computing sample variances". Values are relative to the first row, so
+    that a large offset costs no precision and a constant component has a deviation of exactly 0.
 
     Attributes:
-        count: How many rows were given.
+        count: Number of rows so far.
     """
 
     def __init__(self) -> None:
@@ -116,7 +116,7 @@ class RunningStatistics:
         self._combine(other.count, np.asarray(mean), other._squares)
 
     def normalization(self) -> Normalization:
-        """Return what normalizes; deviation 1 where values differ by rounding errors at most."""
+        """Return the normalization; deviation 1 where values differ by rounding errors only."""
         mean, std = self.mean, self.std
         resolution = 4 * np.finfo(np.float64).eps * np.abs(mean)
         std = np.where(std > resolution, std, 1.0)
@@ -134,10 +134,10 @@ class RunningStatistics:
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:
-        """Make what `to_dict` described.
+        """Return the statistics that `to_dict` described.
 
-        Without minimum and maximum, as physx once wrote it, nothing counts as seen: the rows are
-        gone through again when somebody asks.
+        Without minimum and maximum, as in early versions, they are empty: the rows are read again
+        when statistics are needed.
         """
         statistics = cls()
         if "minimum" not in plain or "maximum" not in plain:
@@ -167,7 +167,7 @@ class RunningStatistics:
 
 
 def _over_rows(function: np.ufunc, rows: Array) -> Array:
-    """Reduce an array along its rows; narrow rows lie side by side for it, which is faster."""
+    """Reduce an array along its rows, several narrow rows at once, which is faster."""
     count, shape = len(rows), rows.shape[1:]
     width = math.prod(shape)
     fold = max(1, min(_WIDTH // max(width, 1), count))

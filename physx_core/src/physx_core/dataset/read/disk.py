@@ -70,7 +70,7 @@ class DiskColumn:
             DatasetError: If a partition is missing, truncated or damaged, or the disk fails.
         """
         size, rows = self.row_nbytes, self._target(out)
-        view = files.raw(rows)
+        view = files.as_bytes(rows)
         for number, row in enumerate(index.tolist()):
             self._read(row, 1, view[number * size : (number + 1) * size])
         if rows is not out:
@@ -83,7 +83,7 @@ class DiskColumn:
             DatasetError: If a partition is missing, truncated or damaged, or the disk fails.
         """
         rows = self._target(out)
-        self._read(start, len(rows), files.raw(rows))
+        self._read(start, len(rows), files.as_bytes(rows))
         if rows is not out:
             out[...] = rows
 

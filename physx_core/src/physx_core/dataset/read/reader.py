@@ -119,7 +119,7 @@ class Reader:
         size, stop = self.field(mode, name).nbytes, start + len(out)
         if not size:
             return
-        view = files.raw(out)
+        view = files.as_bytes(out)
         for segment in self.segments(mode, name):
             first = max(start, segment.start)
             count = min(stop, segment.start + segment.rows) - first

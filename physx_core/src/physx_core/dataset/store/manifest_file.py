@@ -63,7 +63,7 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
     """
     path = directory / FILE
     try:
-        content = files.content(path, _LARGEST)
+        content = files.read_content(path, _LARGEST)
     except FileNotFoundError:
         raise
     except OSError as error:

@@ -36,7 +36,7 @@ class ManifestStore:
         Raises:
             OSError: If it cannot be stored.
         """
-        with files.turn(self.directory) if self.shared else contextlib.nullcontext():
+        with files.lock_manifest(self.directory) if self.shared else contextlib.nullcontext():
             if self.shared:
                 self.reload(manifest_file.load(self.directory))
             before = self.manifest.copy()

@@ -48,16 +48,16 @@ class PartitionFile:
         """
         header = make_header(identity, capacity)
         path = directory / identity.file_name
-        return cls(path, identity, header, _write_header(files.temporary(path), header))
+        return cls(path, identity, header, _write_header(files.temporary_path(path), header))
 
     def publish(self) -> None:
         """Give the file its name."""
-        files.temporary(self._path).rename(self._path)
+        files.temporary_path(self._path).rename(self._path)
 
     def discard(self) -> None:
         """Close the file and remove it, whether it is published or not."""
         self.close()
-        files.temporary(self._path).unlink(missing_ok=True)
+        files.temporary_path(self._path).unlink(missing_ok=True)
         self._path.unlink(missing_ok=True)
 
     def reserve(self, rows: int) -> None:
@@ -90,7 +90,7 @@ class PartitionFile:
         """
         if self._row_nbytes:
             offset = self.data_offset + row * self._row_nbytes
-            files.write_at(self._descriptor, files.raw(block), offset)
+            files.write_at(self._descriptor, files.as_bytes(block), offset)
 
     def commit(self, rows: int) -> None:
         """Make the first `rows` rows part of the dataset."""
@@ -157,7 +157,7 @@ def copy(
         OSError: If the file cannot be written; nothing was changed.
     """
     header = make_header(identity, rows, rows)
-    draft = files.temporary(path)
+    draft = files.temporary_path(path)
     descriptor = _write_header(draft, header)
     try:
         try:
@@ -192,7 +192,7 @@ def _copy(source: Path, source_offset: int, target: int, target_offset: int, cou
         while done < count:
             part = buffer[: count - done]
             here, there = source_offset + done, target_offset + done
-            shared = files.copied(origin, here, target, there, len(part))
+            shared = files.copy_range(origin, here, target, there, len(part))
             descriptor, offset = (target, there) if shared else (origin, here)
             if not files.read_at(descriptor, part, offset):
                 raise OSError(errno.EIO, f"{source} became shorter while it was being read")

@@ -54,7 +54,7 @@ def scan(directory: Path, fields: Mapping[str, Field], partition: Partition) -> 
     for name, field in fields.items():
         statistics = running[name] = RunningStatistics()
         for block in partition.segment(directory, field).blocks():
-            crc[name] = crc32(files.raw(block), crc[name])
+            crc[name] = crc32(files.as_bytes(block), crc[name])
             if has_statistics(field):
                 statistics.update(block)
     return replace(partition, checksums=crc, running=running, counted=False)

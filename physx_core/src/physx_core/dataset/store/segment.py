@@ -98,7 +98,7 @@ class Segment:
         with file:
             for first in range(0, self.rows, count):
                 block = buffer[: self.rows - first]
-                self.read(file, offset + first * row_nbytes, files.raw(block))
+                self.read(file, offset + first * row_nbytes, files.as_bytes(block))
                 yield block
 
     def compute_checksum(self) -> int:
@@ -109,7 +109,7 @@ class Segment:
         """
         crc = 0
         for block in self.blocks():
-            crc = crc32(files.raw(block), crc)
+            crc = crc32(files.as_bytes(block), crc)
         return crc
 
 

@@ -62,7 +62,7 @@ def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> Wri
     manifest = Manifest(info=to_plain_info(info))
     with files.storing(f"A dataset in {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
-        with files.turn(folder) if options.shared else contextlib.nullcontext():
+        with files.lock_manifest(folder) if options.shared else contextlib.nullcontext():
             lock = files.lock(folder)
             try:
                 if recovery.holds_dataset(folder):
@@ -88,7 +88,7 @@ def extend(folder: Path, options: WriterOptions) -> Writer:
     """
     with (
         files.storing(f"Rows in {folder}"),
-        files.turn(folder) if options.shared else contextlib.nullcontext(),
+        files.lock_manifest(folder) if options.shared else contextlib.nullcontext(),
     ):
         lock, alone = files.lock_shared(folder) if options.shared else (files.lock(folder), True)
         try:

@@ -102,7 +102,7 @@ def _write(path: Path, offset: int, places: Index, rows: Array, *, durable: bool
     try:
         for first, last in _runs(places) if row_nbytes else ():
             place = offset + int(places[first]) * row_nbytes
-            files.write_at(descriptor, files.raw(rows[first:last]), place)
+            files.write_at(descriptor, files.as_bytes(rows[first:last]), place)
         if durable:
             os.fdatasync(descriptor)
     finally:

@@ -159,7 +159,7 @@ class Writer:
             except OSError as error:
                 what = f"{count - done} of {count} rows of mode {mode_name!r}"
                 safe = f"The {self.store.manifest.modes[mode_name].rows} samples before them"
-                raise files.not_stored(what, error, safe) from error
+                raise files.storage_error(what, error, safe) from error
 
     def refresh(self) -> None:
         """Learn what other writers have committed.
@@ -168,7 +168,7 @@ class Writer:
             DatasetError: If the manifest is no longer valid.
         """
         if self.store.shared:
-            with files.storing("What other writers did"), files.turn(self._directory):
+            with files.storing("What other writers did"), files.lock_manifest(self._directory):
                 self.store.reload(recovery.load(self._directory))
 
     def finish(self, mode_name: str) -> None:
