@@ -6,3 +6,4 @@ from .environments.arm import PinocchioArm as PinocchioArm
 from .environments.double_pendulum import DartDoublePendulum as DartDoublePendulum
 from .environments.double_pendulum import PinocchioDoublePendulum as PinocchioDoublePendulum
 from .pinocchio.simulation import PinocchioBackend as PinocchioBackend
+from .version import __version__ as __version__

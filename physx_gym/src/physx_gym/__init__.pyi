@@ -28,3 +28,4 @@ from .tasks.trajectory import Trajectory as Trajectory
 from .telemetry.log import Log as Log
 from .telemetry.log_file import read_log as read_log
 from .vector.vector_env import ParallelVectorEnv as ParallelVectorEnv
+from .version import __version__ as __version__

@@ -26,3 +26,4 @@ from .serving.service import Service as Service
 from .serving.socket_service import SocketService as SocketService
 from .serving.worlds import Worlds as Worlds
 from .serving.worlds import open_worlds as open_worlds
+from .version import __version__ as __version__

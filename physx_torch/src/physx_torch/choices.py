@@ -65,7 +65,7 @@ def make(what: str, factory: Callable[..., Any], *args: Any, **kwargs: Any) -> A
     except (TypeError, ValueError) as error:
         name = getattr(factory, "__name__", repr(factory))
         raise ConfigError(
-            f"The {what} {name} refuses its arguments: {error}. "
+            f"The {what} {name} rejects its arguments: {error}. "
             f"It takes: {', '.join(parameters_of(factory)) or 'what its documentation says'}."
         ) from error
 

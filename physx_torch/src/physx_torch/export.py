@@ -1,4 +1,4 @@
-"""Export: a network with its transformation as one file that runs without physx."""
+"""Export of a network with its transformation as one file that runs without physx."""
 
 from __future__ import annotations
 
@@ -8,68 +8,79 @@ import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
-from physx_core import Field, Transformation
+from physx_core import Field
 from physx_core.errors import ConfigError, MissingLibraryError
-
-if TYPE_CHECKING:
-    from physx_torch.networks.network import TorchNetwork
+from physx_torch.networks.network import TorchNetwork
 
 Tensors = dict[str, torch.Tensor]
+Predict = Callable[[Tensors], Tensors]
 
 
-class Exported(torch.nn.Module):
-    """Network and transformation as one module, from physical units to physical units.
+class _PhysicalUnits(torch.nn.Module):
+    """A network with its transformation as one module, from physical units to physical units.
 
     Attributes:
         network: The network.
-        inputs: Names of the fields that are read.
-        outputs: Names of the fields that are given; one that is read too is ``predicted_<name>``.
+        inputs: Names of the input fields.
+        outputs: Names of the output fields; one that is also an input is ``predicted_<name>``.
     """
 
-    def __init__(self, network: TorchNetwork, transformation: Transformation) -> None:
+    def __init__(self, network: TorchNetwork, predict: Predict) -> None:
         super().__init__()
         self.network = network
         self.inputs = list(network.net_fields)
         self.outputs = [
             f"predicted_{name}" if name in self.inputs else name for name in network.pred_fields
         ]
-        self._transformation = transformation
+        self._predict = predict
 
     def forward(self, data: Tensors) -> Tensors:
-        """Return the predictions by name for tensors of the fields by name."""
-        prediction = self.network.predict(self._transformation.transform_before_prediction(data))
-        prediction = self._transformation.transform_before_apply(prediction)
+        """Return the predictions by output name for tensors by input name."""
+        prediction = self._predict(data)
         names = zip(self.outputs, self.network.pred_fields, strict=True)
         return {output: prediction[name] for output, name in names}
 
 
-def write(
+def export_network(
     path: Path,
     form: str,
     network: TorchNetwork,
-    transformation: Transformation,
+    predict: Predict,
     fields: Mapping[str, Field],
 ) -> None:
-    """Write a network: see `Network.export`.
+    """Write a network and its transformation as ``"onnx"``, ``"torchscript"`` or ``"pt2"``.
+
+    The first axis of inputs and outputs is that of the samples, of any length. Floating inputs
+    have the network's data type. ONNX names inputs and outputs by the fields; the other two take
+    and return a dictionary of tensors by field. A field that is both an input and predicted is
+    output as ``predicted_<name>``.
+
+    Args:
+        path: The file; an existing one is replaced.
+        form: The file's format.
+        network: The network, on the processor.
+        predict: Prediction in physical units with the network: tensors by field to tensors by
+            field.
+        fields: The fields that the network was bound to, by name.
 
     Raises:
-        ConfigError: The network is not on the processor, or cannot be written in this form.
-        MissingLibraryError: A library that the form needs is not installed.
+        ConfigError: If the network is not on the processor, or cannot be exported in this format.
+        MissingLibraryError: If ONNX is not installed: ``physx-torch[export]`` brings it.
     """
     if network.device.type != "cpu":
         raise ConfigError(
             f'A network is exported from the processor, not from "{network.device}", so that the '
-            'file runs anywhere: restore it with device="cpu", as physx export-network does.'
+            'file runs anywhere: load it with device="cpu", as physx export-network does.'
         )
     samples = {name: _samples(fields[name], network) for name in network.net_fields}
     try:
-        with _fixed(network), _quiet():
-            FORMS[form](Exported(network, transformation).eval(), samples, path)
+        with _evaluating(network), _quiet():
+            FORMS[form](_PhysicalUnits(network, predict).eval(), samples, path)
     except MissingLibraryError:
         raise
     except Exception as error:  # an exporter may fail in any way on what it does not know
@@ -86,8 +97,8 @@ def _reason(error: BaseException) -> str:
 
 
 @contextlib.contextmanager
-def _fixed(network: TorchNetwork) -> Iterator[None]:
-    """Let a network predict only, with parameters that need no gradients, for a while."""
+def _evaluating(network: TorchNetwork) -> Iterator[None]:
+    """Put a network into evaluation mode, with parameters that need no gradients, for a while."""
     was_training = network.training
     trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
     network.set_eval()
@@ -102,12 +113,12 @@ def _fixed(network: TorchNetwork) -> Iterator[None]:
 
 
 def _samples(field: Field, network: TorchNetwork) -> torch.Tensor:
-    """Return samples of a field for the exporters to follow through the network."""
+    """Return example samples of a field for the exporters to trace the network with."""
     zeros = np.zeros((2, *(field.shape or ())), field.dtype)
     return network.numpy_to_tensor({field.name: zeros})[field.name]
 
 
-def _torchscript(module: Exported, samples: Tensors, path: Path) -> None:
+def _torchscript(module: _PhysicalUnits, samples: Tensors, path: Path) -> None:
     traced = torch.jit.trace(module, (samples,), strict=False, check_trace=False)
     buffer = io.BytesIO()
     torch.jit.save(traced, buffer)
@@ -115,17 +126,17 @@ def _torchscript(module: Exported, samples: Tensors, path: Path) -> None:
 
 
 def _axes(samples: Tensors) -> dict[str, Any]:
-    """Return which axes have any length, as the exporters take it: the samples'."""
+    """Mark the sample axis as one of any length, in the form that the exporters take."""
     axis = torch.export.Dim("samples")
     return {"data": {name: {0: axis} for name in samples}}
 
 
-def _pt2(module: Exported, samples: Tensors, path: Path) -> None:
+def _pt2(module: _PhysicalUnits, samples: Tensors, path: Path) -> None:
     program = torch.export.export(module, (samples,), dynamic_shapes=_axes(samples))
     _replace(path, lambda partial: torch.export.save(program, partial), ".pt2")
 
 
-def _onnx(module: Exported, samples: Tensors, path: Path) -> None:
+def _onnx(module: _PhysicalUnits, samples: Tensors, path: Path) -> None:
     for library in ("onnx", "onnxscript"):
         try:
             __import__(library)
@@ -143,12 +154,12 @@ def _onnx(module: Exported, samples: Tensors, path: Path) -> None:
         verbose=False,
     )
     if written is None:
-        raise ConfigError("the exporter gave no program.")
+        raise ConfigError("the exporter returned no program.")
     _replace(path, lambda partial: written.save(partial, external_data=False))
 
 
 def _replace(path: Path, write_to: Callable[[Path], Any], suffix: str = ".partial") -> None:
-    """Let a file appear under its name only when it is complete."""
+    """Write a file so that it appears under its name only when it is complete."""
     partial = path.with_name(f".{path.name}.partial").with_suffix(suffix)
     try:
         write_to(partial)
@@ -159,7 +170,7 @@ def _replace(path: Path, write_to: Callable[[Path], Any], suffix: str = ".partia
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep to oneself what the exporters say of their own inner workings."""
+    """Silence the exporters' warnings and logs about their internals."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -171,9 +182,9 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-FORMS: dict[str, Callable[[Exported, Tensors, Path], None]] = {
+FORMS: dict[str, Callable[[_PhysicalUnits, Tensors, Path], None]] = {
     "onnx": _onnx,
     "torchscript": _torchscript,
     "pt2": _pt2,
 }
-"""The forms that a network can be written in."""
+"""Writer of each file format."""

@@ -261,7 +261,9 @@ def test_a_recorded_prediction_leaves_the_data_alone_that_were_learned_from():
 def test_a_training_needs_samples_from_somewhere():
     with pytest.raises(DatasetNotFoundError) as caught:
         Training(NETWORK, epoch_nb=1, batch_size=1).execute()
-    assert "DatasetConfig.existing_dir, or an environment that makes" in caught.value.__notes__[0]
+    assert (
+        "DatasetConfig.existing_dir, or an environment that generates" in caught.value.__notes__[0]
+    )
     assert not list(Path("sessions").glob("*"))
 
 

@@ -21,9 +21,16 @@ from physx_core import (
     Prediction,
     Replay,
     Training,
+    plugins,
 )
 from physx_core.cli import main
-from physx_core.errors import ConfigError, DatasetError, DatasetNotFoundError, WrongSamplesError
+from physx_core.errors import (
+    ConfigError,
+    DatasetError,
+    DatasetNotFoundError,
+    PluginError,
+    WrongSamplesError,
+)
 
 ENVS = Path(__file__).parents[1] / "programs" / "source_envs.py"
 NETWORK = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "y"})
@@ -266,8 +273,8 @@ def test_the_command_replays_what_a_session_holds_and_draws_it():
         EnvironmentConfig("toy/spring", as_tcp_ip_client=False, num_clients=2),
         session_name="springs", batch_nb=1, batch_size=6,
     ).execute()  # fmt: skip
-    words = ["replay", "sessions/springs"]
-    assert main([*words, "--environment.visualizer", f"{__file__}:Watch"]) == 0
+    words = ["replay", "sessions/springs", "--environment.visualizer", f"{__file__}:Watch"]
+    assert main(words) == 0
     drawn = Path("sessions/replay/drawn.txt").read_text().splitlines()
     assert sorted(line for line in drawn if "view" not in line)[-6:] == [
         f"{number} {step} mass spring" for number in (1, 2) for step in range(3)
@@ -293,9 +300,9 @@ def test_rejected_samples_are_replayed_once_each(over_tcp, nothing_stays_behind)
     data = DatasetConfig(existing_dir="sessions/refused", mode="wrong")
     Mine(data, again, session_name="replay").execute()
     assert seen == list(zip(wrong["env_id"], wrong["step"], strict=True)) and len(seen) == 12
-    with pytest.raises(ConfigError, match='"wrong" is that of samples which check_sample rejected'):
+    with pytest.raises(ConfigError, match='"wrong" is for samples that check_sample rejects'):
         DataGeneration(config, DatasetConfig(mode="wrong"), batch_nb=1, batch_size=1).execute()
-    with pytest.raises(ConfigError, match="To look at them: physx replay"):
+    with pytest.raises(ConfigError, match="To view them: physx replay"):
         Training(NETWORK, DatasetConfig(mode="wrong"), config, epoch_nb=1, batch_size=1).execute()
 
 
@@ -303,17 +310,44 @@ def test_the_command_replays_the_rejected_samples(capsys):
     config = environment("Refusing", record_wrong_samples=True)
     DataGeneration(config, session_name="refused", batch_nb=1, batch_size=4).execute()
     words = ["sessions/refused", "--environment.no-as-tcp-ip-client"]
+    words += ["--environment.visualizer", f"{__file__}:Watch"]
     assert main(["replay", *words, "--mode", "wrong"]) == 0
     assert "3 steps of" in capsys.readouterr().out
     assert main(["replay", *words, "--mode", "validation"]) == 1
     assert 'no samples of mode "validation"' in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("installed", [[], ["watch"], ["watch", "other"]])
+def test_the_command_takes_the_only_visualizer_plugin(installed, monkeypatch, capsys):
+    def load(name):
+        kinds = {"visualizer": {name: Watch}}
+        if name == "more":
+            kinds["network"] = {}
+        if name == "broken":
+            raise PluginError(name, "broken")
+        return plugins.Plugin(plugins.PluginInfo(name, (), ""), kinds)
+
+    DataGeneration(environment(), session_name="few", batch_nb=1, batch_size=2).execute()
+    monkeypatch.setattr(plugins, "available", lambda: dict.fromkeys([*installed, "more", "broken"]))
+    monkeypatch.setattr(plugins, "load", load)
+    monkeypatch.setattr("physx_core.plugins.references.load", load)
+    words = ["replay", "sessions/few", "--environment.no-as-tcp-ip-client"]
+    assert main(words) == (len(installed) != 1)
+    if len(installed) == 1:
+        assert Path("sessions/replay/drawn.txt").exists()
+    else:
+        text = capsys.readouterr().err
+        assert "physx replay needs --environment.visualizer" in text
+        assert f"Installed: {', '.join(sorted(installed)) or 'none'}" in text
+        assert not Path("sessions/replay").exists()
+    assert main([*words, "--environment.visualizer", "None"]) == 0
+
+
 def test_replay_needs_to_know_samples_and_environment():
-    with pytest.raises(ConfigError, match="name them in existing_dir"):
+    with pytest.raises(ConfigError, match="name their dataset in existing_dir"):
         Replay(DatasetConfig()).execute()
     with Dataset.create("bare") as dataset:
         dataset.append("training", {"x": np.zeros((3, 2))})
-    with pytest.raises(ConfigError, match="does not say which environment"):
+    with pytest.raises(ConfigError, match="does not name its environment"):
         Replay(DatasetConfig(existing_dir="bare")).execute()
     assert not Path("sessions/replay").exists()

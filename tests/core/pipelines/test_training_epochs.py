@@ -285,7 +285,7 @@ def test_what_cannot_be_trained_by_several_processes(data, monkeypatch):
 
     options = {"epoch_nb": 1, "batch_nb": 1, "batch_size": 2}
     for data, choice, advice in (
-        (None, {}, "let them make the samples in one process, with epoch_nb=1"),
+        (None, {}, "generate the samples in one process, with epoch_nb=1"),
         (None, {"always_produce": True}, "Leave out always_produce"),
         (DATA, {"load_samples": True}, "send the stored samples through them in one process"),
         (DATA, {"load_samples": True, "only_first_epoch": False}, "or train in one process"),

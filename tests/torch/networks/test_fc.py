@@ -53,7 +53,7 @@ def test_every_plain_activation_works():
         ("Relu", 'Did you mean "ReLU"'),
         ("torch.nn:Tahn", 'Did you mean "Tanh"'),
         ("nowhere:Tanh", "nowhere"),
-        ("MultiheadAttention", "refuses its arguments"),
+        ("MultiheadAttention", "rejects its arguments"),
         (dict, "torch.nn.Module"),
     ],
 )

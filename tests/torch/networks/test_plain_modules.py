@@ -12,7 +12,7 @@ import torch
 
 from physx_core import Dataset, DatasetConfig, NetworkConfig, Training, checkpoint
 from physx_core.errors import ComponentNotFoundError, ConfigError
-from physx_core.pipelines import Learner, restored
+from physx_core.pipelines import Learner, load_learner
 from physx_core.plugins.networks import resolve_network
 from physx_torch import FC, ModuleNetwork
 
@@ -72,7 +72,7 @@ def test_networks_of_physx_stay_what_they_are():
     for reference, expected in ((FC, FC), ("physx_torch:FC", FC), ("torch/fc", FC)):
         assert resolve_network(reference, {"layers": [2, 1]}) == (expected, {"layers": [2, 1]})
     assert resolve_network(dict, {"a": 1}) == (dict, {"a": 1})
-    with pytest.raises(ConfigError, match="which is no physx network"):
+    with pytest.raises(ConfigError, match="which is not a physx network"):
         Learner(config(dict, {"a": 1}), trains=False)
 
 
@@ -129,7 +129,7 @@ def test_the_checkpoint_of_a_scripts_class_is_restored_in_a_new_process(tmp_path
     subprocess.run([sys.executable, "script.py"], check=True, timeout=120)
     path = checkpoint.find(Path("sessions/training"), "network", -1)
     assert "script.py:Mixture" in (path / checkpoint.DESCRIPTION).read_text()
-    learner = restored(NetworkConfig(), path)
+    learner = load_learner(path)
     assert learner.network.module.first.out_features == 6
     answer = learner.predict({"a": np.ones((1, 2)), "b": np.ones((1, 1))})["c"]
     np.testing.assert_allclose(answer, np.load("answer.npy"), rtol=1e-6)

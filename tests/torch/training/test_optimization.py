@@ -218,7 +218,7 @@ def test_plateau_looks_at_the_loss_of_the_epoch():
         (("CosinAnnealingLR", {}), 'Did you mean "CosineAnnealingLR"'),
         (("CosineAnnealingLR", {}), "T_max"),
         (("StepLR", {"steps": 3}), "step_size"),
-        ((dict, {}), "refuses its arguments"),
+        ((dict, {}), "rejects its arguments"),
         ((id, {}), "not a scheduler"),
     ],
 )

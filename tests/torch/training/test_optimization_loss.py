@@ -83,7 +83,7 @@ def test_loss_in_every_form(loss):
         ("torch.nn:MSELos", 'Did you mean "MSELoss"'),
         (None, "needs a loss"),
         (5, "cannot be called"),
-        (torch.nn.Linear, "refuses its arguments"),
+        (torch.nn.Linear, "rejects its arguments"),
     ],
 )
 def test_wrong_loss(loss, told):

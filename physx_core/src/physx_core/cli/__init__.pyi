@@ -1,5 +1,4 @@
-"""The command ``physx``: its commands are entry points, which other packages may add to."""
+"""The command ``physx``, whose subcommands are entry points that other packages can add."""
 
 from .arguments import argument_registry as argument_registry
-from .command import GROUP as GROUP
 from .command import main as main

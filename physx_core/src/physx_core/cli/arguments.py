@@ -1,4 +1,4 @@
-"""Command-line arguments of the form ``NAME=VALUE``, and references to components."""
+"""Parses command-line arguments of the form ``NAME=VALUE``, and references to components."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 
 def argument_registry() -> ConstructorRegistry:
-    """Return what reads ``NAME=VALUE ...`` and references; a context within which it does."""
+    """Return tyro's rules for ``NAME=VALUE ...`` and references; active as a context manager."""
     registry = ConstructorRegistry()
 
     @registry.primitive_rule
@@ -40,7 +40,7 @@ def argument_registry() -> ConstructorRegistry:
 
 
 def _argument(word: str) -> tuple[str, Any]:
-    """Return name and value of ``NAME=VALUE``; the value is TOML, or else a text."""
+    """Return name and value of ``NAME=VALUE``; the value is TOML, or else a string."""
     name, equals, text = word.partition("=")
     if not equals:
         raise ValueError(f"{word!r} is not NAME=VALUE")

@@ -24,46 +24,46 @@ from physx_core.workers.processes.descendants import kill_descendants
 class Client:
     """Run one instance of an environment for a run that waits for clients, until the run ends.
 
-    The run has launcher = "physx/manual" and says where it listens. The token is in the environment
+    The run has launcher = "physx/manual" and prints its address. The token is in the environment
     variable PHYSX_TOKEN, or in a file that only you can read.
     """
 
     connect: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")]
-    """Where the run listens."""
+    """Address of the run."""
     instance: int | None = None
-    """Number of the instance to run, from 1; by default any that no client runs."""
+    """Number of the instance to run, from 1; by default any without a client."""
     token_file: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
-    """File that holds the token; readable by you alone."""
+    """File with the token, readable only by you."""
     patience: float = PATIENCE
-    """Time in s for which to try again where nothing listens yet."""
+    """Time in s to retry while nothing listens at the address."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Run the client, and say what it does.
+    """Run the client, and print what it does.
 
     Raises:
-        ConfigError: There is no token, or an option is unfit.
-        ConnectionRefusedByPeerError: The run does not take the client.
-        SystemExit: The environment failed, or the server is gone; the client has said so.
+        ConfigError: If there is no token, or an option is invalid.
+        ConnectionRefusedByPeerError: If the run rejects the client.
+        SystemExit: If the environment fails or the server is gone, which the client has printed.
     """
     options = tyro.cli(Client, args=words, prog="physx client")
     token = given_token(options.token_file)
     if token is None:
         raise ConfigError(
-            f"A client needs the token of the run: set {TOKEN_VARIABLE}, or name the file that "
-            "holds it with --token-file."
+            f"A client needs the token of the run: set {TOKEN_VARIABLE}, or name a file that "
+            "contains it with --token-file."
         )
     if options.instance is not None and options.instance < 1:
         raise ConfigError(f"--instance is {options.instance}; instances are numbered from 1.")
-    os.environ.pop(TOKEN_VARIABLE, None)  # the environment and what it starts need not know it
+    os.environ.pop(TOKEN_VARIABLE, None)  # not for the environment and its processes
     signal.signal(signal.SIGTERM, lambda *args: sys.exit(128 + signal.SIGTERM))
-    faulthandler.enable()  # a crash of an engine says in which step it happened
+    faulthandler.enable()  # shows where an engine crashed
     try:
         status = run_client(
             options.connect, token, options.instance, patience=options.patience, say=_say
         )
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is about to end
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is ending already
         kill_descendants()
     sys.exit(status)
 

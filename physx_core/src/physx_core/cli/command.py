@@ -1,4 +1,4 @@
-"""The command ``physx``. What a verb needs is imported when the verb is used."""
+"""The command ``physx``, whose subcommands are entry points that are imported when used."""
 
 from __future__ import annotations
 
@@ -11,15 +11,23 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from physx_core.errors import PhysxError, UsageError, nearest
+from physx_core.errors import PhysxError, PluginError, UsageError, nearest
+from physx_core.plugins.entries import (
+    COMMANDS,
+    OFFICIAL,
+    describe_conflict,
+    find_entries,
+    owner_of,
+)
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-GROUP = "physx.commands"
-"""Entry-point group of the commands: name of the command, module with a function ``run(words)``."""
-_PACKAGES = {"log": "physx-gym", "robots": "physx-dart", "serve": "physx-remote"}
-"""Commands of the physx project that other distributions bring."""
+_ORDER = (
+    *("generate", "train", "predict", "replay", "info", "stats", "verify"),
+    *("export", "import", "export-network", "client", "plugins"),
+)
+"""Order of the core's commands in the overview; others follow by name."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -42,40 +50,43 @@ def main(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exception(error)
         print(_message(error, debug), file=sys.stderr)
         return 1
-    except BrokenPipeError:  # who read the output has enough, as in  physx info DIR | head
+    except BrokenPipeError:  # the reader has closed the pipe, as in  physx info DIR | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except KeyboardInterrupt:
-        print("physx: interrupted; everything that was committed is kept", file=sys.stderr)
+        print("physx: interrupted; committed samples are kept", file=sys.stderr)
         return 130
 
 
 def _run(name: str, words: list[str]) -> int:
-    commands = _commands()
+    commands = find_entries(COMMANDS)
     if name not in commands:
-        if name in _PACKAGES:
-            package = _PACKAGES[name]
-            raise UsageError(f"physx {name} belongs to {package}: pip install {package}")
+        package = OFFICIAL.get((COMMANDS, name))
+        if package is not None:
+            raise UsageError(f"physx {name} is part of {package}: pip install {package}")
         guess = nearest(name, commands)
         raise UsageError(f'There is no command "{name}".{guess} See physx --help.')
-    module = commands[name].load()
+    entry, *others = commands[name]
+    if others:
+        raise PluginError(name, describe_conflict("command", commands[name]))
     try:
-        module.run(words)
-    except SystemExit as end:  # how the parser ends after --help or a mistake in the options
+        run = entry.load().run
+    except Exception as error:  # a package's own import may fail in any way
+        text = f"physx {name} ({owner_of(entry)}) fails to import {entry.value}: {error}"
+        raise PluginError(name, text) from error
+    try:
+        run(words)
+    except SystemExit as end:  # raised by the parser after --help or an invalid option
         return 1 if end.code else 0
     return 0
 
 
-def _commands() -> dict[str, EntryPoint]:
-    from importlib.metadata import entry_points
-
-    return {entry.name: entry for entry in sorted(entry_points(group=GROUP))}
-
-
 def _overview() -> str:
-    commands = _commands()
-    width = max(map(len, commands), default=0)
-    lines = "\n".join(f"  {name:{width}}  {_summary(entry)}" for name, entry in commands.items())
+    commands = find_entries(COMMANDS)
+    names = [name for name in _ORDER if name in commands]
+    names += [name for name in commands if name not in _ORDER]
+    width = max(map(len, names), default=0)
+    lines = "\n".join(f"  {name:{width}}  {_summary(commands[name])}" for name in names)
     return (
         "physx: connect physics engines with deep learning (not NVIDIA PhysX)\n\n"
         f"usage: physx COMMAND [OPTIONS]\n\n{lines}\n\n"
@@ -84,14 +95,18 @@ def _overview() -> str:
     )
 
 
-def _summary(entry: EntryPoint) -> str:
-    """Return the first line of a command's module, which is read but not imported."""
-    package, *module = entry.value.split(".")
+def _summary(entries: list[EntryPoint]) -> str:
+    """Return the first docstring line of a command's module, which is read but not imported."""
+    if len(entries) > 1:
+        return f"(broken: {describe_conflict('command', entries)})"
+    package, *module = entries[0].value.split(".")
     try:
         spec = importlib.util.find_spec(package)
-        folders = (spec and spec.submodule_search_locations) or []
-        source = Path(folders[0], *module).with_suffix(".py").read_text()
-        text = ast.get_docstring(ast.parse(source)) or ""
+        if spec is None:
+            return f"(broken: there is no module {package})"
+        folders = spec.submodule_search_locations or []
+        path = Path(folders[0], *module).with_suffix(".py") if module else Path(spec.origin or "")
+        text = ast.get_docstring(ast.parse(path.read_text())) or ""
     except (ImportError, OSError, IndexError, SyntaxError, ValueError) as error:
         return f"(broken: {error})"  # a broken package breaks its own command only
     return text.partition("\n")[0].partition(": ")[2].rstrip(".")

@@ -1,4 +1,4 @@
-"""What a dataset holds, as text of 100 columns."""
+"""Prints the contents of a dataset as tables of 100 columns."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from physx_core.typing import Array
 
 _WIDTH = 100
 _SMALL = 9
-"""Components up to which each is shown on a line of its own."""
+"""Largest number of components that are shown on lines of their own."""
 
 
 def print_dataset(place: Path, *, verify: bool) -> None:
@@ -25,11 +25,11 @@ def print_dataset(place: Path, *, verify: bool) -> None:
 
     Args:
         place: A session's or a dataset's folder.
-        verify: Whether every byte is checked, not only what the files say of themselves.
+        verify: Whether every byte is checked, not only sizes and headers.
 
     Raises:
-        DatasetNotFoundError: There is no dataset.
-        DatasetError: Its manifest cannot be read.
+        DatasetNotFoundError: If there is no dataset.
+        DatasetError: If its manifest cannot be read.
     """
     with Dataset.open(place) as dataset:
         rows = dataset.describe()
@@ -47,7 +47,7 @@ def print_dataset(place: Path, *, verify: bool) -> None:
 
 
 def size(nbytes: float) -> str:
-    """Return a number of bytes for people."""
+    """Return a human-readable number of bytes."""
     for unit in ("B", "kB", "MB", "GB"):
         if nbytes < 1000:
             return f"{nbytes:.3g} {unit}"
@@ -55,8 +55,8 @@ def size(nbytes: float) -> str:
     return f"{nbytes:.3g} TB"
 
 
-def counted(number: int, what: str) -> str:
-    """Return a number of things for people."""
+def count(number: int, what: str) -> str:
+    """Return a human-readable number of things."""
     return f"{number:,} {what}" + ("" if number == 1 else "s")
 
 
@@ -71,7 +71,7 @@ def _origin(dataset: Dataset) -> list[str]:
 
 def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> None:
     nbytes, partitions = sum(row["bytes"] for row in rows), rows[0]["partitions"]
-    samples, files = counted(rows[0]["samples"], "sample"), counted(partitions, "partition")
+    samples, files = count(rows[0]["samples"], "sample"), count(partitions, "partition")
     print(f"{mode}: {samples}, {size(nbytes)} in {files}")
     try:
         stored = dataset.num_samples(mode)
@@ -106,7 +106,7 @@ def _print_episodes(dataset: Dataset, mode: str, samples: int) -> None:
     lengths, instances = episode_lengths(view, samples)
     least, most = lengths.min(), lengths.max()
     steps = f"{least:,}" if least == most else f"{least:,} to {most:,}"
-    of = counted(instances, "instance")
+    of = count(instances, "instance")
     print(f"  trajectories: {len(lengths):,} of {of}, {steps} samples each")
 
 
@@ -123,7 +123,7 @@ def _print_normalization(dataset: Dataset, mode: str) -> None:
 
 
 def _components(name: str, item: Normalization) -> list[list[str]]:
-    """Return the lines of a field: one for each component, or ranges over many."""
+    """Return a field's lines: one for each component, or one with ranges over many."""
     columns = [item.mean, item.std, item.minimum, item.maximum]
     if item.mean.size > _SMALL:
         return [[name, f"all {item.mean.size}", *(_range(column) for column in columns)]]
@@ -144,14 +144,14 @@ def _range(values: Array | None) -> str:
 def _print_integrity(dataset: Dataset, *, content: bool) -> None:
     problems = dataset.verify(content=content)
     what = "every byte was checked" if content else "sizes and headers; --verify checks every byte"
-    found = counted(len(problems), "problem") if problems else "sound"
+    found = count(len(problems), "problem") if problems else "sound"
     print(f"integrity: {found} ({what})")
     for text in problems:
         print(textwrap.fill(text, _WIDTH, initial_indent="  ", subsequent_indent="    "))
 
 
 def _print_table(names: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
-    """Print columns side by side; the last one is wrapped to what is left of the width."""
+    """Print columns side by side; the last one is wrapped to the remaining width."""
     cells = [list(names), *(list(line) for line in lines)]
     widths = [max(len(line[column]) for line in cells) for column in range(len(names))]
     rest = max(12, _WIDTH - sum(widths[:-1]) - 2 * len(names))

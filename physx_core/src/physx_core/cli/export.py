@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physx_core.cli.dataset_tables import counted
+from physx_core.cli.dataset_tables import count
 from physx_core.dataset import Dataset
 from physx_core.dataset.exchange import ExportOptions, export
 from physx_core.observers import ProgressBar
@@ -25,28 +25,28 @@ class Export:
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
     """A session's or a dataset's folder."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
-    """The file, or for zarr and minari the folder, to make."""
+    """The file, or the folder for zarr and minari, to create."""
     to: Literal["npz", "parquet", "minari", "zarr", "hdf5-single"]
     """The format."""
     mode: tuple[str, ...] = ()
-    """Modes to export; by default all that have samples. Parquet and minari take one."""
+    """Modes to export; by default all with samples. Parquet and minari take one."""
     compression: str = "none"
     """npz: deflate; parquet: snappy, gzip, zstd, lz4, brotli; zarr: zstd, gzip, blosc;
     hdf5-single: gzip, lzf."""
     observations: tuple[str, ...] = ()
-    """minari: fields that are the observations; by default all training fields that are not
-    chosen for something else, as a dictionary. One field is the observation itself."""
+    """minari: fields of the observations; by default all training fields without another role,
+    as a dictionary. A single field is the observation itself."""
     actions: tuple[str, ...] = ()
-    """minari: fields that are the actions; by default there is one action, which does nothing."""
+    """minari: fields of the actions; by default there is one action, without effect."""
     rewards: str | None = None
     """minari: field that is the reward; by default rewards are 0."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Export as the words say and print what was written.
+    """Export a dataset and print the number of exported samples.
 
     Raises:
-        PhysxError: The dataset cannot be read, or does not fit into the format.
+        PhysxError: If the dataset cannot be read, or does not fit the format.
     """
     options = tyro.cli(Export, args=words, prog="physx export")
     form = ExportOptions(
@@ -72,7 +72,7 @@ def run(words: Sequence[str]) -> None:
             bar.end()
         stored = {mode: dataset.num_samples(mode) for mode in written}
     for mode, rows in written.items():
-        print(f"{counted(rows, f'{mode} sample')}: {options.out}")
+        print(f"{count(rows, f'{mode} sample')}: {options.out}")
         if rows < stored[mode]:
             left = stored[mode] - rows
             print(f"left out: {left:,} samples that are a trajectory of their own")

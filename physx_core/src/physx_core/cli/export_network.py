@@ -11,22 +11,22 @@ import tyro
 
 from physx_core import checkpoint
 from physx_core.config import NetworkConfig
-from physx_core.pipelines.learner import restored
+from physx_core.pipelines.learner import load_learner
 
 
 @dataclass
 class ExportNetwork:
     """Write a session's network, with its normalization, as one file for other programs.
 
-    It reads and gives fields in physical units, for any number of samples.
+    Inputs and outputs are in physical units, for any number of samples.
     """
 
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SESSION")]
     """The session's folder, or that of a checkpoint."""
     to: str
-    """Form of the file: "onnx", "torchscript" or "pt2" for networks of PyTorch."""
+    """Format of the file: "onnx", "torchscript" or "pt2" for PyTorch networks."""
     output: str | None = None
-    """The file; by default it lies in the session's folder, with the checkpoint's name."""
+    """The file; by default in the session's folder, named like the checkpoint."""
     network_name: str = "network"
     """Name of the checkpoints in the session."""
     which_network: int = -1
@@ -34,17 +34,17 @@ class ExportNetwork:
 
 
 def run(words: Sequence[str]) -> None:
-    """Export as the words say and print what was written.
+    """Export a network and print its fields and the file.
 
     Raises:
-        CheckpointError: There is no such checkpoint.
-        ConfigError: The network cannot be written in this form.
-        MissingLibraryError: A library that the form needs is not installed.
+        CheckpointError: If there is no such checkpoint.
+        ConfigError: If the network cannot be exported in this format.
+        MissingLibraryError: If a library that the format needs is not installed.
     """
     options = tyro.cli(ExportNetwork, args=words, prog="physx export-network")
     place = Path(options.directory)
     path = checkpoint.find(place, options.network_name, options.which_network)
-    learner = restored(NetworkConfig(device="cpu"), path)
+    learner = load_learner(path, NetworkConfig(device="cpu"))
     file = Path(options.output) if options.output else place / f"{path.name}.{options.to}"
     learner.export(file, options.to)
     network = learner.network

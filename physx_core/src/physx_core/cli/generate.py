@@ -10,7 +10,7 @@ from physx_core.pipelines.data_generation import DataGeneration
 
 
 def run(words: Sequence[str]) -> None:
-    """Make samples as the words say and print how long it took, the start of clients included."""
+    """Generate samples and print the time that it took, including the start of the clients."""
     pipeline = pipeline_from(DataGeneration, "generate", ("environment.environment",), words)
     begin = time.perf_counter()
     pipeline.execute()

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli.dataset_tables import counted
+from physx_core.cli.dataset_tables import count
 from physx_core.dataset.exchange import import_file
 from physx_core.observers import ProgressBar
 
@@ -17,26 +17,26 @@ from physx_core.observers import ProgressBar
 class Import:
     """Store the arrays of a file as the fields of a dataset.
 
-    Arrays of one length become the fields of one mode. Groups become part of the names, except
-    those that are named training, validation or prediction: they become modes.
+    Arrays of one length become the fields of one mode. Group names become part of the fields'
+    names, except training, validation and prediction, which become modes.
     """
 
     file: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE")]
     """A NumPy archive (npz) or an HDF5 file."""
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
-    """The dataset's folder; if there is a dataset with these fields, it gets the rows added."""
+    """The dataset's folder; rows are added to an existing dataset with these fields."""
     mode: str | None = None
-    """Mode for the rows, whatever the file says; of a file with several modes, the one to take.
-    By default the modes that the file names, or else training."""
+    """Mode of the rows, regardless of the file's; for a file with several modes, the one to import.
+    By default the modes of the file, or else training."""
     fields: tuple[str, ...] = ()
-    """Arrays to take; by default all of them."""
+    """Arrays to import; by default all."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Import as the words say and print what was stored.
+    """Import a file and print the number of stored samples.
 
     Raises:
-        PhysxError: The file holds what a dataset cannot, or the dataset cannot be written.
+        PhysxError: If the file's arrays do not fit a dataset, or the dataset cannot be written.
     """
     options = tyro.cli(Import, args=words, prog="physx import")
     bar = ProgressBar()
@@ -52,4 +52,4 @@ def run(words: Sequence[str]) -> None:
     finally:
         bar.end()
     for mode, rows in stored.items():
-        print(f"{counted(rows, f'{mode} sample')}: {options.directory}")
+        print(f"{count(rows, f'{mode} sample')}: {options.directory}")

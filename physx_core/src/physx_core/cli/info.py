@@ -16,21 +16,20 @@ from physx_core.errors import DatasetNotFoundError
 
 @dataclass
 class Info:
-    """Show what a session or dataset holds."""
+    """Show the contents of a session or dataset."""
 
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
-    """The one folder to look into: a session's or a dataset's."""
+    """A session's or a dataset's folder; give one folder."""
     verify: bool = False
-    """Read every byte to check that nothing was changed, not only what the files say of
-    themselves."""
+    """Check every byte, not only sizes and headers."""
 
 
 def run(words: Sequence[str]) -> None:
     """Print the dataset and the checkpoints of a folder.
 
     Raises:
-        DatasetNotFoundError: The folder holds neither a dataset nor checkpoints.
-        DatasetError: The dataset's manifest cannot be read.
+        DatasetNotFoundError: If the folder contains neither a dataset nor checkpoints.
+        DatasetError: If the dataset's manifest cannot be read.
     """
     options = tyro.cli(Info, args=words, prog="physx info")
     place = Path(options.directory)

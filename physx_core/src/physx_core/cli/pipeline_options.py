@@ -1,4 +1,4 @@
-"""Making a pipeline from a TOML file and the options of the command line."""
+"""Creates a pipeline from a TOML file and the options of the command line."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ def pipeline_from(
     words: Sequence[str],
     given: Mapping[str, Any] | None = None,
 ) -> P:
-    """Make a pipeline from what the user typed.
+    """Create a pipeline from the words of a command line.
 
     Args:
         make: The pipeline's class.
         verb: The command, for messages.
-        places: Options that the first words without a dash are for, for example
+        places: Options that take the first words without a dash, for example
             ``environment.environment``.
         words: The words after the command. ``--config FILE`` names a TOML file whose table of the
-            pipeline's kind holds options; words after it replace them.
-        given: Table of options that hold where the file has none of the name.
+            pipeline's kind contains options; words after it override them.
+        given: Table of options that apply unless the file contains them.
 
     Raises:
-        PhysxError: An option is unknown or its value unfit.
-        SystemExit: Help was asked for, or the parser has shown a mistake.
+        PhysxError: If an option is unknown or its value invalid.
+        SystemExit: If help was requested, or the parser has printed an error.
     """
     table, rest = _take_file(make, list(words))
     table = {**(given or {}), **table}
@@ -66,7 +66,7 @@ def _take_file(make: type[Pipeline], words: list[str]) -> tuple[dict[str, Any], 
         return {}, words
     place = words.index("--config")
     if place + 1 == len(words):
-        raise UsageError("--config needs the path of a TOML file after it.")
+        raise UsageError("--config needs the path of a TOML file.")
     path = words[place + 1]
     tables = read_toml(path)
     if not isinstance(tables.get(make.kind), dict):
@@ -80,7 +80,7 @@ def _name_positionals(verb: str, places: Sequence[str], words: list[str]) -> lis
     count = 0
     while count < len(words) and not words[count].startswith("-"):
         if count == len(places):
-            raise UsageError(f'"{words[count]}" is too much: see physx {verb} --help.')
+            raise UsageError(f'Unexpected argument "{words[count]}": see physx {verb} --help.')
         named += [f"--{places[count].replace('_', '-')}", words[count]]
         count += 1
     return named + words[count:]
@@ -89,7 +89,7 @@ def _name_positionals(verb: str, places: Sequence[str], words: list[str]) -> lis
 def _nested_defaults(
     make: type[Pipeline], table: Mapping[str, Any], words: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the configurations that the file describes, by option name."""
+    """Return the configurations in the file, by option name."""
     defaults: dict[str, Any] = {}
     for option in _dataclass_fields(make):
         name = _option_name(option.name)
@@ -107,7 +107,7 @@ def _nested_defaults(
 def _options_of(
     make: type[Pipeline], defaults: Mapping[str, Any], words: Sequence[str]
 ) -> list[tuple[str, Any, Any]]:
-    """Return name, type and default of the options, as `dataclasses.make_dataclass` takes them."""
+    """Return name, type and default of each option for `dataclasses.make_dataclass`."""
     hints, docs = typing.get_type_hints(make), _docstrings(make)
     options: list[tuple[str, Any, Any]] = []
     for option in _dataclass_fields(make):
@@ -122,7 +122,7 @@ def _options_of(
             if default is None:
                 asked = any(word.startswith(f"--{name}.") for word in words)
                 if name == "environment" and not asked:
-                    continue  # it is optional, but has an option that is not
+                    continue  # it is optional, but one of its options is required
                 default = dataclasses.MISSING if name == "environment" else hint()
         help_text = tyro.conf.arg(help=docs.get(option.name, ""))
         annotated = Annotated[hint, help_text] if name == option.name else hint
@@ -152,12 +152,13 @@ def _configuration(make: type[Pipeline], python_name: str) -> Any:
 
 
 def _docstrings(cls: type[Any]) -> dict[str, str]:
-    """Return the docstrings below the attributes in a class's source."""
-    tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
-    body = typing.cast("ast.ClassDef", tree.body[0]).body
+    """Return the docstrings below the attributes in the source of a class and its bases."""
     docs: dict[str, str] = {}
-    for statement, following in itertools.pairwise(body):
-        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
-            text = following.value if isinstance(following, ast.Expr) else None
-            docs[statement.target.id] = str(text.value) if isinstance(text, ast.Constant) else ""
+    for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__)):
+        tree = ast.parse(textwrap.dedent(inspect.getsource(base)))
+        body = typing.cast("ast.ClassDef", tree.body[0]).body
+        for statement, following in itertools.pairwise(body):
+            if isinstance(statement, ast.AnnAssign) and isinstance(following, ast.Expr):
+                name, text = ast.unparse(statement.target), following.value
+                docs[name] = str(text.value) if isinstance(text, ast.Constant) else ""
     return docs

@@ -9,13 +9,13 @@ from physx_core.errors import PhysxError, UsageError
 
 
 def run(words: Sequence[str]) -> None:
-    """Print each plugin with its components, or with the reason why it cannot be used.
+    """Print each plugin with its components, or with the reason why it is broken.
 
     Raises:
-        UsageError: There are words after the command.
+        UsageError: If there are words after the command.
     """
     if words and words[0] in ("-h", "--help"):
-        print("usage: physx plugins\n\nLists the plugins and loads each to see what it brings.")
+        print("usage: physx plugins\n\nLists the plugins, and loads each to list its components.")
         return
     if words:
         raise UsageError(f"physx plugins takes no options, not {' '.join(words)}.")

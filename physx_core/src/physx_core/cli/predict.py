@@ -10,7 +10,7 @@ from physx_core.pipelines.prediction import Prediction
 
 
 def run(words: Sequence[str]) -> None:
-    """Predict as the words say; the first word is a session's folder."""
+    """Run a prediction; the first word is a session's folder."""
     words = list(words)
     if words and not words[0].startswith("-"):
         session = Path(words.pop(0))

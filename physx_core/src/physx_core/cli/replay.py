@@ -6,34 +6,60 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
+from physx_core import plugins
 from physx_core.cli.pipeline_options import pipeline_from
 from physx_core.dataset import Dataset
+from physx_core.errors import PhysxError, UsageError, listed
 from physx_core.pipelines.replay import Replay, recorded_environment
-from physx_core.plugins import available
 
-_VIEWER = "rerun"
+_VISUALIZER = "--environment.visualizer"
 
 
 def run(words: Sequence[str]) -> None:
-    """Replay as the words say; the first is a session's or dataset's folder.
+    """Replay samples; the first word is a session's or dataset's folder.
 
-    The environment is the second word, or else what the dataset says to have been made with. It is
-    drawn with the visualizer that is chosen, or else with Rerun, if that is installed. ``--mode``
-    is short for ``--dataset.mode``.
+    The environment is the second word, or else the one that the dataset was generated with. It is
+    drawn with the given visualizer, or else with that of the only installed visualizer plugin.
+    ``--mode`` is short for ``--dataset.mode``.
+
+    Raises:
+        UsageError: If no visualizer is given, and there is not exactly one visualizer plugin.
+        PhysxError: If there are no such samples, or the environment fails.
     """
     words = ["--dataset.mode" if word == "--mode" else word for word in words]
     place = ("dataset.existing_dir", "environment.environment")
-    pipeline = pipeline_from(Replay, "replay", place, words, _given(words))
+    viewers = _visualizer_plugins()
+    viewer = {"visualizer": viewers[0]} if len(viewers) == 1 else {}
+    pipeline = pipeline_from(Replay, "replay", place, words, _given(words, viewer))
+    config = pipeline.environment_config
+    is_given = any(word.partition("=")[0] == _VISUALIZER for word in words)
+    if config is not None and config.visualizer is None and not is_given:
+        raise UsageError(
+            f"physx replay needs {_VISUALIZER} REFERENCE, as there is not exactly one visualizer "
+            f"plugin. Installed: {listed(viewers)}. (None: draw nothing.)"
+        )
     pipeline.execute()
     config = pipeline.environment_config
     print(f"{pipeline.step_id} steps of {config.environment if config else ''}")
     print(f"session: {pipeline.session.path}")
 
 
-def _given(words: Sequence[str]) -> dict[str, Any]:
-    """Return the options of the environment that need not be typed."""
+def _visualizer_plugins() -> list[str]:
+    """Return the names of the installed plugins that contain nothing but visualizers."""
+    found = []
+    for name in plugins.available():
+        try:
+            components = plugins.load(name).components
+        except PhysxError:  # `physx plugins` reports broken ones
+            continue
+        if components.keys() == {"visualizer"}:
+            found.append(name)
+    return found
+
+
+def _given(words: Sequence[str], plain: dict[str, Any]) -> dict[str, Any]:
+    """Return default options of the environment: `plain`, and those recorded in the dataset."""
     named = list(itertools.takewhile(lambda word: not word.startswith("-"), words))
-    plain: dict[str, Any] = {"visualizer": _VIEWER} if _VIEWER in available() else {}
     if len(named) == 1 and "--environment.environment" not in words:
         with Dataset.open(named[0]) as dataset:
             plain |= recorded_environment(dataset)

@@ -23,24 +23,24 @@ BARS = "▁▂▃▄▅▆▇█"
 
 @dataclass
 class Stats:
-    """Show the numbers that were recorded in a session."""
+    """Show the statistics recorded in a session."""
 
     session: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SESSION")]
     """The session's folder."""
     width: int = 32
-    """Length of the spark lines."""
+    """Width of the spark lines, in characters."""
     tensorboard: bool = False
-    """Show them in TensorBoard: start it, tell its address, and end it with Ctrl-C."""
+    """Start TensorBoard and print its address; Ctrl-C ends it."""
     port: int = 6006
-    """Port that TensorBoard listens at, on this machine only."""
+    """Port of TensorBoard, on this machine only."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Print a line for each number, or start TensorBoard.
+    """Print a line for each statistic, or start TensorBoard.
 
     Raises:
-        SessionError: The session has no numbers, or none for TensorBoard.
-        MissingLibraryError: TensorBoard is not installed.
+        SessionError: If the session has no statistics, or none for TensorBoard.
+        MissingLibraryError: If TensorBoard is not installed.
     """
     options = tyro.cli(Stats, args=words, prog="physx stats")
     if options.tensorboard:
@@ -66,8 +66,8 @@ def _line(timeline: str, name: str, values: list[float]) -> tuple[str, ...]:
 def spark_line(values: Sequence[float], width: int) -> str:
     """Return a curve of at most `width` bars from the smallest to the largest value.
 
-    Each bar is the mean of as many values as there are to a bar. Where all values are positive and
-    span more than a factor of 100, the bars are of their logarithms. NaN and infinity are an "x".
+    Each bar is a mean of consecutive values. If all are positive and span more than a factor of
+    100, bars show their logarithms. NaN and infinity are shown as "x".
     """
     size = min(width, len(values))
     edges = [len(values) * number // max(1, size) for number in range(size + 1)]
@@ -94,7 +94,7 @@ def _start_tensorboard(session: Path, port: int) -> None:
     if not folder.is_dir():
         raise SessionError(
             f'There is no {folder}: train with statistics=["torch/tensorboard"], or '
-            "--statistics torch/tensorboard. Without --tensorboard a table is printed."
+            "--statistics torch/tensorboard. Without --tensorboard, a table is printed."
         )
     if importlib.util.find_spec("tensorboard") is None:
         raise MissingLibraryError(

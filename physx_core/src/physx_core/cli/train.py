@@ -10,7 +10,7 @@ from physx_core.pipelines.training import Training
 
 
 def run(words: Sequence[str]) -> None:
-    """Train as the words say and print the last losses and where the network is."""
+    """Train, and print the last losses and the network's folder."""
     pipeline = pipeline_from(Training, "train", ("dataset.existing_dir",), words)
     pipeline.execute()
     if not pipeline.group.leads:

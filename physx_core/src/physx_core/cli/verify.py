@@ -8,27 +8,27 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli.dataset_tables import counted
+from physx_core.cli.dataset_tables import count
 from physx_core.dataset import Dataset
 from physx_core.errors import DatasetError, DatasetNotFoundError
 
 
 @dataclass
 class Verify:
-    """Check every file of a dataset: there, whole, and of the rows that were written."""
+    """Check that every file of a dataset exists, is complete, and contains the written rows."""
 
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
     """A session's or a dataset's folder."""
     repair: bool = False
-    """First put right what can be: rebuild dataset.json, finish what a killed writer left open,
-    move partitions that cannot be read to the folder "damaged". No file is deleted."""
+    """Repair first: rebuild dataset.json, finish partitions that a killed writer left open, and
+    move unreadable partitions to the folder "damaged". No file is deleted."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Print what was repaired and each problem that is left.
+    """Print the repairs and each remaining problem.
 
     Raises:
-        DatasetError: There is no dataset, or it has problems.
+        DatasetError: If there is no dataset, or it has problems.
     """
     options = tyro.cli(Verify, args=words, prog="physx verify")
     if options.repair:
@@ -38,13 +38,13 @@ def run(words: Sequence[str]) -> None:
     for text in problems:
         print(text)
     if problems:
-        advice = "" if options.repair else " physx verify DIR --repair puts right what can be."
-        raise DatasetError(f"{options.directory} has {counted(len(problems), 'problem')}.{advice}")
+        advice = "" if options.repair else " physx verify DIR --repair repairs what it can."
+        raise DatasetError(f"{options.directory} has {count(len(problems), 'problem')}.{advice}")
     print(f"sound: {checked}")
 
 
 def _problems(directory: str) -> tuple[list[str], str]:
-    """Return the problems, and what was checked."""
+    """Return the problems, and a summary of the checked files."""
     try:
         with Dataset.open(directory) as dataset:
             problems = dataset.verify()
@@ -54,5 +54,5 @@ def _problems(directory: str) -> tuple[list[str], str]:
     except DatasetError as error:
         return [str(error)], ""
     files = sum(row["partitions"] for row in rows)
-    samples = {row["mode"]: counted(row["samples"], f"{row['mode']} sample") for row in rows}
-    return problems, f"{counted(files, 'file')}, {', '.join(samples.values()) or 'no samples'}"
+    samples = {row["mode"]: count(row["samples"], f"{row['mode']} sample") for row in rows}
+    return problems, f"{count(files, 'file')}, {', '.join(samples.values()) or 'no samples'}"

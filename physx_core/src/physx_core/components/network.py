@@ -6,15 +6,12 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from physx_core.components.group import Group
 from physx_core.errors import ConfigError, FieldsMismatchError, UsageError, listed
 from physx_core.fields import Field
 from physx_core.typing import Batch, Tensors
-
-if TYPE_CHECKING:
-    from physx_core.components.transformation import Transformation
 
 
 class Network(ABC):
@@ -30,13 +27,17 @@ class Network(ABC):
         parameters_file: Name of the file that `save_parameters` writes into a checkpoint.
         default_optimization: Reference of the optimization used where none is configured.
         default_transformation: Reference of the transformation used where none is configured.
-        export_forms: Forms that `export` writes.
+        export_forms: File formats that the network can be exported in.
+        exporter: Function that exports, as ``"package.module:function"``. It is called with the
+            path, one of `export_forms`, the network, a function from tensors of `net_fields` to
+            tensors of `pred_fields` in physical units, and the fields by name.
     """
 
     parameters_file: ClassVar[str]
     default_optimization: ClassVar[str]
     default_transformation: ClassVar[str]
     export_forms: ClassVar[Sequence[str]] = ()
+    exporter: ClassVar[str] = ""
 
     net_fields: Sequence[str] = ("input",)
     opt_fields: Sequence[str] = ("ground_truth",)
@@ -141,29 +142,6 @@ class Network(ABC):
         Raises:
             CheckpointError: The file is missing, damaged or of another architecture.
         """
-
-    def export(
-        self, path: Path, form: str, transformation: Transformation, fields: Mapping[str, Field]
-    ) -> None:
-        """Write network and transformation into one file that other programs run.
-
-        It reads `net_fields` and gives `pred_fields`, both in physical units and by these names,
-        for any number of samples.
-
-        Args:
-            path: The file; an existing one is replaced.
-            form: One of `export_forms`.
-            transformation: What the network is used with.
-            fields: The fields that the network was bound to.
-
-        Raises:
-            ConfigError: The network cannot be written in this form.
-            MissingLibraryError: A library that the form needs is not installed.
-        """
-        raise ConfigError(
-            f'{type(self).__name__} cannot be exported as "{form}". '
-            f"Forms: {listed(self.export_forms)}."
-        )
 
     @abstractmethod
     def numpy_to_tensor(self, batch: Batch) -> Tensors:

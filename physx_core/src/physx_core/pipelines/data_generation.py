@@ -1,4 +1,4 @@
-"""DataGeneration: environments make samples, and the dataset keeps them."""
+"""DataGeneration: environments generate samples, and the dataset stores them."""
 
 from __future__ import annotations
 
@@ -10,41 +10,35 @@ from typing import ClassVar
 from physx_core.config import MODES, WRONG, DatasetConfig, EnvironmentConfig, at_least, options
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, listed
-from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
+from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
 from physx_core.pipelines.run_description import describe_dataset, describe_environment_config
 from physx_core.pipelines.storage import describe_environment, open_own, record_rejected
-from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 
 
 @options
 @dataclass(eq=False)
-class DataGeneration(Pipeline):
-    """Makes ``batch_nb`` batches of ``batch_size`` samples and stores them in its session.
+class DataGeneration(NewSessionPipeline):
+    """Generates ``batch_nb`` batches of ``batch_size`` samples and stores them in its session.
 
     Attributes:
         dataset: The session's dataset, open for writing.
         source: The environments.
-        batch: The batch that was made last.
-        batch_id: Number of batches that are stored.
+        batch: The last batch.
+        batch_id: Number of stored batches.
     """
 
     environment_config: EnvironmentConfig
     dataset_config: DatasetConfig | None = None
-    session_dir: str = "sessions"
-    """Folder of the sessions, relative to the working directory."""
-    session_name: str = "data_generation"
-    """Name of the session's folder."""
-    new_session: bool = True
-    """Leave an existing session of this name alone and number the new one; otherwise add to it."""
     _: KW_ONLY
+    session_name: str = "data_generation"
     batch_nb: int = at_least(1)
-    """Number of batches to make."""
+    """Number of batches to generate."""
     batch_size: int = at_least(1)
     """Number of samples in a batch."""
     mode: str | None = field(default=None, metadata={"choices": MODES})
-    """Mode that the samples are stored in; None: that of the dataset's configuration."""
+    """Mode to store the samples in; None: that of the dataset's configuration."""
 
     kind: ClassVar[str] = "data_generation"
     dataset: Dataset = field(init=False, repr=False)
@@ -53,11 +47,11 @@ class DataGeneration(Pipeline):
     batch_id: int = field(init=False, repr=False, default=0)
 
     def execute(self) -> None:
-        """Make all batches.
+        """Generate all batches.
 
         Raises:
-            PhysxError: An environment failed or gave data that cannot be stored; what was
-                committed stays.
+            PhysxError: If an environment fails or sets data that cannot be stored; committed
+                samples are kept.
         """
         with self._running():
             self.data_generation_begin()
@@ -69,22 +63,22 @@ class DataGeneration(Pipeline):
             self.data_generation_end()
 
     def data_generation_begin(self) -> None:
-        """The first batch is about to be made."""
+        """Called before the first batch."""
         self.batch_id = 0
         self.observers.begin("generation", self.batch_nb * self.batch_size, "samples")
 
     def batch_condition(self) -> bool:
-        """Return whether there are batches left to make."""
+        """Return whether there are batches left to generate."""
         return self.batch_id < self.batch_nb
 
     def batch_begin(self) -> None:
-        """A batch is about to be made."""
+        """Called before each batch."""
 
     def batch_produce(self) -> None:
-        """Make a batch and store it; the samples are committed when this returns.
+        """Generate a batch and store it; the samples are committed when this returns.
 
-        With ``record_wrong_samples`` what `check_sample` rejected meanwhile is stored too, in the
-        mode "wrong".
+        With ``record_wrong_samples`` the samples that `check_sample` rejected meanwhile are stored
+        too, in the mode "wrong".
         """
         with record_rejected(self.source, self.dataset):
             self.batch = self.source.batch(self.batch_size)
@@ -98,10 +92,10 @@ class DataGeneration(Pipeline):
         self.observers.advance(self.batch_size)
 
     def batch_end(self) -> None:
-        """A batch is stored."""
+        """Called after each batch."""
 
     def data_generation_end(self) -> None:
-        """The last batch is stored."""
+        """Called after the last batch."""
         self.observers.end()
 
     @property
@@ -112,22 +106,22 @@ class DataGeneration(Pipeline):
         dataset_config = self.dataset_config or DatasetConfig()
         if dataset_config.existing_dir is not None:
             raise ConfigError(
-                "DataGeneration writes into the dataset of its own session, so it takes no "
-                "existing_dir. To add to a session, give its name and new_session=False."
+                "DataGeneration writes into the dataset of its own session, so existing_dir cannot "
+                "be set. To add to a session, give its name and new_session=False."
             )
         config = self.environment_config
         if config.load_samples:
             raise ConfigError(
-                "DataGeneration makes new samples, so it takes no load_samples: that works in "
+                "DataGeneration generates new samples, so load_samples cannot be set: it works in "
                 "Training, Prediction and Replay."
             )
         if self._mode == WRONG:
             raise ConfigError(
-                'The mode "wrong" is that of samples which check_sample rejected. Make samples for '
-                f"{listed(MODES)}, with record_wrong_samples=True to keep those that are rejected."
+                'The mode "wrong" is for samples that check_sample rejects. Generate samples for '
+                f"{listed(MODES)}, with record_wrong_samples=True to keep the rejected ones."
             )
-        seed = chosen_seed(config.seed)
-        self.session = Session.create(self.session_dir, self.session_name, self.new_session)
+        seed = choose_seed(config.seed)
+        self.session = self._create_session()
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
         offset = self.dataset.num_samples(self._mode) if self._mode in self.dataset.modes else 0
         self.dataset.update_info(**describe_environment(config, seed))
@@ -136,7 +130,7 @@ class DataGeneration(Pipeline):
         self.source = self._open_source(
             resources,
             config,
-            stream_seed(seed, self._mode, offset),
+            derive_seed(seed, self._mode, offset),
             total=self.batch_nb * self.batch_size,
         )
 

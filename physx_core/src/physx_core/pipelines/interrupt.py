@@ -1,4 +1,4 @@
-"""Ctrl-C that waits until the work under way is in order."""
+"""Defers Ctrl-C until the current step is finished."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from types import FrameType
 
 @contextlib.contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Hold a first Ctrl-C back, and tell of it; a second one interrupts at once.
+    """Defer the first Ctrl-C, and yield a function that tells whether it was pressed.
 
-    Outside of the main thread, and where somebody else handles Ctrl-C, nothing changes.
+    A second one interrupts at once. Outside the main thread, and where Ctrl-C is already handled,
+    nothing changes.
     """
     pressed = False
 

@@ -13,46 +13,47 @@ from physx_core.components.network import Network
 from physx_core.components.optimization import Optimization
 from physx_core.components.transformation import Transformation
 from physx_core.config import NetworkConfig
-from physx_core.errors import ConfigError, MissingFieldError, UsageError
+from physx_core.errors import ConfigError, MissingFieldError, UsageError, listed
 from physx_core.fields import Field
-from physx_core.plugins import resolve
+from physx_core.plugins import import_component, resolve
 from physx_core.plugins.networks import resolve_network
 from physx_core.statistics import Normalization
-from physx_core.typing import Array, Batch
+from physx_core.typing import Array, Batch, Tensors
 
 
 class Learner:
-    """Everything that a `NetworkConfig` describes, working together.
+    """The components that a `NetworkConfig` describes, working together.
 
     Attributes:
-        config: The configuration, with references in the place of None.
+        config: The configuration, with the transformation's default filled in.
         network: The network.
-        transformation: Works between physical units and the network.
-        optimization: Improves the network; None where nothing is trained.
+        transformation: Converts between physical units and what the network computes with.
+        optimization: Improves the network; None if nothing is trained.
         fields: The fields that the network was bound to, by name.
         group: The processes that train the network together.
     """
 
     def __init__(self, config: NetworkConfig, *, trains: bool) -> None:
-        """Make the components.
+        """Create the components.
 
         Args:
-            config: What to make.
-            trains: Whether an optimization is made too.
+            config: The components and their arguments.
+            trains: Whether an optimization is created too.
 
         Raises:
-            ConfigError: No network is configured, or a component refuses its arguments.
-            PhysxError: A reference leads nowhere.
+            ConfigError: If no network is configured, or a component rejects its arguments.
+            PhysxError: If a reference cannot be resolved.
         """
         if config.network is None:
             raise ConfigError(
                 'NetworkConfig.network is missing: name a network, for example "torch/fc".'
             )
         make, arguments = resolve_network(config.network, config.network_kwargs)
-        self.network: Network = _made("network", config.network, make, arguments, Network)
+        self.network: Network = _create("network", config.network, make, arguments, Network)
         reference = config.transformation or self.network.default_transformation
-        self.transformation: Transformation = _make(
-            "transformation", reference, config.transformation_kwargs, Transformation
+        make = resolve("transformation", reference)
+        self.transformation: Transformation = _create(
+            "transformation", reference, make, config.transformation_kwargs, Transformation
         )
         self.config = dataclasses.replace(config, transformation=reference)
         self.network.set_data_type(config.data_type)
@@ -62,12 +63,13 @@ class Learner:
         self.group = Group()
         self._is_between_steps = False
         if trains:
-            self.optimization = self._make_optimization(config)
+            self.optimization = self._create_optimization(config)
 
-    def _make_optimization(self, config: NetworkConfig) -> Optimization:
+    def _create_optimization(self, config: NetworkConfig) -> Optimization:
         reference = config.optimization or self.network.default_optimization
-        optimization: Optimization = _make(
-            "optimization", reference, config.optimization_kwargs, Optimization
+        make = resolve("optimization", reference)
+        optimization: Optimization = _create(
+            "optimization", reference, make, config.optimization_kwargs, Optimization
         )
         arguments = dict(config.optimizer_kwargs)
         if config.lr is not None:
@@ -79,81 +81,74 @@ class Learner:
         if config.scheduler is not None:
             optimization.set_scheduler(config.scheduler, **config.scheduler_kwargs)
         elif config.scheduler_kwargs:
-            raise ConfigError("NetworkConfig.scheduler_kwargs are given without scheduler.")
+            raise ConfigError("NetworkConfig.scheduler_kwargs is given without a scheduler.")
         return optimization
 
     def bind(self, fields: Mapping[str, Field], normalization: Mapping[str, Normalization]) -> None:
-        """Tell the components the fields' shapes and normalization.
+        """Pass the fields' shapes and normalization to the components.
 
         Raises:
-            FieldsMismatchError: The network needs fields of other names or shapes.
+            FieldsMismatchError: If the network needs fields with other names or shapes.
         """
         self.fields = dict(fields)
         self.network.bind(fields)
         self.normalize(normalization)
 
     def normalize(self, normalization: Mapping[str, Normalization]) -> None:
-        """Tell the transformation the normalization of the network's fields."""
+        """Pass the normalization of the network's fields to the transformation."""
         used = {*self.network.net_fields, *self.network.opt_fields}
         mine = {name: item for name, item in normalization.items() if name in used}
         self.transformation.set_normalization(mine, self.network)
 
     @property
     def batch_fields(self) -> list[str]:
-        """Names of the fields that a training batch must hold."""
+        """Names of the fields that a training batch must contain."""
         extra = self.optimization.extra_fields if self.optimization is not None else ()
         names = (*self.network.net_fields, *self.network.opt_fields, *extra)
         return list(dict.fromkeys(names))
 
-    def loss(self, batch: Batch) -> tuple[Any, dict[str, Any]]:
-        """Return the loss of a batch in physical units, and the batch as tensors.
-
-        Raises:
-            UsageError: There is no optimization.
-        """
+    def _compute_loss(self, optimization: Optimization, batch: Batch) -> tuple[Any, dict[str, Any]]:
+        """Return the loss of a batch in physical units, and the batch as tensors."""
         network, transformation = self.network, self.transformation
         data = network.numpy_to_tensor(batch)
         inputs = {name: data[name] for name in network.net_fields}
         targets = {name: data[name] for name in network.opt_fields}
         prediction = network.predict(transformation.transform_before_prediction(inputs))
         prediction, targets = transformation.transform_before_loss(prediction, targets)
-        return self._trainer().compute_loss(prediction, targets, data), data
+        return optimization.compute_loss(prediction, targets, data), data
 
     def _trainer(self) -> Optimization:
         if self.optimization is None:
-            raise UsageError("This network was made to predict, not to be trained.")
+            raise UsageError("This network was created for prediction and cannot be trained.")
         return self.optimization
 
     def optimize(self, batch: Batch) -> dict[str, Any]:
-        """Let the network learn from a batch; return the statistics of the step, ``loss`` first.
+        """Train on a batch and return the statistics of the step, ``loss`` first.
+
+        In a group of processes each trains on its share; the statistics are those of the batch.
 
         Raises:
-            UsageError: There is no optimization.
+            UsageError: If there is no optimization.
         """
         if self._is_between_steps:
             self._is_between_steps = False
             self.network.set_train()
-        if self.group.size > 1:
-            return self._optimize_together(batch)
-        loss, data = self.loss(batch)
-        optimization = self._trainer()
-        optimization.optimize(loss)
-        return optimization.transform_loss(loss, data)
-
-    def _optimize_together(self, batch: Batch) -> dict[str, Any]:
-        """Learn from this process's share of the batch; the statistics are those of the whole."""
-        share, weight = self.group.share_of(batch)
-        loss, data = self.loss(share)
-        optimization = self._trainer()
-        optimization.optimize(loss * (weight * self.group.size))  # their mean is that of the batch
+        optimization, group = self._trainer(), self.group
+        if group.size == 1:
+            loss, data = self._compute_loss(optimization, batch)
+            optimization.optimize(loss)
+            return optimization.transform_loss(loss, data)
+        share, weight = group.share_of(batch)
+        loss, data = self._compute_loss(optimization, share)
+        optimization.optimize(loss * (weight * group.size))  # their mean is that of the batch
         losses = optimization.transform_loss(loss, data)
-        totals = self.group.total([float(value) * weight for value in losses.values()])
+        totals = group.total([float(value) * weight for value in losses.values()])
         return dict(zip(losses, totals, strict=True))
 
     def mean_losses(self, batches: Iterable[Batch]) -> dict[str, float]:
         """Return the mean statistics over all samples of some batches, ``loss`` first.
 
-        The network learns nothing. Processes that train together take their share of each batch.
+        The network is not changed. In a group of processes each evaluates its share of a batch.
         """
         self.network.set_eval()
         optimization = self._trainer()
@@ -164,7 +159,8 @@ class Learner:
             if self.group.size > 1:
                 share, weight = self.group.share_of(batch)
                 size *= weight
-            for name, value in optimization.transform_loss(*self.loss(share)).items():
+            losses = optimization.transform_loss(*self._compute_loss(optimization, share))
+            for name, value in losses.items():
                 sums[name] = sums.get(name, 0.0) + float(value) * size
             count += size
         self.network.set_train()
@@ -182,30 +178,30 @@ class Learner:
 
     @property
     def learning_rate(self) -> float | None:
-        """The present learning rate; None where there is no such thing."""
+        """The current learning rate; None if the optimization has none."""
         return self._trainer().learning_rate()
 
     def join(self, group: Group) -> None:
-        """Train together with other processes from here on; fields and parameters are known.
+        """Train in a group of processes from now on; fields and parameters are known.
 
         Raises:
-            ConfigError: The optimization cannot do that.
+            ConfigError: If the optimization does not support several processes.
         """
         self.group = group
         if group.size > 1:
             self._trainer().join(group)
 
     def epoch_end(self, loss: float) -> None:
-        """Tell the optimization that an epoch is over, and the loss that it is judged by."""
+        """Pass the loss of a finished epoch to the optimization."""
         self._trainer().epoch_end(loss)
 
     def predict_in_training(self, batch: Batch) -> Batch:
-        """Return the prediction of the network as it is now, between two optimization steps.
+        """Return the prediction of the current network, between two optimization steps.
 
-        There may be many between two steps, so the network stays ready to predict until the next.
+        The network stays in evaluation mode until the next step, as there may be many predictions.
 
         Raises:
-            UsageError: The fields' shapes are not known yet.
+            UsageError: If the fields' shapes are not known yet.
         """
         if not self.fields:
             raise UsageError(
@@ -220,20 +216,23 @@ class Learner:
         """Return the prediction for a batch, both in physical units.
 
         Raises:
-            MissingFieldError: The batch lacks a field that the network reads.
+            MissingFieldError: If the batch lacks a field that the network reads.
         """
         network = self.network
         try:
             read = {name: batch[name] for name in network.net_fields}
         except KeyError as error:
             raise MissingFieldError(
-                f'The network reads the field "{error.args[0]}", which is not given. '
+                f'The network reads the field "{error.args[0]}", which is missing. '
                 f"Given: {', '.join(batch) or 'none'}.",
                 field=str(error.args[0]),
             ) from None
-        inputs = network.numpy_to_tensor(read)
-        prediction = network.predict(self.transformation.transform_before_prediction(inputs))
-        return network.tensor_to_numpy(self.transformation.transform_before_apply(prediction))
+        return network.tensor_to_numpy(self._predict_tensors(network.numpy_to_tensor(read)))
+
+    def _predict_tensors(self, inputs: Tensors) -> Tensors:
+        """Return the prediction for the network's inputs, both in physical units."""
+        prediction = self.network.predict(self.transformation.transform_before_prediction(inputs))
+        return self.transformation.transform_before_apply(prediction)
 
     def save(self, network_dir: Path, progress: checkpoint.Progress, *, best: bool = False) -> Path:
         """Write the next checkpoint, or the best one, and return its folder."""
@@ -248,15 +247,34 @@ class Learner:
             best=best,
         )
 
-    def export(self, path: Path, form: str) -> None:
-        """Write network and transformation as one file: see `Network.export`."""
-        self.network.export(path, form, self.transformation, self.fields)
+    def export(self, path: str | Path, form: str) -> None:
+        """Write network and transformation into one file that other programs run.
 
-    def resume(self, found: checkpoint.Checkpoint) -> None:
-        """Go on exactly where a checkpoint was written; the fields are bound already.
+        The file's inputs are `Network.net_fields` and its outputs `Network.pred_fields`, in
+        physical units and by these names, for any number of samples.
+
+        Args:
+            path: The file; an existing one is replaced.
+            form: One of `Network.export_forms`.
 
         Raises:
-            CheckpointError: It is damaged, or of another network or optimization.
+            ConfigError: If the network cannot be exported in this form.
+            MissingLibraryError: If a library that the form needs is not installed.
+        """
+        network = self.network
+        if form not in network.export_forms:
+            raise ConfigError(
+                f'{type(network).__name__} cannot be exported as "{form}". '
+                f"Forms: {listed(network.export_forms)}."
+            )
+        write = import_component("exporter", network.exporter)
+        write(Path(path), form, network, self._predict_tensors, self.fields)
+
+    def resume(self, found: checkpoint.Checkpoint) -> None:
+        """Continue a training exactly where a checkpoint was written; the fields are bound.
+
+        Raises:
+            CheckpointError: If it is damaged, or belongs to another network or optimization.
         """
         self.network.load_parameters(found.path / self.network.parameters_file)
         optimization = self._trainer()
@@ -264,18 +282,20 @@ class Learner:
             optimization.load_state(found.path / optimization.state_file)
 
 
-def restored(config: NetworkConfig, path: Path) -> Learner:
-    """Return the network of a checkpoint, ready to predict.
+def load_learner(folder: str | Path, config: NetworkConfig | None = None) -> Learner:
+    """Return the trained network of a session, ready to predict.
 
     Args:
-        config: What it leaves open is taken from the checkpoint.
-        path: The checkpoint's folder.
+        folder: The session's folder, that of its checkpoints, or that of one checkpoint.
+        config: The checkpoint to load, and options that replace its own; None: the last one.
 
     Raises:
-        CheckpointError: The checkpoint is damaged or of another network.
-        FieldsMismatchError: The network reads other fields.
+        CheckpointError: If there is no checkpoint, or it is damaged or of another network.
+        FieldsMismatchError: If the network reads other fields.
     """
-    found = checkpoint.read(path)
+    config = config or NetworkConfig()
+    place = Path(config.network_dir or folder)
+    found = checkpoint.read(checkpoint.find(place, config.network_name, config.which_network))
     kept = dict(found.network)
     if config.network is not None:
         kept |= {"network": config.network, "network_kwargs": config.network_kwargs}
@@ -286,40 +306,22 @@ def restored(config: NetworkConfig, path: Path) -> Learner:
         }
     learner = Learner(dataclasses.replace(config, **kept), trains=False)
     learner.bind(found.fields, found.normalization)
-    learner.network.load_parameters(path / learner.network.parameters_file)
+    learner.network.load_parameters(found.path / learner.network.parameters_file)
     learner.network.set_eval()
     return learner
 
 
-def load_learner(folder: str | Path, config: NetworkConfig | None = None) -> Learner:
-    """Return the trained network of a session, ready to predict.
-
-    Args:
-        folder: The session's folder, or that of its checkpoints.
-        config: Which checkpoint, and what else to change; None: the last one.
-
-    Raises:
-        CheckpointError: There is no checkpoint, or it is damaged or of another network.
-        FieldsMismatchError: The network reads other fields.
-    """
-    config = config or NetworkConfig()
-    place = Path(config.network_dir or folder)
-    return restored(config, checkpoint.find(place, config.network_name, config.which_network))
-
-
-def _make(kind: str, reference: Any, arguments: dict[str, Any], base: type[Any]) -> Any:
-    return _made(kind, reference, resolve(kind, reference), arguments, base)
-
-
-def _made(kind: str, reference: Any, make: Any, arguments: dict[str, Any], base: type[Any]) -> Any:
+def _create(
+    kind: str, reference: Any, make: Any, arguments: dict[str, Any], base: type[Any]
+) -> Any:
     try:
         component = make(**arguments)
     except TypeError as error:
-        raise ConfigError(f"The {kind} {reference!r} refuses its arguments: {error}.") from error
+        raise ConfigError(f"The {kind} {reference!r} rejects its arguments: {error}.") from error
     if not isinstance(component, base):
         raise ConfigError(
-            f"{reference!r} made a {type(component).__name__}, which is no physx {kind}. "
-            "A function that makes one of the library's own goes through its plugin, for example "
-            'network="torch/module", network_kwargs={"module": "package.module:function"}.'
+            f"{reference!r} returned a {type(component).__name__}, which is not a physx {kind}. "
+            "Use a function that returns a component of another library through its plugin, for "
+            'example network="torch/module", network_kwargs={"module": "package.module:function"}.'
         )
     return component

@@ -1,4 +1,4 @@
-"""Pipeline: what the three pipelines share: a session, observers, and an orderly end."""
+"""Pipeline: the session, observers, and orderly end that all pipelines share."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import os
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import ClassVar, Self
@@ -25,12 +26,13 @@ from physx_core.sources.source import Source
 _STREAMS = {"training": 0, "validation": 1, "prediction": 2}
 
 
+@dataclass(eq=False, kw_only=True)
 class Pipeline(ABC):
     """Base of the pipelines.
 
     A pipeline is a context manager: entering it opens its session, dataset, environments and
-    network, leaving it closes them, whatever happened. `execute` does both where it is called on a
-    pipeline that is not open. Subclasses may override every event method.
+    network, and leaving it closes them in any case. `execute` does both if the pipeline is not
+    open. Subclasses may override every event method.
 
     Attributes:
         session: The run's folder; known once the pipeline is open.
@@ -38,37 +40,42 @@ class Pipeline(ABC):
         kind: The pipeline's table in configuration files.
     """
 
+    session_dir: str = "sessions"
+    """Folder of the sessions, relative to the working directory."""
+    session_name: str = "training"
+    """Name of the session's folder."""
+
     kind: ClassVar[str]
-    session: Session
-    observers: Observers
-    _resources: contextlib.ExitStack | None = None
-    _leads = True  # whether this process writes the session; others may help it to train
+    session: Session = field(init=False, repr=False)
+    observers: Observers = field(init=False, repr=False)
+    _resources: contextlib.ExitStack | None = field(init=False, repr=False, default=None)
+    _leads = True  # whether this process writes the session; others only help with the training
     _began = 0.0
 
     @abstractmethod
     def execute(self) -> None:
-        """Run the pipeline from its begin to its end."""
+        """Run the pipeline from start to end."""
 
     @abstractmethod
     def _open(self, resources: contextlib.ExitStack) -> None:
-        """Open everything; what must be closed goes on the stack, in the order of opening."""
+        """Open everything, and push what must be closed onto the stack."""
 
     def _components(self) -> Mapping[str, str]:
-        """Return what the run is made of, in words, for ``info.txt``."""
+        """Return descriptions of the run's components by name, for ``info.txt``."""
         return {}
 
     def __enter__(self) -> Self:
         """Open the session and everything that the pipeline works with.
 
-        Where that fails, a session that was made for it is removed.
+        If that fails, a session that was created for it is removed.
 
         Raises:
-            UsageError: A script without ``if __name__ == "__main__":`` runs in a client.
-            PhysxError: Something that the pipeline needs is missing or fails.
+            UsageError: If a client runs a script without ``if __name__ == "__main__":``.
+            PhysxError: If something that the pipeline needs is missing or fails.
         """
         if os.environ.get("PHYSX_CLIENT"):
             raise UsageError(
-                "A client imports the script that defines its environment, and the script started "
+                "A client imported the script that defines its environment, and the script started "
                 'a pipeline. Put the pipeline under  if __name__ == "__main__":'
             )
         self.session = None  # type: ignore[assignment]
@@ -76,7 +83,7 @@ class Pipeline(ABC):
             with contextlib.ExitStack() as resources:
                 self._began = time.monotonic()
                 self._open(resources)
-                self._note_components()
+                self._describe_components()
                 self._resources = resources.pop_all()
         except BaseException:
             if self.session is not None:
@@ -96,7 +103,7 @@ class Pipeline(ABC):
             self._note_end(error)
             resources.__exit__(kind, error, trace)
 
-    def _note_components(self) -> None:
+    def _describe_components(self) -> None:
         components = self._components()
         if self._leads and components:
             texts = (f"{name}: {text}" for name, text in components.items())
@@ -109,12 +116,12 @@ class Pipeline(ABC):
         elif error is not None:
             how = f"ended by {type(error).__name__}"
         if self._leads:
-            with contextlib.suppress(OSError):  # the run's own error is the one to tell
+            with contextlib.suppress(OSError):  # the run's own error matters more
                 self.session.note(f"{how} after {time.monotonic() - self._began:.1f} s")
 
     @contextlib.contextmanager
     def _running(self) -> Iterator[None]:
-        """Be open for a while: open now and close at the end, unless the user did it."""
+        """Open the pipeline for the duration of a run, unless the user has opened it."""
         if self._resources is not None:
             yield
         else:
@@ -127,7 +134,7 @@ class Pipeline(ABC):
         environment: EnvironmentConfig | None,
         further: Iterable[Observer] = (),
     ) -> None:
-        """Open the observers of the run; only the process that writes the session has any."""
+        """Open the run's observers; only the process that writes the session has any."""
         if not self._leads:
             self.observers = Observers([])
             return
@@ -158,13 +165,13 @@ class Pipeline(ABC):
 
         Args:
             resources: Closes them at the end.
-            config: Which environment, and where.
+            config: The environment, and how its instances run.
             seed: Seed of the instances.
             predict: The network's prediction for a batch; None: there is no network.
-            total: How many rows will be asked; None: unknown.
+            total: Number of rows that will be requested; None: unknown.
             in_process: Whether they must run in this process.
-            replayed: Folder of the dataset whose samples they replay; what its environments saved
-                can be loaded. None: they make new samples.
+            replayed: Folder of the dataset whose samples they replay; the parameters saved there
+                can be loaded. None: they generate new samples.
             accept_all: Whether samples that `check_sample` rejects count like the others.
         """
         services = RunServices(self.session.dataset_dir, self.observers, predict, replayed)
@@ -176,7 +183,7 @@ class Pipeline(ABC):
         else:
             from physx_core.sources.client_source import ClientSource
 
-            # A network that learns changes its answers; a row to replay is sent when it is due.
+            # Predictions change while a network learns; a row to replay is sent when it is due.
             ahead = None if predict is None and replayed is None else 0
             source = ClientSource(
                 config, services, seed, run_ahead=ahead, total=total, accept_all=accept_all
@@ -184,7 +191,7 @@ class Pipeline(ABC):
         return resources.enter_context(source)
 
     def _record_config(self, seed: int) -> None:
-        """Write the options into the session, with the seed that was drawn if none was given."""
+        """Write the options into the session, with the seed that is used."""
         if not self._leads:
             return
         plain = {**to_plain(self), "session_name": self.session.name}
@@ -193,19 +200,30 @@ class Pipeline(ABC):
         self.session.record(self.kind, plain, seed)
 
 
-def chosen_seed(seed: int | None) -> int:
-    """Return the seed, or a fresh one where none was given."""
+@dataclass(eq=False, kw_only=True)
+class NewSessionPipeline(Pipeline):
+    """Base of the pipelines that may create their session."""
+
+    new_session: bool = True
+    """Number the new session if one of this name exists; otherwise continue in the existing one."""
+
+    def _create_session(self) -> Session:
+        return Session.create(self.session_dir, self.session_name, self.new_session)
+
+
+def choose_seed(seed: int | None) -> int:
+    """Return the seed, or a random one if it is None."""
     if seed is not None:
         return seed
     return int(np.random.SeedSequence().generate_state(1, np.uint32)[0])
 
 
-def stream_seed(seed: int, mode: str, offset: int) -> list[int]:
-    """Return the seed of the environments of one run.
+def derive_seed(seed: int, mode: str, offset: int) -> list[int]:
+    """Return the seed of a run's environments.
 
     Args:
         seed: The configured seed.
-        mode: Mode of the samples: two modes never get the same samples.
-        offset: Samples that the mode already holds: a run that adds some does not repeat them.
+        mode: Mode of the samples, so that no two modes get the same samples.
+        offset: Number of samples that the mode has, so that a run does not generate them again.
     """
     return [seed, _STREAMS[mode], offset]

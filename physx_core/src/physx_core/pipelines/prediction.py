@@ -1,4 +1,4 @@
-"""Prediction: a trained network takes part in the running simulation."""
+"""Prediction: feeds a trained network's predictions into the running simulation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from physx_core.dataset import Dataset
 from physx_core.fields import Field
 from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.learner import Learner, load_learner
-from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
+from physx_core.pipelines.pipeline import Pipeline, choose_seed, derive_seed
 from physx_core.pipelines.run_description import describe_environment_config, describe_learner
 from physx_core.pipelines.storage import (
     describe_environment,
@@ -29,37 +29,35 @@ from physx_core.typing import Batch
 @options
 @dataclass(eq=False)
 class Prediction(Pipeline):
-    """Steps the environments and gives them the network's predictions, again and again.
+    """Steps the environments and applies the network's predictions to them.
 
     One environment runs in this process. Several (``num_clients``) run in clients, or in this
-    process too with ``as_tcp_ip_client=False``. In each step every instance makes one sample, the
+    process with ``as_tcp_ip_client=False``. In each step every instance generates one sample, the
     network predicts for all of them as one batch, row i for instance i + 1, and each instance gets
-    its row with `Environment.apply_prediction`: the same numbers either way. What an environment
-    asks for itself with `Environment.get_prediction` is predicted sample by sample in this process,
-    but for all clients as one batch, whose results a network may round otherwise.
+    its row with `Environment.apply_prediction`: the same numbers either way. Requests with
+    `Environment.get_prediction` are predicted one by one in this process, but for all clients as
+    one batch, which a network may round differently.
 
-    With ``load_samples`` the environments replay stored samples, those of
+    With ``load_samples`` the environments replay stored samples: those of
     ``dataset_config.existing_dir`` or else of the session, mode ``dataset_config.mode``, in the
-    order of writing: each step takes as many as there are instances, which find them in
-    `Environment.sample`. After the last sample comes the first. They are only read.
+    order of writing. Each step takes one per instance, available as `Environment.sample`. After
+    the last sample it starts over. The dataset is only read.
 
     Attributes:
         learner: The network and its transformation, from the session's checkpoint.
         source: The environments.
         dataset: The session's own dataset, open for writing, if samples are recorded; else None.
-        batch: The present samples, one row for each instance of the environment.
+        batch: The current samples, one row for each instance of the environment.
         prediction: The network's prediction for them, in physical units.
-        step_id: Number of steps that are finished.
+        step_id: Number of finished steps.
     """
 
     network_config: NetworkConfig
     environment_config: EnvironmentConfig
     dataset_config: DatasetConfig | None = None
-    session_dir: str = "sessions"
-    """Folder of the sessions, relative to the working directory."""
+    _: KW_ONLY
     session_name: str = "training"
     """Name of the session whose network predicts."""
-    _: KW_ONLY
     step_nb: int = at_least(-1, -1)
     """Number of steps; -1: until Ctrl-C."""
     record: bool = False
@@ -76,12 +74,12 @@ class Prediction(Pipeline):
     _stored: StoredRows | None = field(init=False, repr=False, default=None)
 
     def execute(self) -> None:
-        """Run all steps. Ctrl-C ends the run in order after the present step.
+        """Run all steps. Ctrl-C ends the run in an orderly way after the current step.
 
         Raises:
-            PhysxError: There is no network, or the environment failed.
-            KeyboardInterrupt: Ctrl-C before ``step_nb`` steps were made; a second one ends the run
-                at once.
+            PhysxError: If there is no network, or the environment fails.
+            KeyboardInterrupt: After Ctrl-C before ``step_nb`` steps; a second one ends the run at
+                once.
         """
         with self._running(), deferred_interrupt() as interrupted:
             self.prediction_begin()
@@ -94,7 +92,7 @@ class Prediction(Pipeline):
                 raise KeyboardInterrupt
 
     def prediction_begin(self) -> None:
-        """The first step is about to be made."""
+        """Called before the first step."""
         self.step_id = 0
         self.observers.begin("prediction", None if self.step_nb < 0 else self.step_nb, "steps")
 
@@ -103,13 +101,13 @@ class Prediction(Pipeline):
         return self.step_nb < 0 or self.step_id < self.step_nb
 
     def sample_begin(self) -> None:
-        """A step is about to be made."""
+        """Called before each step."""
 
     def predict(self) -> None:
-        """Step the environments, ask the network, and give its answers to the environments."""
+        """Step the environments, predict, and apply the predictions to the environments."""
         count = self.source.instance_nb
         with record_rejected(self.source, self.dataset):
-            stored = None if self._stored is None else self._stored.take_on(count)
+            stored = None if self._stored is None else self._stored.take_cyclic(count)
             self.batch = self.source.batch(count, stored)
             self.prediction = self.learner.predict(self.batch)
             self.source.apply(self.prediction)
@@ -122,11 +120,11 @@ class Prediction(Pipeline):
         self.observers.advance(1)
 
     def prediction_end(self) -> None:
-        """The last step is made."""
+        """Called after the last step."""
         self.observers.end()
 
     def _store(self, dataset: Dataset) -> None:
-        """Store samples and predictions; a predicted field of a taken name gets a prefix."""
+        """Store samples and predictions; a predicted field gets a prefix if its name is taken."""
         predicted = {
             name if name not in self.batch else f"predicted_{name}": values
             for name, values in self.prediction.items()
@@ -145,7 +143,7 @@ class Prediction(Pipeline):
 
     def _open(self, resources: contextlib.ExitStack) -> None:
         network, environment = self.network_config, self.environment_config
-        seed = chosen_seed(environment.seed)
+        seed = choose_seed(environment.seed)
         self.session = Session.existing(self.session_dir, self.session_name)
         self.learner = load_learner(self.session.path, network)
         config = self.dataset_config or DatasetConfig()
@@ -162,7 +160,7 @@ class Prediction(Pipeline):
         self.source = self._open_source(
             resources,
             environment,
-            stream_seed(seed, "prediction", 0),
+            derive_seed(seed, "prediction", 0),
             predict=self.learner.predict,
             in_process=environment.num_clients == 1,
             replayed=replayed,

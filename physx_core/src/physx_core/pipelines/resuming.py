@@ -1,4 +1,4 @@
-"""What a training that is resumed goes on with."""
+"""Finds the checkpoint and the dataset that a training resumes from."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from physx_core.pipelines.storage import is_copy
 from physx_core.session import Session
 
 
-def last_checkpoint(
+def read_last_checkpoint(
     session: Session, name: str, environment: EnvironmentConfig | None
 ) -> Checkpoint:
-    """Return the checkpoint that a training goes on from.
+    """Return the checkpoint that a training resumes from.
 
     Args:
         session: The training's session.
         name: Name of the network.
-        environment: What made the samples; all that are needed must be stored already.
+        environment: The environment of the samples; all needed samples must be stored already.
 
     Raises:
-        CheckpointError: There is none, or it is damaged.
-        ConfigError: Environments would have to make samples.
+        CheckpointError: If there is none, or it is damaged.
+        ConfigError: If environments would have to generate samples.
     """
     found = checkpoint.read(checkpoint.find(session.network_dir, name, -1))
     if environment is not None:
         replays = environment.load_samples and not environment.only_first_epoch
         if environment.always_produce or replays or found.progress.epoch == 0:
             raise ConfigError(
-                "A training cannot be resumed while environments make its samples: they would "
-                "begin anew. Train on the stored samples: leave the environment out."
+                "A training cannot be resumed while environments generate its samples, as they "
+                "would start over. Train on the stored samples: leave the environment out."
             )
     return found
 
 
-def dataset_to_resume(session: Session, config: DatasetConfig) -> DatasetConfig:
-    """Return the configuration without the dataset that the session has a copy of."""
+def without_copied_dataset(session: Session, config: DatasetConfig) -> DatasetConfig:
+    """Return the configuration without an existing dataset that the session has a copy of."""
     if config.existing_dir is None or not is_copy(session.dataset_dir):
         return config
     return dataclasses.replace(config, existing_dir=None)

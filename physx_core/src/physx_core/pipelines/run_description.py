@@ -1,4 +1,4 @@
-"""What a run is made of, in words, for the session's ``info.txt``."""
+"""Describes a run's components for the session's ``info.txt``."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from physx_core.dataset import Dataset
 from physx_core.pipelines.learner import Learner
 
 
-def described(component: object) -> str:
-    """Return what a component says of itself, or its class's name where it says nothing."""
+def describe_component(component: object) -> str:
+    """Return a component's own text, or its class's name if it defines none."""
     cls = type(component)
-    silent = cls.__str__ is object.__str__ and cls.__repr__ is object.__repr__
-    return cls.__name__ if silent else str(component)
+    has_text = cls.__str__ is not object.__str__ or cls.__repr__ is not object.__repr__
+    return str(component) if has_text else cls.__name__
 
 
 def describe_training(
     learner: Learner, environment: EnvironmentConfig | None, dataset: Dataset
 ) -> Mapping[str, str]:
-    """Return the components of a training by name."""
+    """Return descriptions of a training's components by name."""
     return {
         **describe_learner(learner),
         "environment": describe_environment_config(environment),
@@ -28,16 +28,16 @@ def describe_training(
 
 
 def describe_learner(learner: Learner) -> Mapping[str, str]:
-    """Return network, transformation, and, where there is one, optimization by name."""
+    """Return descriptions of network, transformation, and optimization, if any, by name."""
     network = learner.network
     reads, predicts = ", ".join(network.net_fields), ", ".join(network.pred_fields)
     counted = f"{reads} -> {predicts}, {network.nb_parameters():,} parameters"
     found = {
-        "network": f"{described(network)}\n{counted}",
-        "transformation": described(learner.transformation),
+        "network": f"{describe_component(network)}\n{counted}",
+        "transformation": describe_component(learner.transformation),
     }
     if learner.optimization is not None:
-        found["optimization"] = described(learner.optimization)
+        found["optimization"] = describe_component(learner.optimization)
     return found
 
 
@@ -51,7 +51,7 @@ def describe_environment_config(config: EnvironmentConfig | None) -> str:
 
 
 def describe_dataset(dataset: Dataset) -> str:
-    """Return where a dataset is, and what it holds now."""
+    """Return a dataset's folder, and the samples and fields of its modes."""
     lines = [str(dataset.directory)]
     for mode in dataset.modes:
         lines.append(f"{mode}: {dataset.num_samples(mode):,} samples")

@@ -1,4 +1,4 @@
-"""RunServices: what environments may ask of the pipeline that they belong to."""
+"""RunServices: the requests that environments can make to their pipeline."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Predict: TypeAlias = Callable[[Batch], Batch]
 
 
 class RunServices:
-    """Answers the requests of environments in this process; the server passes on the clients'."""
+    """Serves the requests of environments, those of clients by way of the server."""
 
     def __init__(
         self,
@@ -29,14 +29,14 @@ class RunServices:
         predict: Predict | None,
         source_dir: Path | None = None,
     ) -> None:
-        """Keep whom to ask.
+        """Keep the receivers of the requests.
 
         Args:
-            dataset_dir: Where the instances' parameters are kept.
-            observer: Who looks at drawing events.
+            dataset_dir: Folder for the instances' parameters.
+            observer: Receives drawing events.
             predict: The network's prediction; None: the pipeline has no network.
-            source_dir: A dataset that is only read: parameters that are not kept in `dataset_dir`
-                are looked for here.
+            source_dir: Folder of a dataset that is only read, to look for parameters that are not
+                in `dataset_dir`.
         """
         self._dir, self._source_dir = dataset_dir, source_dir
         self._observer = observer
@@ -46,7 +46,7 @@ class RunServices:
         """Return the prediction for one sample.
 
         Raises:
-            UsageError: The pipeline has no network.
+            UsageError: If the pipeline has no network.
         """
         batch = {name: np.asarray(value)[np.newaxis] for name, value in fields.items()}
         return {name: values[0] for name, values in self.predict_batch(batch).items()}
@@ -55,7 +55,7 @@ class RunServices:
         """Return the prediction for several samples.
 
         Raises:
-            UsageError: The pipeline has no network.
+            UsageError: If the pipeline has no network.
         """
         if self._predict is None:
             raise UsageError(
@@ -65,7 +65,7 @@ class RunServices:
         return self._predict(batch)
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Keep an instance's values beside the dataset; earlier ones of other names stay."""
+        """Save an instance's values beside the dataset; earlier ones of other names are kept."""
         path = self._dir / PARAMETERS.format(instance_id)
         path.parent.mkdir(parents=True, exist_ok=True)
         merged = {**self.load_parameters(instance_id), **values}
@@ -74,10 +74,10 @@ class RunServices:
         partial.replace(path)
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return what an instance kept.
+        """Return the values that an instance saved.
 
         Raises:
-            DatasetError: The file is damaged.
+            DatasetError: If the file is damaged.
         """
         values: dict[str, Any] = {}
         for place in (self._source_dir, self._dir):
@@ -90,5 +90,5 @@ class RunServices:
         return values
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:
-        """Hand drawing events to the observers."""
+        """Pass drawing events to the observers."""
         self._observer.events(instance_id, step, events)

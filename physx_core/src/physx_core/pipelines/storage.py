@@ -1,4 +1,4 @@
-"""Opening the datasets that pipelines write to and read from."""
+"""Opens and checks the datasets that pipelines write to and read from."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from physx_core.session import Session, installed_versions
 from physx_core.sources.source import Source
 
 PARAMETERS = "parameters_{}.bin"
-"""Name of the file beside a dataset that holds what an instance saved."""
+"""Name of the file beside a dataset that contains an instance's saved parameters."""
 
 
 def open_own(session: Session, config: DatasetConfig) -> Dataset:
-    """Open a session's own dataset for writing; make it if it is not there.
+    """Open a session's own dataset for writing; create it if it does not exist.
 
     Raises:
-        DatasetError: It is damaged, or another process writes to it.
+        DatasetError: If it is damaged, or another process writes to it.
     """
     if (session.dataset_dir / "dataset.json").exists():
         return Dataset.open(
@@ -41,7 +41,7 @@ def open_existing(session: Session, config: DatasetConfig) -> Dataset:
     """Open the dataset that a configuration names, or else the session's own, for reading.
 
     Raises:
-        DatasetNotFoundError: There is none.
+        DatasetNotFoundError: If there is none.
     """
     try:
         return Dataset.open(config.existing_dir or session.dataset_dir)
@@ -49,7 +49,7 @@ def open_existing(session: Session, config: DatasetConfig) -> Dataset:
         if config.existing_dir is None:
             error.add_note(
                 "Name a session or dataset in DatasetConfig.existing_dir, or an environment that "
-                "makes the samples."
+                "generates the samples."
             )
         raise
 
@@ -58,19 +58,19 @@ def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) 
     """Check that a training's samples come from one place.
 
     Raises:
-        ConfigError: They do not.
+        ConfigError: If they do not.
     """
     if environment is None:
         return
     if config.mode == WRONG:
         raise ConfigError(
-            'The mode "wrong" holds samples that check_sample rejected: environments neither make '
-            "them nor replay them for a training. To look at them: physx replay."
+            'The mode "wrong" contains samples that check_sample rejected: environments neither '
+            "generate nor replay them for a training. To view them: physx replay."
         )
     if environment.load_samples and environment.always_produce:
         raise ConfigError(
-            "load_samples replays stored samples and always_produce makes new ones: choose one. "
-            "To replay in every epoch, set only_first_epoch=False."
+            "load_samples replays stored samples and always_produce generates new ones: choose "
+            "one. To replay in every epoch, set only_first_epoch=False."
         )
     if config.existing_dir is not None and not environment.load_samples:
         raise ConfigError(
@@ -80,10 +80,10 @@ def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) 
 
 
 def reject_environments(environment: EnvironmentConfig) -> None:
-    """Tell why environments cannot take part in a training of several processes.
+    """Reject environments in a training of several processes.
 
     Raises:
-        ConfigError: Always, with the way to the same training.
+        ConfigError: Always; the message tells how to get the same training.
     """
     replays = environment.load_samples
     if environment.always_produce or (replays and not environment.only_first_epoch):
@@ -92,39 +92,39 @@ def reject_environments(environment: EnvironmentConfig) -> None:
             "train in one process."
         )
     else:
-        what = "send the stored samples through them" if replays else "let them make the samples"
+        what = "send the stored samples through them" if replays else "generate the samples"
         advice = (
             f"take part in the first epoch. First {what} in one process, with epoch_nb=1; then "
-            "several go on with resume=True (physx train --resume)."
+            "continue in several with resume=True (physx train --resume)."
         )
     raise ConfigError(
         "Several processes train on stored samples only, each on its share, but environments "
-        f"shall {advice}"
+        f"would {advice}"
     )
 
 
 def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
-    """Copy an existing dataset into a session's own one: all rows, and the environments' values.
+    """Copy an existing dataset into a session's own: all rows and the environments' parameters.
 
-    The existing one is not changed. Rows that lie in whole partitions are copied by the system,
-    which shares them on the disk where the file system can.
+    The existing one is not changed. Rows in whole partitions are copied by the operating system,
+    which shares them on the disk if the file system can.
 
     Args:
         dataset: The session's own dataset, open for writing.
-        config: Names the existing one; None: the session's own samples are there already.
+        config: Names the existing dataset, if any.
 
     Raises:
-        ConfigError: The session's own dataset has samples of its own.
-        DatasetNotFoundError: There is no such dataset.
-        DatasetError: It is damaged, or the disk is full.
+        ConfigError: If the session's own dataset has samples.
+        DatasetNotFoundError: If there is no such dataset.
+        DatasetError: If it is damaged, or the disk is full.
     """
     if config.existing_dir is None:
         return
     if any(dataset.num_samples(mode) for mode in dataset.modes):
         raise ConfigError(
-            "The session has samples of its own already, so it cannot begin with a copy of "
-            f"{config.existing_dir}. To go on with its own, leave existing_dir out; otherwise "
-            "take a new session."
+            "The session already has samples of its own, so it cannot start with a copy of "
+            f"{config.existing_dir}. To continue with its own, leave existing_dir out; otherwise "
+            "use a new session."
         )
     dataset.merge(config.existing_dir)
     with Dataset.open(config.existing_dir) as existing:
@@ -134,7 +134,7 @@ def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
 
 
 def is_copy(directory: Path) -> bool:
-    """Return whether a dataset began as a copy of another one."""
+    """Return whether a dataset was copied from another one."""
     with contextlib.suppress(DatasetNotFoundError), Dataset.open(directory) as dataset:
         return "copied_from" in dataset.info
     return False
@@ -142,14 +142,14 @@ def is_copy(directory: Path) -> bool:
 
 @contextlib.contextmanager
 def record_rejected(source: Source, dataset: Dataset | None) -> Iterator[None]:
-    """Store what `check_sample` rejects of the batch that is made meanwhile, behind the batch.
+    """Store the samples that `check_sample` rejects during the body, in the mode "wrong".
 
-    It goes to the mode "wrong", also where too many rejected samples end the run. If the batch
-    cannot be made for another reason, what was rejected is not stored either.
+    They are stored after the body's batch, also if too many of them end the run. If the batch
+    fails for another reason, they are not stored either.
 
     Args:
-        source: Makes the batch.
-        dataset: Gets the samples; None: they are forgotten.
+        source: Generates the batch.
+        dataset: Stores the samples; None: they are discarded.
     """
     try:
         yield
@@ -167,7 +167,7 @@ def _store_rejected(source: Source, dataset: Dataset | None) -> None:
 
 
 def describe_environment(config: EnvironmentConfig, seed: int) -> dict[str, Any]:
-    """Return what a dataset keeps of the environment that made its samples."""
+    """Return the description of its samples' environment that a dataset keeps."""
     plain = to_plain(config)
     reference = plain["environment"]
     with contextlib.suppress(UsageError):  # a class that only this process can find

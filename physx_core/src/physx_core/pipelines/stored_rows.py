@@ -1,4 +1,4 @@
-"""StoredRows: stored samples, to be sent through environments pass after pass."""
+"""StoredRows: stored samples to send through environments, in passes."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Index = NDArray[np.intp]
 
 
 class StoredRows:
-    """Rows of a mode, all of them in each pass: in the order of writing, or in a new random one.
+    """Rows of a mode, all in each pass: in the order of writing, or in a new random order.
 
-    They are read some ahead, about 4 MB, but not beyond the end of a pass: what is stored in the
-    place of rows that were given is found by the next pass. Rows that are added later are in none.
+    About 4 MB are read ahead, but not beyond the end of a pass, so that the next pass reads what
+    has replaced the rows meanwhile. Rows that are added later are not included.
 
     Attributes:
-        count: How many rows a pass has.
+        count: Number of rows in a pass.
     """
 
     def __init__(
@@ -31,16 +31,16 @@ class StoredRows:
         rows: Index | None = None,
         random: np.random.Generator | None = None,
     ) -> None:
-        """Keep what to read.
+        """Select the rows.
 
         Args:
-            dataset: Where the rows are.
+            dataset: The dataset that contains the rows.
             mode: Their mode.
-            rows: Numbers of the rows of a pass; None: all that there are now.
+            rows: Indices of the rows of a pass; None: all current rows.
             random: Draws the order of each pass; None: the order of `rows`.
 
         Raises:
-            DatasetError: The mode has no rows.
+            DatasetError: If the mode has no rows.
         """
         if mode not in dataset.modes or not dataset.num_samples(mode):
             raise DatasetError(
@@ -61,7 +61,7 @@ class StoredRows:
         """Return the next rows of the pass, fewer than `count` at its end.
 
         Returns:
-            Their numbers in the mode, and the rows: field name to array of shape
+            Their indices in the mode, and the rows: field name to array of shape
             (rows, *field shape).
         """
         if self._given == len(self._order):
@@ -77,15 +77,13 @@ class StoredRows:
         place = slice(first - self._start, last - self._start)
         return self._order[first:last], {name: rows[place] for name, rows in self._block.items()}
 
-    def take_on(self, count: int) -> Batch:
-        """Return exactly `count` rows; after the last one of a pass comes the first of the next."""
-        index, rows = self.take(count)
-        parts = [rows]
-        left = count - len(index)
-        while left:
-            index, rows = self.take(left)
+    def take_cyclic(self, count: int) -> Batch:
+        """Return exactly `count` rows; after the end of a pass the next one begins."""
+        parts: list[Batch] = []
+        while count:
+            index, rows = self.take(count)
             parts.append(rows)
-            left -= len(index)
+            count -= len(index)
         if len(parts) == 1:
             return rows
         return {name: np.concatenate([part[name] for part in parts]) for name in rows}

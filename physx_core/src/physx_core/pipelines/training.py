@@ -1,4 +1,4 @@
-"""Training: a network learns from a dataset, or from environments that make it."""
+"""Training: trains a network on a dataset, or on samples that environments generate."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from physx_core.dataset import Dataset
 from physx_core.observers import statistics_observers
 from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.learner import Learner
-from physx_core.pipelines.pipeline import Pipeline, chosen_seed, stream_seed
-from physx_core.pipelines.resuming import dataset_to_resume, last_checkpoint
+from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
+from physx_core.pipelines.resuming import read_last_checkpoint, without_copied_dataset
 from physx_core.pipelines.run_description import describe_training
 from physx_core.pipelines.storage import (
     check_sources,
@@ -38,74 +38,67 @@ from physx_core.typing import Batch
 
 @options
 @dataclass(eq=False)
-class Training(Pipeline):
+class Training(NewSessionPipeline):
     """Trains a network for ``epoch_nb`` epochs of ``batch_nb`` batches of ``batch_size`` samples.
 
     The samples come from
 
     - an existing dataset (``dataset_config.existing_dir``), which is only read, or the session's
       own one;
-    - environments: they make new samples in the first epoch, which are stored and used again in the
-      later ones, or in every epoch with ``always_produce``;
+    - environments, which generate samples in the first epoch, stored and reused in later ones, or
+      in every epoch with ``always_produce``;
     - an existing dataset by way of environments, with ``load_samples``: the session gets its own
       copy of the dataset; in the first epoch, or in every one with ``only_first_epoch=False``, each
-      stored sample goes through an environment, and what that makes of it is learned from and takes
-      its place in the copy: see `TrainingData`. Without ``existing_dir`` they are the samples that
-      the session itself has.
+      stored sample goes through an environment, whose result is trained on and replaces the sample
+      in the copy: see `TrainingData`. Without ``existing_dir`` the session's own samples are used.
 
-    Several processes that ``torchrun`` starts train one network together on stored samples: each
-    learns from its share of every batch, which is ``batch_size`` times the number of processes, and
-    the first one writes the session. Where environments make or replay the samples of the first
-    epoch, one process trains that, and several go on with ``resume``.
+    Several processes started by ``torchrun`` train one network together on stored samples: each
+    takes its share of every batch, which is ``batch_size`` times the number of processes, and the
+    first one writes the session. If environments generate or replay the samples of the first epoch,
+    train that epoch in one process, then continue in several with ``resume``.
 
     Attributes:
         group: The processes that train together.
         learner: The network, its transformation and its optimization.
-        data: Where the batches come from.
-        batch: The present batch, in physical units.
-        epoch_id: Number of epochs that are finished.
-        batch_id: Number of batches of the present epoch that are finished.
-        losses: What `Optimization.transform_loss` returned for the present batch.
+        data: Source of the batches.
+        batch: The current batch, in physical units.
+        epoch_id: Number of finished epochs.
+        batch_id: Number of finished batches of the current epoch.
+        losses: The result of `Optimization.transform_loss` for the current batch.
         training_loss: Mean loss over the batches of the last epoch; NaN before its end.
-        validation_loss: Mean loss over the samples to validate with; NaN before the first time.
+        validation_loss: Mean loss over the validation samples; NaN before the first validation.
         best: The epoch with the smallest loss, whose network is the checkpoint "best".
-        checkpoint_path: Folder of the checkpoint that was written last.
+        checkpoint_path: Folder of the last checkpoint.
     """
 
     network_config: NetworkConfig
     dataset_config: DatasetConfig | None = None
     environment_config: EnvironmentConfig | None = None
-    session_dir: str = "sessions"
-    """Folder of the sessions, relative to the working directory."""
-    session_name: str = "training"
-    """Name of the session's folder."""
-    new_session: bool = True
-    """Leave an existing session of this name alone and number the new one; otherwise use it."""
     _: KW_ONLY
     epoch_nb: int = at_least(1)
     """Number of epochs."""
     batch_size: int = at_least(1)
     """Number of samples in a batch."""
     batch_nb: int | None = at_least(1, None)
-    """Batches in an epoch; None: as many as it takes to see each stored sample once."""
+    """Batches in an epoch; None: as many as needed to use each stored sample once."""
     seed: int | None = at_least(0, None)
-    """Seed of the network's first parameters and of the order of samples; None: a fresh one."""
+    """Seed of the network's initial parameters and of the order of samples; None: a random one."""
     validation_every: int = at_least(0, 1)
-    """Validate after each so many epochs, if the dataset has a validation mode or
+    """Number of epochs between validations, if the dataset has a validation mode or
     `validation_split` holds samples back; 0: never."""
     patience: int | None = at_least(1, None)
-    """Stop after so many validations in a row without improvement of the loss, or epochs where
-    nothing is validated; None: never. The network stays as it is then; "best" is beside it."""
+    """Number of consecutive validations (epochs, if nothing is validated) without improvement of
+    the loss after which to stop; None: never. The last network is kept, beside "best"."""
     min_improvement: float = at_least(0, 0.0)
-    """How much smaller than the best one a loss must be to be an improvement."""
+    """Least decrease below the best loss that counts as an improvement."""
     statistics: Sequence[str | type[Any]] = ()
-    """Where numbers go beside stats/scalars.csv, for example "torch/tensorboard" or "rerun"."""
+    """Observers of numbers beside stats/scalars.csv, for example "torch/tensorboard" or "rerun"."""
     statistics_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Keyword arguments of each of them, by its name."""
+    """Keyword arguments of each observer, by its name."""
     histograms_every: int = at_least(0, 0)
-    """Record the distribution of weights and gradients after each so many epochs; 0: never."""
+    """Number of epochs between histograms of weights and gradients; 0: none."""
     resume: bool = field(default=False, metadata={"recorded": False})
-    """Go on from the session's last checkpoint, until `epoch_nb` epochs are made in all."""
+    """Resume from the session's last checkpoint, up to `epoch_nb` epochs in total."""
 
     kind: ClassVar[str] = "training"
     group: Group = field(init=False, repr=False, default_factory=Group)
@@ -121,11 +114,11 @@ class Training(Pipeline):
     checkpoint_path: Path | None = field(init=False, repr=False, default=None)
 
     def execute(self) -> None:
-        """Train. Ctrl-C ends the training after the present batch, with a checkpoint to resume.
+        """Train. Ctrl-C ends the training after the current batch, with a checkpoint to resume.
 
         Raises:
-            PhysxError: Data, network or environments are not what the training needs.
-            KeyboardInterrupt: Ctrl-C; a second one ends the training at once.
+            PhysxError: If data, network or environments do not fit the training.
+            KeyboardInterrupt: After Ctrl-C; a second one ends the training at once.
         """
         with self._running(), deferred_interrupt() as interrupted:
             self.train_begin()
@@ -146,15 +139,15 @@ class Training(Pipeline):
             self.train_end()
 
     def train_begin(self) -> None:
-        """The first epoch is about to begin, or that in which a resumed training ended."""
+        """Called before the first epoch, or before the one in which a resumed training ended."""
         self.epoch_id = self._resumed.epoch
 
     def epoch_condition(self) -> bool:
-        """Return whether there are epochs left and the network still improves."""
+        """Return whether there are epochs left and the training has not stopped early."""
         return self.epoch_id < self.epoch_nb and not self.stopped
 
     def epoch_begin(self) -> None:
-        """An epoch is about to begin."""
+        """Called before each epoch."""
         begins = self.epoch_id == self._resumed.epoch
         self.batch_id = self._resumed.batch if begins else 0
         self._epoch_batches = self.data.begin_epoch(self.epoch_id, self.learner.batch_fields)
@@ -166,21 +159,21 @@ class Training(Pipeline):
             self.observers.begin("training", max(0, left), "batches")
 
     def batch_condition(self) -> bool:
-        """Return whether there are batches left in the present epoch."""
+        """Return whether there are batches left in the current epoch."""
         return self.batch_id < self._epoch_batches
 
     def batch_begin(self) -> None:
-        """A batch is about to be made or read."""
+        """Called before each batch."""
 
     def batch_produce(self) -> None:
-        """Read the next batch, or have the environments make and the dataset store it."""
+        """Read the next batch, or have the environments generate and the dataset store it."""
         self.batch = self.data.next_batch()
         if self.data.produces:  # the normalization grows with the samples
             self.learner.bind(self.data.fields, self.data.normalization())
             self.learner.network.set_train()
 
     def optimize(self) -> None:
-        """Let the network learn from the batch."""
+        """Train the network on the batch."""
         self.losses = self.learner.optimize(self.batch)
 
     def batch_count(self) -> None:
@@ -192,7 +185,7 @@ class Training(Pipeline):
         self.observers.advance(1)
 
     def batch_end(self) -> None:
-        """A batch is learned."""
+        """Called after each batch."""
 
     def epoch_count(self) -> None:
         """Count the epoch."""
@@ -200,7 +193,7 @@ class Training(Pipeline):
         self.batch_id = 0
 
     def epoch_end(self) -> None:
-        """Validate, record the epoch's losses, and keep a checkpoint if that is wanted."""
+        """Validate, record the epoch's losses, and write a checkpoint if configured."""
         values = self._record.take_epoch()
         self.training_loss = values.get("loss/training", float("nan"))
         if self.learner.learning_rate is not None:
@@ -228,7 +221,7 @@ class Training(Pipeline):
         return self.validation_loss
 
     def train_end(self) -> None:
-        """The last epoch is over: keep the network, and tell if there should have been more."""
+        """Write the last checkpoint, and report an early stop."""
         self.observers.end()
         if self.stopped and self._leads:
             self.observers.note(self.stopped)
@@ -237,20 +230,20 @@ class Training(Pipeline):
 
     @property
     def stopped(self) -> str:
-        """Why the training ends before its last epoch; empty where it does not."""
+        """Reason why the training ends before its last epoch; empty if it does not."""
         if self.patience is None or self.epoch_id >= self.epoch_nb:
             return ""
         return self.best.reason_to_stop(self.patience)
 
     def validate(self) -> dict[str, float]:
-        """Return the mean loss, and other statistics, over the samples to validate with."""
+        """Return the mean loss and other statistics over the validation samples."""
         batches = self.data.validation_batches(self.learner.batch_fields)
         return self.learner.mean_losses(batches)
 
     def save_checkpoint(self) -> Path:
         """Write the network into the session and return the checkpoint's folder.
 
-        Where nothing was learned since the last one was written, that stays the last.
+        If nothing was trained since the last checkpoint, no new one is written.
         """
         now = (self.epoch_id, self.batch_id)
         if self.checkpoint_path is None or self._saved != now:
@@ -282,18 +275,19 @@ class Training(Pipeline):
         config = self.dataset_config or DatasetConfig()
         environment = self.environment_config
         check_sources(config, environment)
-        self._join_group()
+        self._network_class: Any = Network
+        self._prepare_network_class()
         last = None
         if self.resume:
             session = Session.existing(self.session_dir, self.session_name)
-            last = last_checkpoint(session, self.network_config.network_name, environment)
-            config, environment = dataset_to_resume(session, config), None
-        self._begin_with(last)
-        self._seed_network(self._resumed.seed)
+            last = read_last_checkpoint(session, self.network_config.network_name, environment)
+            config, environment = without_copied_dataset(session, config), None
+        self._start_from(last)
+        self._network_class.set_seed(self._resumed.seed)
         self.learner = Learner(self.network_config, trains=True)
         if config.existing_dir is not None:  # a missing dataset leaves no session behind
             Dataset.open(config.existing_dir).close()
-        self.session = self._make_session()
+        self.session = self._open_session()
         make = open_existing if environment is None else open_own
         dataset = resources.enter_context(make(self.session, config))
         if environment is not None:
@@ -316,33 +310,35 @@ class Training(Pipeline):
         )
         fields = self.data.fields
         shapes = [fields[name].shape for name in self.learner.batch_fields if name in fields]
-        if not self.data.produces or None not in shapes:  # else the first batch tells
+        if not self.data.produces or None not in shapes:  # else bound with the first batch
             self.learner.bind(fields, self.data.normalization())
         self._load_parameters(last)
         self.learner.join(self.group)
         self.learner.network.set_train()
 
-    def _join_group(self) -> None:
+    def _prepare_network_class(self) -> None:
+        """Join the group of processes that the network's library trains with."""
         config = self.network_config
-        if config.network is None:  # the learner tells it
+        if config.network is None:  # reported by the learner
             return
         component, _ = resolve_network(config.network, config.network_kwargs)
-        join = getattr(component, "join_group", Network.join_group)
-        self.group = join(config.device)
+        if hasattr(component, "join_group"):  # else a function that returns a network
+            self._network_class = component
+        self.group = self._network_class.join_group(config.device)
         self._leads = self.group.leads
         if self.group.size > 1 and self.environment_config is not None and not self.resume:
             reject_environments(self.environment_config)
 
-    def _begin_with(self, last: checkpoint.Checkpoint | None) -> None:
-        """Begin at the first epoch, or where a checkpoint was written."""
-        seed = self.group.tell(chosen_seed(self.seed))
+    def _start_from(self, last: checkpoint.Checkpoint | None) -> None:
+        """Start at the first epoch, or where a checkpoint was written."""
+        seed = self.group.tell(choose_seed(self.seed))
         self._resumed = last.progress if last else Progress(0, 0, 0, seed)
         self._saved = (self._resumed.epoch, self._resumed.batch)
         self.checkpoint_path = last.path if last else None
         self._record = TrainingRecord(self._resumed.record)
         self.best = BestEpoch(self._resumed.best, self.min_improvement)
 
-    def _make_session(self) -> Session:
+    def _open_session(self) -> Session:
         made = None
         if self._leads:
             new = self.new_session and not self.resume
@@ -352,13 +348,6 @@ class Training(Pipeline):
 
     def _components(self) -> Mapping[str, str]:
         return describe_training(self.learner, self.environment_config, self.data.dataset)
-
-    def _seed_network(self, seed: int) -> None:
-        if self.network_config.network is not None:
-            config = self.network_config
-            component, _ = resolve_network(config.network, config.network_kwargs)
-            if hasattr(component, "set_seed"):
-                component.set_seed(seed)
 
     def _load_parameters(self, last: checkpoint.Checkpoint | None) -> None:
         config = self.network_config
@@ -378,6 +367,6 @@ class Training(Pipeline):
         return self._open_source(
             resources,
             config,
-            stream_seed(seed, "training", stored),
+            derive_seed(seed, "training", stored),
             predict=self.learner.predict_in_training,
         )

@@ -1,4 +1,4 @@
-"""TrainingRecord and BestEpoch: the numbers of a training, and what they say of its epochs."""
+"""TrainingRecord and BestEpoch: running statistics of a training, and its best epoch."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 RECENT = 50
-"""Number of batches, or of epochs, that the running mean and variance are of."""
+"""Window of the running mean and variance, in batches or epochs."""
 
 
 class TrainingRecord:
-    """Sums over the present epoch, and the losses of the last batches and epochs."""
+    """Sums over the current epoch, and the losses of the last batches and epochs."""
 
     def __init__(self, state: Mapping[str, Any]) -> None:
-        """Begin, or go on where `state` was taken; it is empty at the begin."""
+        """Start, or continue from a `state`; an empty one starts."""
         self._count: int = state.get("count", 0)
         self._sums: dict[str, float] = dict(state.get("sums", {}))
         self._recent = deque[float](state.get("recent", ()), RECENT)
@@ -23,7 +23,7 @@ class TrainingRecord:
 
     @property
     def state(self) -> dict[str, Any]:
-        """All that a resumed training needs, as plain data."""
+        """The state that a resumed training needs, as plain data."""
         return {
             "count": self._count,
             "sums": dict(self._sums),
@@ -32,7 +32,7 @@ class TrainingRecord:
         }
 
     def add(self, losses: Mapping[str, float]) -> dict[str, float]:
-        """Count a batch and return its numbers, to be recorded.
+        """Add a batch and return the values to record.
 
         These are ``<name>/batch`` for each entry, and mean and sample variance of the loss over the
         last `RECENT` batches, ``loss/mean`` and ``loss/variance``.
@@ -50,11 +50,11 @@ class TrainingRecord:
         return values
 
     def take_epoch(self) -> dict[str, float]:
-        """Return the numbers of the epoch, to be recorded, and begin a new one.
+        """Return the values to record for the epoch, and start a new one.
 
         These are ``<name>/training`` for each entry, its mean over the batches, and mean and sample
         variance of the loss over the last `RECENT` epochs, ``loss/training_mean`` and
-        ``loss/training_variance``. Empty where there was no batch.
+        ``loss/training_variance``. Empty if there was no batch.
         """
         if not self._count:
             return {}
@@ -74,20 +74,20 @@ def _spread(recent: Collection[float]) -> tuple[float, float]:
 
 
 class BestEpoch:
-    """Knows the epoch with the smallest loss, and since when there was no real improvement.
+    """The epoch with the smallest loss, and the number of epochs without improvement.
 
     Attributes:
         loss: The smallest loss so far.
-        epoch: Number of the epochs that were finished then.
-        waited: How many epochs were judged since one that was better by `min_improvement`.
+        epoch: Number of epochs that were finished then.
+        waited: Number of epochs judged since the loss last improved by `min_improvement`.
     """
 
     def __init__(self, state: Mapping[str, Any], min_improvement: float) -> None:
-        """Begin, or go on where `state` was taken; it is empty at the begin.
+        """Start, or continue from a `state`.
 
         Args:
-            state: See `state`.
-            min_improvement: How much smaller a loss must be to count as an improvement.
+            state: See `state`; an empty one starts.
+            min_improvement: Least decrease of the loss that counts as an improvement.
         """
         self.loss: float = state.get("loss", math.inf)
         self.epoch: int = state.get("epoch", 0)
@@ -97,7 +97,7 @@ class BestEpoch:
 
     @property
     def state(self) -> dict[str, Any]:
-        """All that a resumed training needs, as plain data."""
+        """The state that a resumed training needs, as plain data."""
         return {
             "loss": self.loss,
             "epoch": self.epoch,
@@ -106,11 +106,11 @@ class BestEpoch:
         }
 
     def judge(self, loss: float, epoch: int) -> bool:
-        """Take an epoch's loss into account and return whether it is the smallest.
+        """Account for an epoch's loss and return whether it is the smallest.
 
         Args:
-            loss: Loss of its validation, or its training loss. NaN is no improvement.
-            epoch: Number of epochs that are finished.
+            loss: Validation loss, or training loss. NaN is not an improvement.
+            epoch: Number of finished epochs.
         """
         if loss < self._reference - self._min_improvement:
             self._reference, self.waited = loss, 0
@@ -122,7 +122,7 @@ class BestEpoch:
         return True
 
     def reason_to_stop(self, patience: int) -> str:
-        """Return why a training stops that waits so often for an improvement; empty: it goes on."""
+        """Return why to stop after `patience` epochs without improvement; empty: do not stop."""
         if self.waited < patience:
             return ""
         return (

@@ -1,26 +1,11 @@
-"""Plugins: components of pip-installed packages, found by the name of their entry point.
+"""Plugins: components of pip-installed packages, selected by the name of their entry point.
 
-A plugin is a module that an entry point of the group ``physx`` names. It implements some of the
+A plugin is a module named by an entry point of the group ``physx``. It implements some of the
 hooks in `physx_core.plugins.hookspecs` with the marker `hookimpl`.
 """
 
 from __future__ import annotations
 
-from physx_core.config import reference_of
-from physx_core.plugins.hookspecs import GROUP, KINDS, Components, hookimpl
-from physx_core.plugins.references import imported, resolve
-from physx_core.plugins.registry import Plugin, PluginInfo, available, load
+import lazy_loader
 
-__all__ = [
-    "GROUP",
-    "KINDS",
-    "Components",
-    "Plugin",
-    "PluginInfo",
-    "available",
-    "hookimpl",
-    "imported",
-    "load",
-    "reference_of",
-    "resolve",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""The plugin ``physx``: what the core itself brings, through the same hooks as any plugin."""
+"""The plugin ``physx``: the core's own components, registered with the same hooks."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from physx_core.plugins.hookspecs import Components, hookimpl
 
 @hookimpl
 def physx_launchers() -> Components:
-    """Return the launchers; they are imported when clients are started."""
+    """Return the launchers, which are imported when clients are started."""
     return {
         "subprocess": "physx_core.workers.processes.launchers:SubprocessLauncher",
         "manual": "physx_core.workers.processes.launchers:ManualLauncher",

@@ -1,8 +1,8 @@
 """The seven hooks that a plugin may implement.
 
-Each returns a dictionary from a component's name to the component: a class, a function that
-returns one when it is called with the component's keyword arguments, or a text
-``"package.module:Name"`` that is imported when the component is first used.
+Each returns a dictionary from a component's name to the component: a class, a function that takes
+the component's keyword arguments and returns it, or a reference ``"package.module:Name"`` that is
+imported when the component is first used.
 """
 
 from __future__ import annotations
@@ -12,13 +12,12 @@ from typing import Any
 
 import pluggy
 
-GROUP = "physx"
-"""Entry-point group of the plugins."""
+from physx_core.plugins.entries import PLUGINS
 
 Components = dict[str, type[Any] | Callable[..., Any] | str]
 
-hookspec = pluggy.HookspecMarker(GROUP)
-hookimpl = pluggy.HookimplMarker(GROUP)
+hookspec = pluggy.HookspecMarker(PLUGINS)
+hookimpl = pluggy.HookimplMarker(PLUGINS)
 
 KINDS = {
     "environment": "physx_environments",
@@ -29,7 +28,7 @@ KINDS = {
     "backend": "physx_backends",
     "launcher": "physx_launchers",
 }
-"""Kind of component to the hook that gives it."""
+"""Kind of component to the hook that returns it."""
 
 
 @hookspec

@@ -1,7 +1,8 @@
-"""Networks by reference, among them classes of a deep-learning library that know nothing of physx.
+"""Resolves networks by reference, including plain classes of a deep-learning library.
 
-A plugin that is named as its library is (`torch`) may bring a network ``module``. Whoever names a
-class of that library as the network gets it through this one, with the class as ``module``.
+A plugin that is named like its library (`torch`) may have a network ``module``, which adapts a
+class of that library. A reference to such a class resolves to this network, with the class as its
+argument ``module``.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ from typing import Any
 
 from physx_core.components.network import Network
 from physx_core.errors import ConfigError
+from physx_core.plugins.entries import OFFICIAL, PLUGINS
 from physx_core.plugins.references import resolve
-from physx_core.plugins.registry import available, components_of, load, pip_line
+from physx_core.plugins.registry import available, load
 
 _ADAPTER = "module"
 
@@ -21,13 +23,13 @@ def resolve_network(reference: Any, arguments: Mapping[str, Any]) -> tuple[Any, 
     """Return the class or factory of a network and the keyword arguments to call it with.
 
     Args:
-        reference: As in `resolve`; also a class whose base belongs to the library of a plugin.
+        reference: As in `resolve`; also a class derived from one of a plugin's library.
         arguments: The user's keyword arguments.
 
     Raises:
-        ConfigError: The library's class and the plugin's network both take an argument.
-        PluginNotFoundError: The library's plugin is not installed.
-        PhysxError: The reference leads nowhere: see `resolve`.
+        ConfigError: If the arguments contain ``module``.
+        PluginNotFoundError: If the library's plugin is not installed.
+        PhysxError: If the reference cannot be resolved: see `resolve`.
     """
     found = resolve("network", reference)
     library = _library_of(found)
@@ -35,8 +37,8 @@ def resolve_network(reference: Any, arguments: Mapping[str, Any]) -> tuple[Any, 
         return found, dict(arguments)
     if _ADAPTER in arguments:
         raise ConfigError(
-            f"{found.__name__} is itself the module, so network_kwargs cannot name another one "
-            f'in "{_ADAPTER}". If it takes an argument of that name, put all of its own arguments '
+            f"{found.__name__} is itself the module, so network_kwargs cannot contain "
+            f'"{_ADAPTER}". If it takes an argument of that name, put all of its own arguments '
             'into network_kwargs={"module_kwargs": {...}}.'
         )
     named = reference if isinstance(reference, str) else found
@@ -44,14 +46,14 @@ def resolve_network(reference: Any, arguments: Mapping[str, Any]) -> tuple[Any, 
 
 
 def _library_of(found: Any) -> str | None:
-    """Return the plugin through which a class of its library becomes a network, or None."""
+    """Return the plugin that adapts a plain class of its library, or None."""
     if not isinstance(found, type) or issubclass(found, Network):
         return None
     packages = dict.fromkeys(base.__module__.partition(".")[0] for base in found.__mro__)
     known = available()
     for package in packages:
-        if package not in known and pip_line(package) is None:
+        if package not in known and (PLUGINS, package) not in OFFICIAL:
             continue
-        if _ADAPTER in components_of("network", load(package)):
+        if _ADAPTER in load(package).components.get("network", {}):
             return package
     return None

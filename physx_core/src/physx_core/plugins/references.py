@@ -1,4 +1,4 @@
-"""References: how a user names a component, and how it is found."""
+"""References: names of components, and how they are resolved."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-from physx_core.config import SCRIPT_PREFIX, reference_of
+from physx_core.config import SCRIPT_PREFIX
+from physx_core.config import reference_of as reference_of
 from physx_core.errors import (
     ComponentNotFoundError,
     PhysxError,
@@ -64,32 +65,31 @@ def resolve(kind: str, reference: Any) -> Any:
         The class or factory; for ``backend`` an instance of it, ready to build simulations.
 
     Raises:
-        PluginNotFoundError: The plugin is not installed.
-        PluginError: It is installed but broken.
-        ComponentNotFoundError: The plugin, module or script has nothing of that name.
-        ReferenceFormError: The reference has none of the forms above.
+        PluginNotFoundError: If the plugin is not installed.
+        PluginError: If it is installed but broken.
+        ComponentNotFoundError: If the plugin, module or script has no component of that name.
+        ReferenceFormError: If the reference has none of the forms above.
     """
     if kind not in KINDS:
-        raise ReferenceFormError(f'"{kind}" is no kind of component: {", ".join(KINDS)}.')
+        raise ReferenceFormError(f'"{kind}" is not a kind of component: {", ".join(KINDS)}.')
     component = _find(kind, reference)
     return component() if kind == "backend" and isinstance(component, type) else component
 
 
-def located(kind: str, reference: Any) -> str:
-    """Return the text by which another process finds a component without looking for plugins.
+def locate(kind: str, reference: Any) -> str:
+    """Return the reference by which another process finds a component without reading metadata.
 
-    To look through the metadata of all installed packages takes a good part of a client's start.
+    Reading the metadata of all installed packages takes a good part of a client's start.
 
     Args:
         kind: See `resolve`.
         reference: See `resolve`.
 
     Returns:
-        ``"package.module:Class"`` where a plugin names its component so, or where it can be named
-        so; otherwise the reference's own text.
+        ``"package.module:Class"`` if possible; otherwise the reference's own text.
 
     Raises:
-        UsageError: It is a class that no other process can find.
+        UsageError: If it is a class that no other process can find.
     """
     text = reference_of(reference)
     if ":" in text:
@@ -102,19 +102,19 @@ def located(kind: str, reference: Any) -> str:
         component = components[name]
         place = reference_of(component)
         return place if place == component or _find(kind, place) is component else text
-    except (PhysxError, LookupError, AttributeError):  # the other process says what is wrong
+    except (PhysxError, LookupError, AttributeError):  # the other process reports the error
         return text
 
 
-def imported(kind: str, reference: str) -> Any:
-    """Return what ``"package.module:Class"`` or ``"script.py:Class"`` names.
+def import_component(kind: str, reference: str) -> Any:
+    """Import the object named by ``"package.module:Class"`` or ``"script.py:Class"``.
 
     Args:
-        kind: What it is, for errors.
-        reference: Where it is.
+        kind: Kind of the object, for messages.
+        reference: The object's name.
 
     Raises:
-        ComponentNotFoundError: The module or script has nothing of that name.
+        ComponentNotFoundError: If the module or script has no object of that name.
     """
     place, _, name = reference.rpartition(":")
     return _attribute(kind, _module(kind, place), name, place)
@@ -124,13 +124,13 @@ def _find(kind: str, reference: Any) -> Any:
     if not isinstance(reference, str):
         if isinstance(reference, type):
             return reference
-        raise ReferenceFormError(f"{reference!r} is neither a class nor the name of one.")
+        raise ReferenceFormError(f"{reference!r} is neither a class nor a reference to one.")
     if ":" in reference:
-        return imported(kind, reference)
+        return import_component(kind, reference)
     plugin_name, _, name = reference.partition("/")
     if not plugin_name:
         raise ReferenceFormError(
-            f'"{reference}" names no {kind}: give "plugin/name", "package.module:Class" '
+            f'"{reference}" does not name a {kind}: give "plugin/name", "package.module:Class" '
             'or "script.py:Class".'
         )
     plugin = load(plugin_name)

@@ -1,4 +1,7 @@
-"""Sources of samples: environments in this process, or in clients over TCP."""
+"""Sources of samples: environments in this process, or in clients over TCP.
+
+For programs that step environments without a pipeline, such as vectorized environments.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ClientSource: each instance of the environment in a process of its own, over TCP."""
+"""ClientSource: runs each instance of the environment in a client process, over TCP."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ _AHEAD_ROWS = 1 << 16
 
 
 class ClientSource(Source):
-    """Has clients make rows, and puts each row where its instance and step say it belongs.
+    """Collects rows from clients, and places each by its instance and step.
 
     Rows are the same as those of `LocalSource`, bit for bit. Requests of the environments are
-    answered while a batch is waited for. Where the services have a method
-    ``predict_batch(batch) -> batch``, predictions are made once every instance that is at work asks
-    for one, all of them as one batch in the order of the instances: with ``run_ahead=0`` the same
-    batches in every run. Such a network may round other than for single samples.
+    served while waiting for a batch. If the services have a method
+    ``predict_batch(batch) -> batch``, predictions wait until every working instance has requested
+    one, and are computed as one batch in the order of the instances: with ``run_ahead=0`` the same
+    batches in every run. A network may round these differently from single samples.
     """
 
     def __init__(
@@ -48,17 +48,17 @@ class ClientSource(Source):
         total: int | None = None,
         accept_all: bool = False,
     ) -> None:
-        """Keep what the clients are started with.
+        """Prepare the clients.
 
         Args:
-            config: Which environment, and how many clients.
-            services: What the environments may ask of the run.
+            config: The environment, and the number of clients.
+            services: Serves the environments' requests.
             seed: Seed of all instances.
-            run_ahead: How many rows each client may make before they are asked for; None: as many
-                as fit in 4 MB. 0: a row is made only once it is asked for, as it must be where
-                rows depend on a network that is trained, or on predictions that are applied.
-            total: How many rows will ever be asked for; no client makes rows beyond. None: nobody
-                knows.
+            run_ahead: Number of rows that each client may generate before they are requested;
+                None: as many as fit in 4 MB. It must be 0 if rows depend on a network that is
+                trained, or on predictions that are applied.
+            total: Number of rows that will be requested in all, beyond which no client generates
+                any; None: unknown.
             accept_all: Whether samples that `check_sample` rejects count like the others.
         """
         self.instance_nb = config.num_clients
@@ -78,7 +78,7 @@ class ClientSource(Source):
         self._failed = self._closed = False
 
     def open(self) -> None:
-        """Bring the instances to life: see `Source.open`."""
+        """Start the clients: see `Source.open`."""
         try:
             self._group.open()
             first = self._group.peer(1).fields
@@ -93,10 +93,10 @@ class ClientSource(Source):
         """Return the next rows: see `Source.batch`.
 
         Raises:
-            UsageError: Stored rows are given, but the clients run ahead of what is asked for.
+            UsageError: If stored rows are given, but the clients run ahead.
         """
         if size < 1:
-            raise UsageError(f"A batch has at least one row, not {size}.")
+            raise UsageError(f"A batch must have at least one row, not {size}.")
         if not self.fields or self._closed:
             raise UsageError("This source is not open: use it in a with statement.")
         if stored is not None:
@@ -125,7 +125,7 @@ class ClientSource(Source):
         return {name: array[:size] for name, array in self._out.items()}
 
     def apply(self, prediction: Batch, *, at_once: bool = True) -> None:
-        """Give predictions to the instances: see `Source.apply`.
+        """Pass predictions to the instances: see `Source.apply`.
 
         An error that an environment raises here is raised by the next call of `batch` or `close`.
 
@@ -135,14 +135,14 @@ class ClientSource(Source):
                 which costs less.
 
         Raises:
-            UsageError: The clients run ahead, so they are no longer at the rows of the last batch.
+            UsageError: If the clients run ahead, beyond the rows of the last batch.
         """
         if self._run_ahead != 0:
             raise UsageError("apply() needs ClientSource(run_ahead=0).")
         self._send_shares(Kind.APPLY, prediction, "the prediction", at_once)
 
     def pop_rejected(self) -> Batch:
-        """Return what was rejected: see `Source.pop_rejected`."""
+        """Return the rejected samples: see `Source.pop_rejected`."""
         blocks: list[Batch] = []
         for number, peer in sorted(self._group.server.peers.items()) if self._rejections else ():
             if self._table and peer.row_fields == self._table:
@@ -169,12 +169,12 @@ class ClientSource(Source):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the source; after an error the clients are not waited for."""
+        """Close the source; after an error without waiting for the clients."""
         self._failed = self._failed or kind is not None
         super().__exit__(kind, error, trace)
 
     def _send_shares(self, kind: Kind, batch: Batch, what: str, at_once: bool) -> None:
-        """Send each instance those rows that are for its rows of the last batch."""
+        """Send each instance the rows that correspond to its rows of the last batch."""
         size = self._asked - self._first
         for number in range(1, self.instance_nb + 1):
             # The position of the instance's first row in the batch.
@@ -194,7 +194,7 @@ class ClientSource(Source):
     def _end_of_rejected(self, number: int) -> int | None:
         """Return the step before which an instance's rejected rows belong to the last batch.
 
-        None: all that there are, as its last row could not be made.
+        None: all of them, as its last row failed.
         """
         end = self._asked if self._failed_row is None else self._failed_row
         if self._failed_row is not None and self._failed_row % self.instance_nb == number - 1:
@@ -203,11 +203,11 @@ class ClientSource(Source):
         return int(self._out["step"][last]) if last >= 0 else 0
 
     def _wanted(self, number: int, rows: int) -> int:
-        """Return how many of the first `rows` rows belong to an instance."""
+        """Return how many of the first `rows` rows an instance generates."""
         return (rows - number + self.instance_nb) // self.instance_nb
 
     def _grant(self) -> None:
-        """Let the clients make what is asked for, and what they may make ahead."""
+        """Permit the clients to generate the requested rows, and some ahead."""
         ahead = self._run_ahead
         if ahead is None:
             size = row_bytes(self._table) or _AHEAD_BYTES
@@ -224,7 +224,7 @@ class ClientSource(Source):
                 peer.send(pack(Kind.CREDIT, number=allowed))
 
     def _without_table(self) -> list[int]:
-        """Return the first instance as long as its fields are not known; it has the first row."""
+        """Return the first instance until its fields are known; it generates the first row."""
         peer = self._group.peer(1)
         if peer.row_fields:
             self._table = self.fields = peer.row_fields
@@ -234,7 +234,7 @@ class ClientSource(Source):
         return [1]
 
     def _without_rows(self) -> list[int]:
-        """Move rows that arrived into the batch; return the instances that owe some."""
+        """Move received rows into the batch; return the instances whose rows are missing."""
         owing, failed = [], {}
         for number in range(1, self.instance_nb + 1):
             peer, taken = self._group.peer(number), self._taken[number - 1]
@@ -258,11 +258,11 @@ class ClientSource(Source):
             if not (earlier and self._rejections and isinstance(failed[row], WrongSamplesError)):
                 self._failed_row = row
                 raise failed[row]
-            return earlier  # what was rejected before it is wanted too
+            return earlier  # rows rejected before it are needed too
         return owing
 
     def _next_row(self, number: int) -> int:
-        """Return the number of the row that an instance makes next, among those of all."""
+        """Return the index among all rows of the next one that an instance generates."""
         return self._taken[number - 1] * self.instance_nb + number - 1
 
     def _agree(self, number: int, first: Sequence[Field], other: Sequence[Field]) -> None:

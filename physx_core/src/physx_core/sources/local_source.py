@@ -1,4 +1,4 @@
-"""LocalSource: all instances of the environment in this process."""
+"""LocalSource: runs all instances of the environment in this process."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from physx_core.workers.instance import Instance, instance_arguments
 
 
 class LocalSource(Source):
-    """Steps the instances one after the other; no serialization, no copy but that into the row."""
+    """Steps the instances one after the other, without serialization; one copy, into the row."""
 
     def __init__(
         self,
@@ -25,11 +25,11 @@ class LocalSource(Source):
         *,
         accept_all: bool = False,
     ) -> None:
-        """Keep what the instances are made from.
+        """Prepare the instances.
 
         Args:
-            config: Which environment, and how many instances.
-            services: What the environments may ask of the run.
+            config: The environment, and the number of instances.
+            services: Serves the environments' requests.
             seed: Seed of all instances.
             accept_all: Whether samples that `check_sample` rejects count like the others.
         """
@@ -46,7 +46,7 @@ class LocalSource(Source):
         self._last = range(0)
 
     def open(self) -> None:
-        """Bring the instances to life: see `Source.open`."""
+        """Create the instances' environments: see `Source.open`."""
         for instance in self._instances:
             instance.open(self._services, draw=self._config.visualizer is not None)
         self.fields = [*self._instances[0].fields, *ROW_FIELDS]
@@ -73,11 +73,11 @@ class LocalSource(Source):
             buffer.put(sample, instance.instance_id, instance.last_episode, instance.last_step)
             self._next += 1
         if buffer is None:
-            raise UsageError(f"A batch has at least one row, not {size}.")
+            raise UsageError(f"A batch must have at least one row, not {size}.")
         return buffer.take()
 
     def pop_rejected(self) -> Batch:
-        """Return what was rejected: see `Source.pop_rejected`."""
+        """Return the rejected samples: see `Source.pop_rejected`."""
         blocks = []
         for instance in self._instances:
             if instance.rejected is not None:
@@ -89,7 +89,7 @@ class LocalSource(Source):
         return concatenate(blocks)
 
     def apply(self, prediction: Batch) -> None:
-        """Give predictions to the instances: see `Source.apply`."""
+        """Pass predictions to the instances: see `Source.apply`."""
         for row, number in enumerate(self._last):
             sample = {name: values[row] for name, values in prediction.items()}
             self._instances[number % self.instance_nb].apply(sample)

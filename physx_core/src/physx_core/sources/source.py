@@ -1,4 +1,4 @@
-"""Source: instances of one environment, in this process or elsewhere, behind one interface."""
+"""Source: the interface to the instances of one environment, in this process or in clients."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from physx_core.typing import Batch
 
 
 class Source(ABC):
-    """Makes batches of samples with the instances of one environment.
+    """Generates batches of samples with the instances of one environment.
 
-    Row r of all that a source ever makes, counted from 0, comes from instance ``r % instance_nb``
-    (counted from 0 here), whatever the sizes of the batches and the speed of the instances. So the
-    seed and the number of instances determine every row. A context manager.
+    Row r, counted from 0 over all batches, comes from instance ``r % instance_nb`` (from 0 here),
+    regardless of batch sizes and of the speed of the instances. So the seed and the number of
+    instances determine every row. A context manager.
 
     Attributes:
         instance_nb: Number of instances.
         fields: The environment's fields, and those that physx adds to each row; shapes that the
-            environment leaves open are None until the first batch.
+            environment does not define are None until the first batch.
     """
 
     instance_nb: int
@@ -30,10 +30,10 @@ class Source(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Bring the instances to life.
+        """Create the instances' environments.
 
         Raises:
-            PhysxError: An environment or client failed.
+            PhysxError: If an environment or client fails.
         """
 
     @abstractmethod
@@ -41,38 +41,37 @@ class Source(ABC):
         """Return the next `size` rows, each checked; valid until the next call.
 
         Args:
-            size: How many rows; shape of each array: (size, *field shape).
+            size: Number of rows; shape of each array: (size, *field shape).
             stored: Stored rows to replay, field name to array of shape (size, *field shape): the
-                instance that makes row i finds stored row i in `Environment.sample`, a copy as a
-                dictionary of arrays. None: nothing is replayed, and it finds None.
+                instance that generates row i gets a copy of stored row i as `Environment.sample`,
+                a dictionary of arrays. None: nothing is replayed, and it is None.
 
         Raises:
-            WrongSamplesError: `check_sample` rejected too many samples in a row.
-            SampleError: A sample cannot be stored; names the field, instance and step.
-            PhysxError: An environment or client failed.
+            WrongSamplesError: If `check_sample` rejects too many consecutive samples.
+            SampleError: If a sample cannot be stored; names the field, instance and step.
+            PhysxError: If an environment or client fails.
         """
 
     @abstractmethod
     def pop_rejected(self) -> Batch:
-        """Return what `check_sample` rejected while the last batch was made, and forget it.
+        """Return and clear the samples that `check_sample` rejected during the last batch.
 
-        They have the same fields as other rows and come by instance, then by step; a rejected row
-        belongs to the batch that holds the next accepted one of its instance. After a
-        `WrongSamplesError` they are all those that were rejected before it. An invalid one, for
-        example with NaN, is left out: see `physx_core.rows.RejectedSamples`. Empty without
-        rejected rows and where ``record_wrong_samples`` is off.
+        They have the same fields as other rows and are ordered by instance, then by step; a
+        rejected row belongs to the batch with its instance's next accepted row. After a
+        `WrongSamplesError` they are all that were rejected before it. Invalid ones, for example
+        with NaN, are left out. Empty if ``record_wrong_samples`` is off.
         """
 
     @abstractmethod
     def apply(self, prediction: Batch) -> None:
-        """Give row i of a prediction to the instance that made row i of the last batch."""
+        """Pass row i of a prediction to the instance that generated row i of the last batch."""
 
     @abstractmethod
     def close(self) -> None:
-        """Close the environments; nothing stays behind. Calling it again does nothing."""
+        """Close the environments, and end their clients. Calling it again does nothing."""
 
     def __enter__(self) -> Self:
-        """Open the source; where that fails, environments that cannot be closed are not told of."""
+        """Open the source; if that fails, errors of closing the environments are suppressed."""
         try:
             self.open()
         except BaseException:
@@ -87,17 +86,17 @@ class Source(ABC):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the source; after an error, no other takes its place."""
+        """Close the source; after an error, errors of closing are suppressed."""
         with contextlib.suppress(PhysxError) if kind is not None else contextlib.nullcontext():
             self.close()
 
 
 def check_stored(stored: Batch, size: int) -> None:
-    """Check that stored rows are as many as a batch has.
+    """Check that there is one stored row for each row of a batch.
 
     Raises:
-        UsageError: There are more or fewer.
+        UsageError: If there are more or fewer.
     """
     for name, values in stored.items():
         if len(values) != size:
-            raise UsageError(f'{len(values)} stored rows of "{name}" cannot make {size} rows.')
+            raise UsageError(f'{len(values)} stored rows of "{name}" do not make {size} rows.')

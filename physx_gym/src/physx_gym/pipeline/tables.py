@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 
 from physx_core.errors import ComponentNotFoundError, ConfigError, UnknownOptionError
-from physx_core.plugins import imported
+from physx_core.plugins import import_component
 
 _MODULES = {
     "environment": ("physx_gym",),
@@ -42,7 +42,7 @@ def find(kind: str, reference: Any) -> Callable[..., Any]:
     if not isinstance(reference, str):
         found = reference
     elif ":" in reference:
-        found = imported(kind, reference)
+        found = import_component(kind, reference)
     else:
         found = _find_by_name(kind, reference)
     if not callable(found):

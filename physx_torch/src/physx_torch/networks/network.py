@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from physx_core import Field, Network, Transformation
+from physx_core import Network
 from physx_core.components import Group, options_of
 from physx_core.errors import (
     ConfigError,
@@ -21,8 +21,8 @@ from physx_core.errors import (
 )
 from physx_core.typing import Array, Batch, Tensors
 from physx_torch.devices import find_device
+from physx_torch.parallel import join_group
 from physx_torch.storage.parameters import check_match, read_tensors, write_tensors
-from physx_torch.training import parallel
 
 DATA_TYPES = {"float32": torch.float32, "float64": torch.float64}
 """Names of the floating types that a network can compute in."""
@@ -48,6 +48,7 @@ class TorchNetwork(torch.nn.Module, Network):
     default_optimization: ClassVar[str] = "torch/default"
     default_transformation: ClassVar[str] = "torch/default"
     export_forms: ClassVar[Sequence[str]] = ("onnx", "torchscript", "pt2")
+    exporter: ClassVar[str] = "physx_torch.export:export_network"
 
     def __init__(
         self,
@@ -99,7 +100,7 @@ class TorchNetwork(torch.nn.Module, Network):
         Raises:
             ConfigError: The device does not exist, or the processes do not find each other.
         """
-        return parallel.join(device)
+        return join_group(device)
 
     def predict(self, data: Tensors) -> Tensors:
         """Return ``{field: tensor}`` for `pred_fields` from the `net_fields` in `data`.
@@ -248,26 +249,6 @@ class TorchNetwork(torch.nn.Module, Network):
             for name, value in self.state_dict().items()
             if isinstance(value, torch.Tensor) or name.endswith("_extra_state")
         }
-
-    def export(
-        self, path: Path, form: str, transformation: Transformation, fields: Mapping[str, Field]
-    ) -> None:
-        """Write network and transformation as ``"onnx"``, ``"torchscript"`` or ``"pt2"``.
-
-        The first axis of inputs and outputs is that of the samples, of any length. Floating inputs
-        have the network's data type. ONNX names inputs and outputs by the fields; the other two
-        take and return a dictionary of tensors by field. A field that is read and predicted is
-        given as ``predicted_<name>``.
-
-        Raises:
-            ConfigError: There is no such form, or the network cannot be written in it.
-            MissingLibraryError: ONNX needs the extra ``physx-torch[export]``.
-        """
-        if form not in self.export_forms:
-            super().export(path, form, transformation, fields)
-        from physx_torch import export
-
-        export.write(path, form, self, transformation, fields)
 
     def numpy_to_tensor(self, batch: Batch) -> Tensors:
         """Return arrays as tensors on the network's device.

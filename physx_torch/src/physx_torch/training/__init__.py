@@ -1,1 +1,1 @@
-"""Optimization, data-parallel training, and statistics."""
+"""Optimization, data loading, and statistics."""

@@ -23,8 +23,8 @@ from physx_core.errors import (
 from physx_core.typing import Tensors
 from physx_torch.choices import choose, classes_in, make
 from physx_torch.networks.network import TorchNetwork
+from physx_torch.parallel import average_gradients, take_first_values
 from physx_torch.storage.state import random_state, read_state, set_random_state, write_state
-from physx_torch.training.parallel import average_gradients, take_first_values
 from physx_torch.training.training_forward import PRECISIONS, Forward, compiled, in_precision
 
 Loss = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]

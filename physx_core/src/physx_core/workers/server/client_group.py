@@ -19,7 +19,7 @@ from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.net.tokens import run_token
 from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
-from physx_core.plugins.references import located
+from physx_core.plugins.references import locate
 from physx_core.workers.instance import instance_arguments
 from physx_core.workers.processes.launchers import stop
 from physx_core.workers.server.client_errors import ended, silent
@@ -316,7 +316,7 @@ class ClientGroup:
         return encode(
             {
                 **instance_arguments(config, instance_id, self._seed, self._accepts_all),
-                "environment": located("environment", config.environment),
+                "environment": locate("environment", config.environment),
                 "draw": config.visualizer is not None,
                 "path": [str(Path(entry).resolve()) for entry in sys.path],
                 "directory": str(Path.cwd()),

@@ -20,8 +20,8 @@ from physx_core.errors import ConfigError
 from physx_torch.devices import find_device
 
 
-def join(device: str) -> Group:
-    """Return the group that this process belongs to; one of its own unless torchrun started it.
+def join_group(device: str) -> Group:
+    """Return the group that this process belongs to; of one process unless torchrun started it.
 
     The processes talk through NCCL where each has a CUDA device of its own, otherwise through Gloo.
 

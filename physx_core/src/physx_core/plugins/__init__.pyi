@@ -1,0 +1,12 @@
+"""Plugins: components of pip-installed packages, selected by the name of their entry point."""
+
+from .hookspecs import KINDS as KINDS
+from .hookspecs import Components as Components
+from .hookspecs import hookimpl as hookimpl
+from .references import import_component as import_component
+from .references import reference_of as reference_of
+from .references import resolve as resolve
+from .registry import Plugin as Plugin
+from .registry import PluginInfo as PluginInfo
+from .registry import available as available
+from .registry import load as load
