@@ -273,13 +273,16 @@ def test_the_command_replays_what_a_session_holds_and_draws_it():
         EnvironmentConfig("toy/spring", as_tcp_ip_client=False, num_clients=2),
         session_name="springs", batch_nb=1, batch_size=6,
     ).execute()  # fmt: skip
-    words = ["replay", "sessions/springs", "--environment.visualizer", f"{__file__}:Watch"]
-    assert main(words) == 0
+    words, viewer = (
+        ["replay", "sessions/springs"],
+        ["--environment.visualizer", f"{__file__}:Watch"],
+    )
+    assert main([*words, *viewer]) == 0
     drawn = Path("sessions/replay/drawn.txt").read_text().splitlines()
     assert sorted(line for line in drawn if "view" not in line)[-6:] == [
         f"{number} {step} mass spring" for number in (1, 2) for step in range(3)
     ]
-    assert main([*words, "toy/spring", "--environment.num-clients", "1", "--step-nb", "2"]) == 0
+    assert main([*words, "toy/spring", *viewer, "--environment.num-clients", "1"]) == 0
     assert "num_clients = 1" in Path("sessions/replay_1/config.toml").read_text()
 
 

@@ -194,7 +194,7 @@ def test_scheduler_of_the_configuration(data):
     training = Training(network, data, epoch_nb=3, batch_size=60, seed=0)
     training.execute()
     assert training.learner.optimization.learning_rate() == pytest.approx(1e-3)
-    with pytest.raises(ConfigError, match="without scheduler"):
+    with pytest.raises(ConfigError, match="without a scheduler"):
         Learner(config(scheduler_kwargs={"step_size": 1}), trains=True)
     with pytest.raises(ConfigError, match="LeastSquares has no schedulers"):
         Learner(NetworkConfig("toy/linear", scheduler="StepLR"), trains=True)
