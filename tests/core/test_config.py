@@ -70,5 +70,5 @@ def test_files_that_are_none_are_named(tmp_path):
     (tmp_path / "bad.toml").write_text("a = ")
     with pytest.raises(ConfigFileError, match="not valid TOML"):
         read_toml(tmp_path / "bad.toml")
-    with pytest.raises(ConfigError, match="cannot hold"):
+    with pytest.raises(ConfigError, match="cannot be written"):
         to_plain(EnvironmentConfig("x", env_kwargs={"f": object()}))

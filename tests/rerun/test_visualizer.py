@@ -13,7 +13,7 @@ from physx_core import plugins
 from physx_core.components import Factory
 from physx_core.errors import ConfigError, UnknownOptionError, VisualizerError
 from physx_rerun import visualizer as visualizer_module
-from physx_rerun.viewer.viewer import Viewer, free_port
+from physx_rerun.viewer.viewer import Viewer, find_free_port
 from physx_rerun.visualizer import RerunVisualizer
 
 
@@ -99,7 +99,7 @@ def test_a_viewer_of_its_own_outlives_the_run(monkeypatch, opened):
 
 
 def test_nobody_listens(tmp_path):
-    address = f"127.0.0.1:{free_port()}"
+    address = f"127.0.0.1:{find_free_port()}"
     with pytest.raises(VisualizerError, match=f"No Rerun viewer listens at {address}"):
         RerunVisualizer(mode="connect", address=address).open("run", tmp_path, 1)
 

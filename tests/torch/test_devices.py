@@ -92,9 +92,9 @@ def test_mixed_precision_is_that_of_the_device(monkeypatch):
             super().__init__("cpu", torch.bfloat16)
 
     monkeypatch.setattr(torch, "autocast", Autocast)
-    from physx_torch.training.training_forward import in_precision
+    from physx_torch.training.training_forward import run_in_precision
 
-    forward = in_precision(lambda x: x, torch.device("cuda:1"), torch.float16, torch.float32)
+    forward = run_in_precision(lambda x: x, torch.device("cuda:1"), torch.float16, torch.float32)
     assert forward(torch.zeros(2)).dtype == torch.float32
     assert asked == [("cuda", torch.float16)]
 

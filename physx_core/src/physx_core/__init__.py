@@ -1,6 +1,7 @@
 """physx connects C++ physics engines with deep learning.
 
-The public names are imported when they are first used, so that ``import physx_core`` stays quick.
+The names for users: pipelines, configurations, datasets, world descriptions, and the base classes
+of components. They are imported on first use, so that ``import physx_core`` is quick.
 """
 
 from __future__ import annotations

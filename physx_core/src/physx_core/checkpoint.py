@@ -1,10 +1,10 @@
-"""Checkpoint: a folder with a network's parameters and all that is needed to use them.
+"""Checkpoint: a folder with a network's parameters and everything that is needed to use them.
 
 ``checkpoint.toml`` names the network, its transformation, its fields and their normalization; the
-network's own library writes the parameters beside it. Nothing in it is code.
+network's library writes the parameters beside it. Nothing in it is code.
 
-Those of a training are numbered in the order of writing, and the last is where it can be resumed.
-Beside them stands ``<name>_best``, the network of the epoch with the smallest loss.
+The checkpoints of a training are numbered in the order of writing; it can be resumed from the last.
+Beside them is ``<name>_best``, the network of the epoch with the smallest loss.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ _KEPT = (
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a training was when its checkpoint was written.
+    """Progress of a training when its checkpoint was written.
 
     Attributes:
-        epoch: Number of epochs that were finished.
-        batch: Number of batches of the next epoch that were finished.
-        batches_read: Number of batches that were read from the dataset, in all epochs.
+        epoch: Number of finished epochs.
+        batch: Number of finished batches of the next epoch.
+        batches_read: Number of batches read from the dataset, in all epochs.
         seed: Seed of the training.
         best: State of `BestEpoch`.
         record: State of `TrainingRecord`.
@@ -59,14 +59,14 @@ class Progress:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a checkpoint says of itself.
+    """Description of a checkpoint.
 
     Attributes:
         path: The checkpoint's folder.
         network: References and arguments of network and transformation, as in `NetworkConfig`.
-        fields: The fields that the network reads and is compared with, by name.
-        normalization: Their normalization, by name; empty if nothing was normalized.
-        progress: How far the training was.
+        fields: The network's input and target fields by name.
+        normalization: Their normalization by name; empty if nothing was normalized.
+        progress: Progress of the training.
     """
 
     path: Path
@@ -76,8 +76,8 @@ class Checkpoint:
     progress: Progress
 
 
-def numbers(network_dir: Path, name: str) -> list[int]:
-    """Return the numbers of the checkpoints of one name in a folder, sorted."""
+def list_numbers(network_dir: Path, name: str) -> list[int]:
+    """Return the sorted numbers of the checkpoints of one name in a folder."""
     pattern = re.compile(re.escape(name) + r"_(\d+)")
     if not network_dir.is_dir():
         return []
@@ -102,16 +102,16 @@ def save(
 
     Args:
         network_dir: Folder of the checkpoints.
-        config: What network and transformation were made from.
-        network: Its parameters are kept.
-        optimization: Its state is kept, so that the training can be resumed.
+        config: Configuration of network and transformation.
+        network: The network, whose parameters are written.
+        optimization: The optimization, whose state is written so that training can resume.
         fields: The dataset's fields.
-        normalization: What the transformation normalizes with.
-        progress: How far the training is.
-        best: Write ``<network_name>_best`` in the place of the one before, to predict with or to
-            start from, without what a resumed training needs.
+        normalization: Normalization of the transformation.
+        progress: Progress of the training.
+        best: Replace ``<network_name>_best``, to predict with or to start from, without the state
+            that a resumed training needs.
     """
-    number = max(numbers(network_dir, config.network_name), default=-1) + 1
+    number = max(list_numbers(network_dir, config.network_name), default=-1) + 1
     path = network_dir / f"{config.network_name}_{BEST if best else number}"
     partial = network_dir / f".{path.name}.partial"
     shutil.rmtree(partial, ignore_errors=True)
@@ -133,11 +133,11 @@ def save(
             },
         },
     )
-    _put_in_place(partial, path)
+    _replace(partial, path)
     return path
 
 
-def _put_in_place(partial: Path, path: Path) -> None:
+def _replace(partial: Path, path: Path) -> None:
     former = path.with_name(f".{path.name}.former")
     shutil.rmtree(former, ignore_errors=True)
     if path.exists():
@@ -152,15 +152,15 @@ def find(place: Path, name: str, which: int | str) -> Path:
     Args:
         place: A session's folder, its network folder, or a checkpoint's own folder.
         name: Name of the network.
-        which: Number of the checkpoint; -1: the last; ``"best"``: that of the smallest loss.
+        which: Number of the checkpoint; -1: the last; ``"best"``: the one with the smallest loss.
 
     Raises:
-        CheckpointError: There is no such checkpoint; the message lists those that are there.
+        CheckpointError: If there is no such checkpoint; the message lists the existing ones.
     """
     if (place / DESCRIPTION).exists():
         return place
     folder = place / "network" if (place / "network").is_dir() else place
-    known: list[int | str] = [*numbers(folder, name)]
+    known: list[int | str] = [*list_numbers(folder, name)]
     if which == BEST and (folder / f"{name}_{BEST}" / DESCRIPTION).exists():
         known.append(BEST)
     if not known or which not in (-1, *known):
@@ -173,10 +173,10 @@ def find(place: Path, name: str, which: int | str) -> Path:
 
 
 def read(path: Path) -> Checkpoint:
-    """Return what a checkpoint's folder says of itself.
+    """Return the description of a checkpoint.
 
     Raises:
-        CheckpointError: The description is missing, damaged or of a later format.
+        CheckpointError: If the description is missing, damaged or of a later format.
     """
     try:
         plain = read_toml(path / DESCRIPTION)
@@ -195,4 +195,4 @@ def read(path: Path) -> Checkpoint:
             progress=Progress(**plain["progress"]),
         )
     except (ConfigFileError, KeyError, TypeError) as error:
-        raise CheckpointError(f"{path} is no readable checkpoint: {error}.") from error
+        raise CheckpointError(f"{path} is not a readable checkpoint: {error}.") from error

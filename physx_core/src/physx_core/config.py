@@ -1,4 +1,7 @@
-"""Configurations: frozen, validated dataclasses that load from and save to one TOML file."""
+"""Configurations: frozen, validated dataclasses that are loaded from and saved to one TOML file.
+
+Plugins use `options` and `at_least` to validate the options of their components in the same way.
+"""
 
 from __future__ import annotations
 
@@ -14,22 +17,38 @@ from typing import Any, Literal, TypeVar, dataclass_transform
 
 from physx_core.errors import ConfigError, ConfigFileError, UnknownOptionError, UsageError
 
+__all__ = [
+    "MODES",
+    "WRONG",
+    "DatasetConfig",
+    "EnvironmentConfig",
+    "NetworkConfig",
+    "at_least",
+    "configuration",
+    "from_plain",
+    "options",
+    "read_toml",
+    "reference_of",
+    "to_plain",
+    "write_toml",
+]
+
 T = TypeVar("T")
 
 
 @dataclass_transform(field_specifiers=(field,), frozen_default=True)
 def configuration(cls: type[T]) -> type[T]:
-    """Make a frozen dataclass whose constructor names what is wrong with its arguments.
+    """Create a frozen dataclass whose constructor validates its arguments.
 
-    Field metadata may hold ``minimum`` and ``maximum`` (numbers), ``choices`` (the only values
-    allowed), and ``recorded`` (False: the option is not part of the configuration as plain data).
+    Field metadata may contain ``minimum`` and ``maximum`` (numbers), ``choices`` (the allowed
+    values), and ``recorded`` (False: the option is not part of the configuration as plain data).
     Attribute docstrings become the help texts of the command line.
     """
     return options(dataclass(frozen=True)(cls))
 
 
 def options(cls: type[T]) -> type[T]:
-    """Give a dataclass a constructor that raises `ConfigError` for unknown or unfit options."""
+    """Give a dataclass a constructor that raises `ConfigError` for unknown or invalid options."""
     construct = cls.__init__
     names = [f.name for f in dataclasses.fields(cls) if f.init]  # type: ignore[arg-type]
 
@@ -84,111 +103,109 @@ def _check_range(where: str, value: Any, metadata: Mapping[Any, Any]) -> None:
 
 
 def at_least(minimum: float, default: Any = dataclasses.MISSING) -> Any:
-    """Return a dataclass field for a number that is not below `minimum`."""
+    """Return a dataclass field for a number of at least `minimum`."""
     return field(default=default, metadata={"minimum": minimum})
 
 
 MODES = ("training", "validation", "prediction")
-"""The modes of a dataset that samples are made for."""
+"""The modes of a dataset that samples can be generated for."""
 WRONG = "wrong"
 """Mode of the samples that `check_sample` rejected."""
 
 
 @configuration
 class EnvironmentConfig:
-    """Which environment makes the samples, and how its instances run."""
+    """The environment that generates the samples, and how its instances run."""
 
     environment: str | type[Any]
     """Reference "plugin/name", "package.module:Class", "script.py:Class", or the class itself."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the environment's constructor."""
     as_tcp_ip_client: bool = True
-    """Run each instance in a process of its own; otherwise all of them in this process."""
+    """Run each instance in a process of its own; otherwise all in this process."""
     num_clients: int = at_least(1, 1)
-    """Number of instances. The same seed and number give the same samples, however they run."""
+    """Number of instances. The same seed and number generate the same samples, in any process."""
     ip_address: str = "127.0.0.1"
-    """Address that the server listens at."""
+    """Address of the server."""
     port: int = field(default=0, metadata={"minimum": 0, "maximum": 65535})
-    """Port that the server listens at; 0: any free one."""
+    """Port of the server; 0: any free one."""
     simulations_per_step: int = at_least(1, 1)
-    """Calls of `step` for one sample; `compute_training_data` is False in all but the last."""
+    """Calls of `step` per sample; `compute_training_data` is False in all but the last."""
     max_wrong_samples_per_step: int = at_least(0, 10)
-    """How many samples in a row `check_sample` may reject before the run ends with an error."""
+    """Number of consecutive samples that `check_sample` may reject before the run fails."""
     record_wrong_samples: bool = False
-    """Store the samples that `check_sample` rejects too, in the mode "wrong", with the same fields;
-    those that are invalid, for example with NaN, are left out. A prediction does so if it records.
-    """
+    """Store the samples that `check_sample` rejects too, in the mode "wrong", except invalid ones,
+    for example with NaN. In a prediction, only if it records."""
     load_samples: bool = False
     """Send stored samples of `DatasetConfig.existing_dir`, or else of the session, through the
-    environments, which find them in `Environment.sample`. In a training, what they make of them
-    takes the samples' place in the session's own copy of the dataset, and is learned from. In a
-    prediction the samples are only read, in the order of writing, again and again."""
+    environments, available as `Environment.sample`. In a training, the results are trained on and
+    replace the samples in the session's own copy of the dataset. In a prediction the samples are
+    only read, in the order of writing, repeatedly."""
     only_first_epoch: bool = True
-    """With `load_samples`, in a training: True: samples are sent in the first epoch, and the later
-    ones read what was made of them; False: all are sent in every epoch, as the last one left them.
-    """
+    """With `load_samples`, in a training: send the samples in the first epoch only, and read the
+    results in later ones; otherwise send the last epoch's results again in every epoch."""
     always_produce: bool = False
-    """Make new samples in every epoch of a training, not only in the first; excludes
+    """Generate new samples in every epoch of a training, not only in the first; excludes
     `load_samples`."""
     visualizer: str | type[Any] | None = None
     """Visualizer, for example "rerun"; None: the environment has no factory."""
     visualizer_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the visualizer."""
     seed: int | None = None
-    """Seed of all instances' random streams; None: a fresh one, noted in the session."""
+    """Seed of all instances' random streams; None: a random one, recorded in the session."""
     timeout: float = at_least(0.1, 60.0)
-    """Longest time in s that a client may stay silent while the server waits for it."""
+    """Longest time in s that a client may be silent while the server waits for it."""
     restarts: int = at_least(0, 0)
-    """How often each client that fails is started again; the samples are those of a run without
-    the failure."""
+    """Number of times that each client is restarted after a failure; the samples are the same as
+    without the failure."""
     launcher: str | type[Any] = "physx/subprocess"
-    """What starts the clients: "physx/subprocess" on this machine; "physx/manual": they are started
-    by hand, with ``physx client``; or that of a plugin."""
+    """Launcher of the clients: "physx/subprocess" on this machine; "physx/manual" if you start them
+    with ``physx client``; or that of a plugin."""
     launcher_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the launcher."""
     token_file: str | None = None
-    """File that holds the secret that clients must know, readable by its owner alone; None: the
-    environment variable PHYSX_TOKEN, or else a random one for clients that are started here."""
+    """File with the secret token of the clients, readable by its owner only; None: the environment
+    variable PHYSX_TOKEN, or else a random token for clients that are started here."""
 
 
 @configuration
 class DatasetConfig:
-    """Where samples are kept and how they are read."""
+    """Where samples are stored and how they are read."""
 
     existing_dir: str | None = None
     """Folder of an existing session or dataset to read; it is never modified."""
     mode: str = field(default="training", metadata={"choices": (*MODES, WRONG)})
-    """Mode that is written or read: "training", "validation" or "prediction"; "wrong", which holds
-    what `check_sample` rejected, is only read."""
+    """Mode to write or read: "training", "validation" or "prediction"; "wrong", with the samples
+    that `check_sample` rejected, is only read."""
     max_file_size: float = at_least(1e-6, 0.25)
-    """Size in GB at which a partition is full and the next one begins."""
+    """Size of a partition in GB."""
     shuffle: bool = True
     """Read each epoch in a new random order; otherwise in the order of writing."""
     validation_split: float = field(default=0.0, metadata={"minimum": 0.0, "maximum": 0.99})
-    """Share of the samples that a training holds back for validation, where the dataset has no
-    mode "validation"; the same samples in every training. Normalization comes from the others."""
+    """Share of the samples that a training holds back for validation, if the dataset has no mode
+    "validation"; the same samples in every training. The others define the normalization."""
     split_by: str = field(default="row", metadata={"choices": ("row", "episode")})
     """Hold back single samples, or whole trajectories: "row" or "episode"."""
     normalize: bool = False
-    """Give networks each component with mean 0 and standard deviation 1."""
+    """Normalize each component to mean 0 and standard deviation 1 for networks."""
     recompute_normalization: bool = False
     """Compute mean and standard deviation from the stored rows instead of the stored values."""
 
 
 @configuration
 class NetworkConfig:
-    """Which network is trained or asked, and how it is optimized."""
+    """The network to train or to predict with, and its optimization."""
 
     network: str | type[Any] | None = None
-    """Reference of the network; None: the one that the checkpoint names (prediction only)."""
+    """Reference of the network; None: that of the checkpoint (prediction only)."""
     network_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the network's constructor."""
     optimization: str | type[Any] | None = None
-    """Reference of the optimization; None: the one that the network brings."""
+    """Reference of the optimization; None: the network's default."""
     optimization_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the optimization's constructor."""
     transformation: str | type[Any] | None = None
-    """Reference of the transformation; None: the one that the network brings."""
+    """Reference of the transformation; None: the network's default."""
     transformation_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the transformation's constructor."""
     loss: str | type[Any] | None = None
@@ -198,34 +215,34 @@ class NetworkConfig:
     optimizer_kwargs: dict[str, Any] = field(default_factory=dict)
     """Further keyword arguments of the optimizer."""
     lr: float | None = None
-    """Learning rate; None: the optimizer's own."""
+    """Learning rate; None: the optimizer's default."""
     scheduler: str | type[Any] | None = None
-    """What changes the learning rate after each epoch, a class or the name of one of the network's
-    library; None: it stays."""
+    """Scheduler of the learning rate, a class or the name of one of the network's library; None:
+    the rate is constant."""
     scheduler_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the scheduler."""
     network_dir: str | None = None
-    """Session or network folder whose parameters a training starts from."""
+    """Session or network folder with the parameters that a training starts from."""
     network_name: str = "network"
     """Name of the checkpoints in the session."""
     which_network: int | Literal["best"] = -1
-    """Number of the checkpoint to load; -1: the last; "best": that of the smallest loss."""
+    """Number of the checkpoint to load; -1: the last; "best": the one with the smallest loss."""
     save_each_epoch: bool = False
-    """Keep a checkpoint of every epoch, not only the one at the end."""
+    """Write a checkpoint after every epoch, not only at the end."""
     save_best: bool | None = None
-    """Keep the network of the epoch with the smallest validation loss, or training loss where
-    nothing is validated, as checkpoint "best". None: where something is validated, or
-    `Training.patience` is set; a training loss alone is the smallest at the end anyway."""
+    """Write the network of the epoch with the smallest validation loss, or training loss if nothing
+    is validated, as checkpoint "best". None: if something is validated or `Training.patience` is
+    set, as the training loss is usually smallest at the end."""
     data_type: str = field(default="float32", metadata={"choices": ("float32", "float64")})
     """Floating type that the network computes in."""
     device: str = "auto"
-    """Where the network computes: "cpu", "cuda", "cuda:1" ... or "auto"."""
+    """Device of the network: "cpu", "cuda", "cuda:1" ... or "auto"."""
     require_training_stuff: bool = True
-    """Whether a training needs `loss` and `optimizer`; False where the optimization has its own."""
+    """Whether a training needs `loss` and `optimizer`; False if the optimization has its own."""
 
 
 def to_plain(config: Any) -> dict[str, Any]:
-    """Return a configuration as data that TOML can hold; options that are None are left out."""
+    """Return a configuration as TOML-compatible data, without options that are None."""
     return {
         name: _plain_value(f"{type(config).__name__}.{name}", getattr(config, name))
         for name in (f.name for f in dataclasses.fields(config) if _is_recorded(f))
@@ -258,14 +275,14 @@ def _plain_value(where: str, value: Any) -> Any:
         return value.tolist()
     if isinstance(value, (bool, int, float, str)):
         return value
-    raise ConfigError(f"{where} is {value!r}, which a TOML file cannot hold.")
+    raise ConfigError(f"{where} is {value!r}, which cannot be written to a TOML file.")
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Return the content of a TOML file.
 
     Raises:
-        ConfigFileError: The file is missing or is not TOML.
+        ConfigFileError: If the file is missing or is not TOML.
     """
     import tomllib
 
@@ -285,14 +302,14 @@ def write_toml(path: str | Path, plain: Mapping[str, Any]) -> None:
 
 
 def from_plain(make: Callable[..., T], plain: Mapping[str, Any]) -> T:
-    """Make a configuration from plain data; tables become the configurations that belong there.
+    """Create a configuration from plain data, in which tables are nested configurations.
 
     Args:
-        make: A configuration, or another dataclass made by `options`.
-        plain: Option names to values, as `to_plain` gives them.
+        make: A configuration, or another dataclass decorated with `options`.
+        plain: Option names to values, as returned by `to_plain`.
 
     Raises:
-        ConfigError: An option is unknown or has an unfit value.
+        ConfigError: If an option is unknown or has an invalid value.
     """
     hints = _hints(make)
     values = {}
@@ -311,18 +328,18 @@ def _configuration_in(hint: Any) -> type[Any] | None:
 
 
 SCRIPT_PREFIX = "_physx_script_"
-"""Beginning of the names under which scripts are imported that define a component."""
+"""Prefix of the module names of imported scripts."""
 
 
 def reference_of(component: Any) -> str:
-    """Return the text by which another process finds a component.
+    """Return the reference by which another process finds a component.
 
     Args:
-        component: A reference, which is returned as it is, or a class.
+        component: A reference, which is returned unchanged, or a class.
 
     Raises:
-        UsageError: The class cannot be found from outside: it was defined in a function or in an
-            interactive session.
+        UsageError: If the class was defined in a function or in an interactive session, where other
+            processes cannot find it.
     """
     if isinstance(component, str):
         return component
@@ -344,6 +361,6 @@ def reference_of(component: Any) -> str:
     if not file or not Path(file).is_file():
         raise UsageError(
             f"{name} is defined in an interactive session, where no other process can find it. "
-            "Put it into a file, or run with as_tcp_ip_client=False."
+            "Move it to a file, or run with as_tcp_ip_client=False."
         )
     return f"{Path(file).resolve()}:{name}"

@@ -1,4 +1,7 @@
-"""Every error that a user of physx can meet: one class for each thing that can be put right."""
+"""The errors of physx, one class for each kind of problem that a user can fix.
+
+Plugins raise these errors too: the command line reports them without a traceback.
+"""
 
 from __future__ import annotations
 
@@ -26,16 +29,16 @@ class PhysxError(Exception):
 
 
 class ConfigError(PhysxError):
-    """A value of a configuration is not what the option takes."""
+    """A configuration value is invalid."""
 
 
 class UnknownOptionError(ConfigError):
-    """An option that the configuration does not have.
+    """A configuration does not have an option of this name.
 
     Attributes:
-        owner: What was configured, for example ``EnvironmentConfig``.
-        unknown: The names that nothing takes.
-        known: The names that would have been taken.
+        owner: Name of the configuration, for example ``EnvironmentConfig``.
+        unknown: The unknown option names.
+        known: The valid option names.
     """
 
     def __init__(self, owner: str, unknown: Iterable[str], known: Iterable[str]) -> None:
@@ -52,7 +55,7 @@ class ConfigFileError(ConfigError):
 
 
 class UsageError(PhysxError):
-    """Calls that do not fit together, for example a method called outside of its phase."""
+    """An invalid call, for example of a method outside of its phase."""
 
 
 # Plugins ------------------------------------------------------------------------------------
@@ -74,8 +77,8 @@ class PluginNotFoundError(PhysxError):
     """No installed plugin has this entry-point name.
 
     Attributes:
-        name: The name asked for.
-        installed: Entry-point names that are installed.
+        name: The requested name.
+        installed: Entry-point names of the installed plugins.
     """
 
     def __init__(self, name: str, installed: Sequence[str], pip: str) -> None:
@@ -87,12 +90,12 @@ class PluginNotFoundError(PhysxError):
 
 
 class ComponentNotFoundError(PhysxError):
-    """The plugin, module or script is there, but not the component asked of it.
+    """The plugin, module or script exists, but does not have the requested component.
 
     Attributes:
         kind: Kind of the component, for example ``environment``.
-        name: The name asked for.
-        known: Names that exist there.
+        name: The requested name.
+        known: Names of the existing components.
     """
 
     def __init__(self, kind: str, name: str, place: str, known: Iterable[str]) -> None:
@@ -104,19 +107,19 @@ class ComponentNotFoundError(PhysxError):
 
 
 class ReferenceFormError(PhysxError):
-    """A component was named in a form that physx does not know."""
+    """The reference to a component has an invalid form."""
 
 
 # Samples ------------------------------------------------------------------------------------
 
 
 class SampleError(PhysxError):
-    """An environment gave data that cannot be stored.
+    """An environment set data that cannot be stored.
 
     Attributes:
-        field: Name of the field, or an empty string where no field is concerned.
-        instance_id: Number of the environment instance, counted from 1; 0 where none is concerned.
-        step: The instance's step that gave the data, counted from 0; -1 where none is concerned.
+        field: Name of the field, or an empty string if the error is not about a field.
+        instance_id: Number of the environment instance, from 1; 0 if it is not about an instance.
+        step: The instance's step that set the data, from 0; -1 if it is not about a step.
     """
 
     def __init__(
@@ -129,27 +132,27 @@ class SampleError(PhysxError):
 
 
 class MissingFieldError(SampleError):
-    """A field that was defined is not in the sample."""
+    """A defined field is missing in the sample."""
 
 
 class UnknownFieldError(SampleError):
-    """A field in the sample that was not defined."""
+    """A field in the sample is not defined."""
 
 
 class FieldShapeError(SampleError):
-    """A field's value has another shape than the field."""
+    """A value does not have the shape of its field."""
 
 
 class FieldTypeError(SampleError):
-    """A field's value has a type that the field's type cannot hold."""
+    """A value cannot be represented in the type of its field."""
 
 
 class NotFiniteError(SampleError):
-    """A field's value holds NaN or an infinite number."""
+    """A value contains NaN or infinity."""
 
 
 class WrongSamplesError(SampleError):
-    """`check_sample` rejected more samples in a row than the configuration allows."""
+    """`check_sample` rejected more consecutive samples than the configuration allows."""
 
 
 # Environments and clients -------------------------------------------------------------------
@@ -159,10 +162,10 @@ class EnvironmentFailedError(PhysxError):
     """User code of an environment raised an exception.
 
     Attributes:
-        instance_id: Number of the environment instance, counted from 1.
+        instance_id: Number of the environment instance, from 1.
         method: Name of the method that raised, for example ``step``.
-        step: The instance's step at which it happened, counted from 0; -1 before the first.
-        remote_traceback: Traceback as text, as it was where the environment runs.
+        step: The instance's step at which it raised, from 0; -1 before the first.
+        remote_traceback: Traceback in the environment's process, as text.
     """
 
     def __init__(
@@ -175,12 +178,12 @@ class EnvironmentFailedError(PhysxError):
 
 
 class ClientError(PhysxError):
-    """A client process ended, hung or could not be talked to.
+    """A client process ended, hung or could not be reached.
 
     Attributes:
-        instance_id: Number of the environment instance that the client runs, counted from 1.
+        instance_id: Number of the client's environment instance, from 1.
         exit_status: Exit status of the process, negative for a signal, None while it runs.
-        stderr: Last lines that the process wrote to its standard error.
+        stderr: Last lines of its standard error.
     """
 
     def __init__(
@@ -192,42 +195,42 @@ class ClientError(PhysxError):
 
 
 class ConnectionRefusedByPeerError(PhysxError):
-    """The other side of a connection did not prove that it knows the token, or spoke nonsense."""
+    """The other side of a connection failed to authenticate, or violated the protocol."""
 
 
 class UnansweredError(ConnectionRefusedByPeerError):
-    """Nothing answers at an address, or the connection ended before anything was proved."""
+    """Nothing responds at an address, or the connection ended before authentication."""
 
 
 # Sessions, datasets, checkpoints ------------------------------------------------------------
 
 
 class SessionError(PhysxError):
-    """A session folder is missing, or is not what the pipeline needs."""
+    """A session folder is missing, or does not fit the pipeline."""
 
 
 class DatasetError(PhysxError):
-    """A dataset is missing, damaged, or does not hold what was asked of it."""
+    """A dataset is missing, damaged, or lacks the requested data."""
 
 
 class DatasetNotFoundError(DatasetError):
-    """No dataset lies in this folder."""
+    """A folder does not contain a dataset."""
 
 
 class DatasetLockedError(DatasetError):
-    """Another process writes to this dataset."""
+    """Another process is writing to the dataset."""
 
 
 class ExchangeError(DatasetError):
-    """Rows cannot be written to, or taken from, a file of another format."""
+    """Rows cannot be exported to, or imported from, a file of another format."""
 
 
 class MissingLibraryError(PhysxError):
-    """A library that is only needed for this is not installed.
+    """An optional library is not installed.
 
     Attributes:
         library: Name of the package.
-        extra: Extra that brings it.
+        extra: Extra of a distribution that installs it.
     """
 
     def __init__(
@@ -241,7 +244,7 @@ class MissingLibraryError(PhysxError):
 
 
 class FieldsMismatchError(DatasetError):
-    """Fields of two things that must fit together differ.
+    """Fields that must agree differ.
 
     Attributes:
         differences: One line of text for each difference, by field name.
@@ -254,7 +257,7 @@ class FieldsMismatchError(DatasetError):
 
 
 class CheckpointError(PhysxError):
-    """A checkpoint is missing, damaged, or made for another network."""
+    """A checkpoint is missing, damaged, or of another network."""
 
 
 # Simulations and viewers --------------------------------------------------------------------
@@ -268,7 +271,7 @@ class MissingMeshesError(ModelError):
     """Mesh files that a robot description names do not exist.
 
     Attributes:
-        missing: Every missing file, as the description names it.
+        missing: Every missing file, as named in the description.
     """
 
     def __init__(self, model: str, missing: Sequence[str]) -> None:
@@ -281,16 +284,16 @@ class MissingMeshesError(ModelError):
 
 
 class SimulationError(PhysxError):
-    """A call that the simulation cannot carry out, or a state that is no longer finite."""
+    """The simulation cannot perform a call, or its state is no longer finite."""
 
 
 class FeatureNotSupportedError(SimulationError):
-    """The engine does not have the feature that was asked for.
+    """The engine does not have the requested feature.
 
     Attributes:
         engine: Name of the engine.
-        feature: What was asked for.
-        features: What the engine has.
+        feature: The requested feature.
+        features: The engine's features.
     """
 
     def __init__(
@@ -304,15 +307,15 @@ class FeatureNotSupportedError(SimulationError):
 
 
 class EpisodeError(PhysxError):
-    """A call at the wrong moment of an episode, for example a step before the first reset."""
+    """A call at the wrong time in an episode, for example a step before the first reset."""
 
 
 class ActionError(PhysxError):
-    """An action that is no element of the action space and cannot be brought into it.
+    """An action is not in the action space and cannot be converted.
 
     Attributes:
-        entry: Where in the action it is wrong, for example ``[2]`` or ``["arm"][0]``; empty where
-            all of it is.
+        entry: Invalid entry of the action, for example ``[2]`` or ``["arm"][0]``; empty if the
+            whole action is invalid.
     """
 
     def __init__(self, message: str, entry: str = "") -> None:
@@ -321,7 +324,7 @@ class ActionError(PhysxError):
 
 
 class LogError(PhysxError):
-    """The log of an episode is missing or damaged, or lacks what was asked of it."""
+    """The log of an episode is missing, damaged, or lacks the requested data."""
 
 
 class VisualizerError(PhysxError):
@@ -332,20 +335,20 @@ class VisualizerError(PhysxError):
 
 
 class RemoteError(PhysxError):
-    """An environment in another process cannot be served, reached or driven."""
+    """An environment in another process cannot be served, reached or stepped."""
 
 
 class RemoteClosedError(RemoteError):
-    """The other side ended the connection, or the connection was closed here before."""
+    """The connection was closed, by the other side or here."""
 
 
 class RemoteTimeoutError(RemoteError):
-    """The other side did not answer in time."""
+    """The other side did not respond in time."""
 
 
 class RemoteProtocolError(RemoteError):
-    """The other side sent what the protocol does not allow."""
+    """The other side violated the protocol."""
 
 
 class RequestError(RemoteError):
-    """A request to an environment cannot be carried out; the environment lives on."""
+    """An environment cannot perform a request; it keeps running."""

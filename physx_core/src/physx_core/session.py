@@ -25,7 +25,7 @@ class Session:
 
     Attributes:
         path: The folder: ``<session_dir>/<session_name>``, with ``_1``, ``_2`` ... for later ones.
-        is_new: Whether the folder was made for the present run.
+        is_new: Whether the folder was created for the current run.
     """
 
     path: Path
@@ -55,19 +55,19 @@ class Session:
     def create(
         cls, session_dir: str | Path, session_name: str, new_session: bool = True
     ) -> Session:
-        """Make a session's folder.
+        """Create a session's folder.
 
         Args:
             session_dir: Folder of the sessions, relative to the working directory.
             session_name: Name of the session.
-            new_session: Whether an existing session of that name is left alone and a number is
-                added to the new one's name; otherwise the existing one is used.
+            new_session: Whether to number the new session if one of that name exists; otherwise the
+                existing one is used.
 
         Raises:
-            SessionError: The name is no folder's name, or something else is in the way.
+            SessionError: If the name is not a valid folder name, or the folder cannot be created.
         """
         if session_name in ("", "..") or Path(session_name).name != session_name:
-            raise SessionError(f'"{session_name}" cannot be the name of a session\'s folder.')
+            raise SessionError(f'"{session_name}" is not a valid name of a session.')
         root = Path(session_dir)
         path = root / session_name
         try:
@@ -81,14 +81,14 @@ class Session:
                 except FileExistsError:
                     path = root / f"{session_name}_{_last_number(root, session_name) + 1}"
         except OSError as error:
-            raise SessionError(f"Cannot make the session folder {path}: {error}.") from error
+            raise SessionError(f"Cannot create the session folder {path}: {error}.") from error
 
     @classmethod
     def existing(cls, session_dir: str | Path, session_name: str) -> Session:
-        """Return a session that is there.
+        """Return an existing session.
 
         Raises:
-            SessionError: There is no such session; the message lists those that are there.
+            SessionError: If there is no such session; the message lists the existing ones.
         """
         path = Path(session_dir) / session_name
         if not path.is_dir():
@@ -101,17 +101,17 @@ class Session:
         return cls(path)
 
     def discard(self) -> None:
-        """Remove the folder if it was made for the present run, which did not come to anything."""
+        """Remove the folder if it was created for the current run, which failed to start."""
         if self.is_new:
             shutil.rmtree(self.path, ignore_errors=True)
 
     def record(self, pipeline: str, plain: Mapping[str, Any], seed: int) -> None:
-        """Write what a run is made from into ``config.toml`` and ``info.txt``.
+        """Write a run's configuration into ``config.toml`` and ``info.txt``.
 
         Args:
             pipeline: Name of the pipeline, the table in ``config.toml``.
             plain: Its configuration as plain data.
-            seed: The seed that is used.
+            seed: The seed of the run.
         """
         import tomli_w
 
@@ -128,7 +128,7 @@ class Session:
         self.note(f"{lines}\n{tomli_w.dumps(plain)}")
 
     def note(self, text: str) -> None:
-        """Add a paragraph to ``info.txt``; what stands there, notes of the user's too, stays."""
+        """Append a paragraph to ``info.txt``, where the user may write notes too."""
         with (self.path / "info.txt").open("a", encoding="utf-8") as stream:
             stream.write(f"{text.rstrip()}\n\n")
 
@@ -140,7 +140,7 @@ def _last_number(root: Path, name: str) -> int:
 
 
 def installed_versions() -> dict[str, str]:
-    """Return the versions of Python, NumPy, h5py and of all distributions of physx."""
+    """Return the versions of Python, the platform, the physx distributions, and their libraries."""
     versions = {"python": platform.python_version(), "platform": sys.platform}
     for distribution in distributions():
         name = distribution.metadata["Name"] or ""

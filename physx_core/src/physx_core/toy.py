@@ -1,6 +1,6 @@
 """The plugin ``toy``: a spring and a linear model in pure NumPy.
 
-Documentation, tests and the template use it; it comes through the same hooks as any plugin.
+For documentation and tests; registered with the same hooks as any plugin.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Spring(Environment):
         period: float = 0.02,
         **kwargs: Any,
     ) -> None:
-        """Keep the parameters.
+        """Set the parameters.
 
         Args:
             mass: Mass in kg.
@@ -52,7 +52,7 @@ class Spring(Environment):
         self.predicted: Array | None = None
 
     def create(self) -> None:
-        """Put the mass at a random place."""
+        """Place the mass at random."""
         self.state = self.rng.standard_normal(2)
 
     def init_database(self) -> None:
@@ -118,23 +118,23 @@ class Linear(Network):
         """Choose the fields.
 
         Args:
-            net_fields: Names of the fields that are read.
-            opt_fields: Name of the one field that is predicted.
+            net_fields: Names of the input fields.
+            opt_fields: Name of the predicted field.
 
         Raises:
-            ConfigError: More than one field shall be predicted.
+            ConfigError: If `opt_fields` contains more than one field.
         """
         self.net_fields = [net_fields] if isinstance(net_fields, str) else list(net_fields)
         self.opt_fields = [opt_fields] if isinstance(opt_fields, str) else list(opt_fields)
         if len(self.opt_fields) != 1:
-            raise ConfigError("toy/linear predicts one field, so opt_fields has one name.")
+            raise ConfigError("toy/linear predicts one field: give one name in opt_fields.")
         self.pred_fields = self.opt_fields
         self.weights: Array = np.zeros((0, 0))
         self._shape: tuple[int, ...] = ()
         self._dtype = "float64"
 
     def bind(self, fields: dict[str, Field]) -> None:  # type: ignore[override]
-        """Take the sizes from the fields; known weights stay."""
+        """Set the sizes from the fields; existing weights are kept."""
         super().bind(fields)
         inputs = sum(int(np.prod(fields[name].shape or ())) for name in self.net_fields)
         self._shape = fields[self.opt_fields[0]].shape or ()
@@ -142,8 +142,8 @@ class Linear(Network):
         if self.weights.size == 0:
             self.weights = np.zeros(size, self._dtype)
         elif self.weights.shape != size:
-            was = f"weights {self.weights.shape} do not fit, {size} would"
-            raise FieldsMismatchError("toy/linear was made for other fields", {"weights": was})
+            was = f"weights have shape {self.weights.shape}, expected {size}"
+            raise FieldsMismatchError("toy/linear was created for other fields", {"weights": was})
 
     def rows(self, data: Tensors) -> Array:
         """Return the inputs and a column of ones, shape (samples, inputs + 1)."""
@@ -160,10 +160,10 @@ class Linear(Network):
         return flat.reshape(len(flat), *self._shape)
 
     def set_train(self) -> None:
-        """Nothing differs between training and prediction."""
+        """Training and prediction do not differ."""
 
     def set_eval(self) -> None:
-        """Nothing differs between training and prediction."""
+        """Training and prediction do not differ."""
 
     def set_device(self, device: str) -> None:
         """Accept the processor only."""
@@ -171,7 +171,7 @@ class Linear(Network):
             raise ConfigError(f'toy/linear computes on "cpu", not on "{device}".')
 
     def set_data_type(self, data_type: str) -> None:
-        """Compute in this type."""
+        """Set the type to compute in."""
         self._dtype = data_type
 
     def get_parameters(self) -> dict[str, Any]:
@@ -192,10 +192,12 @@ class Linear(Network):
             with np.load(path, allow_pickle=False) as stored:
                 weights = stored["weights"]
         except (OSError, ValueError, KeyError, EOFError) as error:
-            raise CheckpointError(f"{path} holds no weights of toy/linear: {error}.") from error
+            raise CheckpointError(
+                f"{path} does not contain weights of toy/linear: {error}."
+            ) from error
         if self.weights.size and weights.shape != self.weights.shape:
             raise CheckpointError(
-                f"{path} holds weights {weights.shape}, not {self.weights.shape}."
+                f"{path} contains weights {weights.shape}, not {self.weights.shape}."
             )
         self.weights = weights
 
@@ -209,17 +211,17 @@ class Linear(Network):
 
 
 class LeastSquares(Optimization):
-    """Solves for the weights that fit all batches so far best; the loss is the mean square."""
+    """Solves for the weights that fit all batches so far; the loss is the mean square."""
 
     def set_loss(self, loss: str | type[Any] | None) -> None:
         """Accept the mean square only."""
         if loss is not None:
-            raise ConfigError("toy/least-squares has the mean square as its loss: give none.")
+            raise ConfigError("toy/least-squares uses the mean square as its loss: leave out loss.")
 
     def set_optimizer(
         self, optimizer: str | type[Any] | None, network: Network, **kwargs: Any
     ) -> None:
-        """Remember whose weights to solve for."""
+        """Set the network whose weights to solve for."""
         if optimizer is not None or kwargs or not isinstance(network, Linear):
             raise ConfigError("toy/least-squares solves for toy/linear and takes no optimizer.")
         self._network = network

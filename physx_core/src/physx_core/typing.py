@@ -1,4 +1,4 @@
-"""Types of the values that components exchange."""
+"""Types of the values that components exchange, for annotations in plugins."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+__all__ = ["Array", "Batch", "Color", "Records", "Sample", "Tensors", "Vector"]
 
 Array: TypeAlias = NDArray[Any]
 Sample: TypeAlias = dict[str, Array]

@@ -1,7 +1,6 @@
-"""physx plugin `rerun`: shows environments and training in the Rerun viewer.
+"""The physx plugin ``rerun``: shows environments and training in the Rerun viewer.
 
-The public names are imported when they are first used, so that finding the plugin does not import
-Rerun.
+The public names are imported on first use, so that discovering the plugin does not import Rerun.
 """
 
 from __future__ import annotations

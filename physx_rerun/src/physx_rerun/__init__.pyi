@@ -1,4 +1,4 @@
-"""physx plugin `rerun`: shows environments and training in the Rerun viewer."""
+"""The physx plugin ``rerun``: shows environments and training in the Rerun viewer."""
 
 from .version import __version__ as __version__
 from .viewer.headless import render_picture as render_picture

@@ -1,4 +1,4 @@
-"""``python -m physx_rerun FILE.rrd OUT.png``: make a picture of a recording."""
+"""``python -m physx_rerun FILE.rrd OUT.png``: render a picture of a recording."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from physx_rerun.viewer.headless import render_picture
 
 
 def main() -> int:
-    """Read the command line, draw the picture, and return the exit status."""
+    """Parse the command line, render the picture, and return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m physx_rerun", description=__doc__)
     parser.add_argument("recording", help="the recording, a .rrd file")
     parser.add_argument("picture", help="picture to write, a .png file")

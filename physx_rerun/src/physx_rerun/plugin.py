@@ -1,4 +1,4 @@
-"""What physx finds when the plugin `rerun` is selected."""
+"""The hooks of the plugin ``rerun``."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from physx_core.plugins import hookimpl
 
 @hookimpl
 def physx_visualizers() -> dict[str, str]:
-    """Return the visualizer, as a text so that Rerun is imported when it is first used."""
+    """Return the visualizer as a reference, so that Rerun is imported on first use."""
     return {"rerun": "physx_rerun.visualizer:RerunVisualizer"}

@@ -1,4 +1,4 @@
-"""RerunVisualizer: the observer that shows a run in the Rerun viewer."""
+"""RerunVisualizer: an observer that shows a run in the Rerun viewer."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from physx_core.config import at_least, options
 from physx_core.errors import ConfigError, VisualizerError
 from physx_core.typing import Array
 from physx_rerun.drawing import colors
+from physx_rerun.drawing.chunks import TIME, ChunkBuilder
 from physx_rerun.drawing.drawing import Drawing
-from physx_rerun.drawing.layout import Layout
-from physx_rerun.drawing.rows import TIME, Rows
+from physx_rerun.drawing.windows import WindowLayout
 from physx_rerun.viewer.headless import render_picture
 from physx_rerun.viewer.offscreen import OffscreenViewer
-from physx_rerun.viewer.streams import Recording
-from physx_rerun.viewer.viewer import Viewer, has_display, listens
+from physx_rerun.viewer.streams import RecordingStreams
+from physx_rerun.viewer.viewer import Viewer, has_display, is_listening
 
 MODES = ("save", "spawn", "connect", "headless", "offscreen")
 BINS = 30
@@ -39,36 +39,36 @@ class RerunVisualizer(Visualizer):
     """Draws environments and training curves in the Rerun viewer and saves them as a recording.
 
     Attributes:
-        viewer: The viewer that was started, None where none was.
-        file: The recording's file, None where none is written.
+        viewer: The started viewer, or None.
+        file: The recording's file, or None.
     """
 
     mode: str = field(default="save", metadata={"choices": MODES})
-    """"save": only write a file; "spawn": open a viewer; "connect": show in a viewer that runs;
-    "headless": write a file, and a picture of it at the end; "offscreen": draw pictures for
+    """"save": only write a file; "spawn": open a viewer; "connect": show in a running viewer;
+    "headless": write a file, and a picture at the end; "offscreen": render pictures for
     `capture`."""
     path: str | Path | None = None
-    """The .rrd file; None: a new one in the session's folder, named like the run."""
+    """The .rrd file; None: a new file in the session's folder, named like the run."""
     save: bool = True
-    """Whether the file is written."""
+    """Whether to write the file."""
     address: str | None = None
     """Viewer to connect to, "HOST:PORT"."""
     port: int = at_least(0, 0)
-    """Port of the viewer that is opened; 0: any free one."""
+    """Port of the opened viewer; 0: any free one."""
     memory_limit: str = "2GB"
-    """Memory that the opened viewer may use before it forgets the oldest rows."""
+    """Memory of the opened viewer, beyond which it drops the oldest rows."""
     picture: str | Path | None = None
-    """Picture of the headless mode; None: beside the file, ending in .png."""
+    """Picture of the headless mode; None: beside the file, with the suffix .png."""
     picture_size: tuple[int, int] = (1600, 900)
-    """Width and height, in pixels, of this picture and of those of the offscreen mode."""
+    """Width and height in pixels of the pictures of the headless and offscreen modes."""
     max_instances: int = at_least(0, 4)
-    """Environment instances drawn in full; of the others only numbers and texts are recorded."""
+    """Number of instances to draw completely; of others only numbers and texts are recorded."""
 
     def __post_init__(self) -> None:
-        """Check that the options fit together and begin with an empty scene.
+        """Check that the options are consistent, and start with an empty scene.
 
         Raises:
-            ConfigError: They do not.
+            ConfigError: If they are not.
         """
         self._check_options()
         self._reset()
@@ -80,11 +80,11 @@ class RerunVisualizer(Visualizer):
         self.file: Path | None = None
         self._run_name = "run"
         self._address: str | None = None
-        self._recording: Recording | None = None
+        self._recording: RecordingStreams | None = None
         self._is_open = False
         self._begun = time.monotonic()
         self._flushed, self._waiting = float("-inf"), 0
-        self._rows, self._layout = Rows(), Layout(1)
+        self._rows, self._layout = ChunkBuilder(), WindowLayout(1)
         self._drawings: dict[int, Drawing] = {}
         self._curves: set[str] = set()
         self._positions: dict[str, int] = {}
@@ -93,28 +93,28 @@ class RerunVisualizer(Visualizer):
         if self.mode == "connect" and not re.fullmatch(r".+:\d{1,5}", self.address or ""):
             raise ConfigError('mode "connect" needs address="HOST:PORT" of a running viewer.')
         if self.mode != "connect" and self.address is not None:
-            raise ConfigError(f'address goes with mode "connect", not with "{self.mode}".')
+            raise ConfigError(f'address is for mode "connect", not for "{self.mode}".')
         if self.mode != "headless" and self.picture is not None:
-            raise ConfigError(f'picture goes with mode "headless", not with "{self.mode}".')
+            raise ConfigError(f'picture is for mode "headless", not for "{self.mode}".')
         if self.mode in ("save", "headless") and not self.save:
-            raise ConfigError(f'mode "{self.mode}" needs the file: leave save=True.')
+            raise ConfigError(f'mode "{self.mode}" needs the file: set save=True.')
         if min(self.picture_size) < 64:
             raise ConfigError(f"picture_size {self.picture_size} is smaller than 64 pixels.")
 
     # What the pipeline calls ----------------------------------------------------------------
 
     def open(self, run_name: str, session_dir: Path, instance_nb: int) -> None:
-        """Reach or start the viewer and choose the file; see `Observer.open`.
+        """Connect to or start the viewer and choose the file; see `Observer.open`.
 
         Raises:
-            VisualizerError: Nobody listens at `address`, or there is no display for a window.
+            VisualizerError: If no viewer listens at `address`, or there is no display.
         """
         self._reset()
-        self._run_name, self._layout = run_name, Layout(instance_nb)
+        self._run_name, self._layout = run_name, WindowLayout(instance_nb)
         self._layout.has_time_panel = self.mode != "offscreen"
         if self.mode == "connect":
             self._address = str(self.address)
-            if not listens(self._address):
+            if not is_listening(self._address):
                 raise VisualizerError(
                     f"No Rerun viewer listens at {self._address}. Start one there with: "
                     f"rerun --bind 127.0.0.1 --port {self._address.rpartition(':')[2]}"
@@ -125,7 +125,7 @@ class RerunVisualizer(Visualizer):
             self._offscreen = OffscreenViewer(self.picture_size, self.memory_limit)
             self._address = self._offscreen.address
         if self.save:
-            self.file = Path(self.path) if self.path else _unused(Path(session_dir), run_name)
+            self.file = Path(self.path) if self.path else _unused_path(Path(session_dir), run_name)
         self._is_open = True
 
     def _spawn(self) -> None:
@@ -134,44 +134,47 @@ class RerunVisualizer(Visualizer):
                 'mode "spawn" opens a window, but there is no display. Use mode "headless" for a '
                 'picture, or mode "save" and open the file elsewhere with: rerun FILE.rrd'
             )
-        if self.port and listens(f"127.0.0.1:{self.port}"):
+        if self.port and is_listening(f"127.0.0.1:{self.port}"):
             raise VisualizerError(
                 f"Port {self.port} is taken. If that is a Rerun viewer, use mode "
                 f'"connect" with address="127.0.0.1:{self.port}"; otherwise leave port=0.'
             )
         options = ("--memory-limit", self.memory_limit, "--expect-data-soon")
-        self.viewer = Viewer(self.port, options, lives_on=True)
+        self.viewer = Viewer(self.port, options, outlives=True)
         self.viewer.wait_until_ready()
-        self.viewer.check(wait=1.0)  # it listens before it knows whether it gets its window
+        self.viewer.check(wait=1.0)  # it listens before its window opens
         self._address = self.viewer.address
 
     def events(self, instance_id: int, step: int, events: list[Event]) -> None:
         """Draw the events of one step; see `Observer.events`.
 
         Raises:
-            VisualizerError: An event that cannot be drawn.
-            ConfigError: A color or colormap that does not exist.
+            VisualizerError: If an event cannot be drawn.
+            ConfigError: If a color or colormap does not exist.
         """
         if not self._is_open:
             return
         self._step = step
         if instance_id not in self._drawings:
             self._drawings[instance_id] = Drawing(
-                instance_id, self._rows, self._layout, in_full=instance_id <= self.max_instances
+                instance_id,
+                self._rows,
+                self._layout,
+                draws_shapes=instance_id <= self.max_instances,
             )
         self._drawings[instance_id].draw(events, {"step": step, TIME: self._now()})
         self._flush_if_due()
 
     def capture(self) -> Array | None:
-        """Return what was drawn at the last step in the offscreen mode; see `Visualizer.capture`.
+        """Return a picture of the last step in the offscreen mode; see `Visualizer.capture`.
 
         Raises:
-            VisualizerError: The viewer ended or takes too long, or nothing was drawn.
+            VisualizerError: If the viewer ended or takes too long, or nothing was drawn.
         """
         if self._offscreen is None:
             return None
         self._pictures += 1
-        # What is sent last arrives last: once it is there, all that belongs to the picture is.
+        # Rows arrive in order: once this one has arrived, all rows of the picture have.
         self._rows.add(_MARK, rr.Scalars, {_MARK: self._pictures}, scalars=[0.0])
         self._flush()
         return self._offscreen.picture(self._step, _MARK, self._pictures)
@@ -183,19 +186,19 @@ class RerunVisualizer(Visualizer):
         self._positions[timeline] = step
         times = {**self._positions, TIME: self._now()}
         for name, value in values.items():
-            entity = _entity(name)
+            entity = _entity_of(name)
             group, _, label = name.rpartition("/")
             if name not in self._curves:
                 self._curves.add(name)
                 number = sum(known.rpartition("/")[0] == group for known in self._curves) - 1
                 line = rr.SeriesLines(names=[label], colors=colors.curves(1, number))
-                self._rows.static(entity, line)
+                self._rows.add_static(entity, line)
                 self._layout.add_plot(group or name, entity, timeline, 1)
             self._rows.add(entity, rr.Scalars, times, scalars=[float(value)])
         self._flush_if_due()
 
     def histograms(self, values: Mapping[str, Array], step: int, timeline: str) -> None:
-        """Show how many of the finite numbers lie where; see `Observer.histograms`."""
+        """Show the histogram of the finite numbers; see `Observer.histograms`."""
         if not self._is_open:
             return
         self._positions[timeline] = step
@@ -206,16 +209,16 @@ class RerunVisualizer(Visualizer):
                 continue
             counts, edges = np.histogram(finite, BINS)
             group, _, label = name.partition("/")
-            self._layout.add_histogram(group, label, _entity(name))
+            self._layout.add_histogram(group, label, _entity_of(name))
             middles = (edges[1:] + edges[:-1]) / 2
-            self._rows.add_whole(_entity(name), rr.BarChart(counts, abscissa=middles), times)
+            self._rows.add_archetype(_entity_of(name), rr.BarChart(counts, abscissa=middles), times)
         self._flush_if_due()
 
     def close(self) -> None:
-        """Finish the file, let the viewer go, draw the picture; see `Observer.close`.
+        """Finish the file, disconnect the viewer, render the picture; see `Observer.close`.
 
         Raises:
-            VisualizerError: The picture cannot be drawn.
+            VisualizerError: If the picture cannot be rendered.
         """
         if not self._is_open:
             return
@@ -247,12 +250,12 @@ class RerunVisualizer(Visualizer):
             self._flush()
 
     def _flush(self) -> None:
-        chunks = self._rows.take()
+        chunks = self._rows.pop_chunks()
         self._flushed, self._waiting = self._now(), 0
         if self._recording is None:
             if not chunks:
                 return
-            self._recording = Recording(
+            self._recording = RecordingStreams(
                 f"physx {self._run_name} {self._layout.digest}",
                 self._run_name,
                 self.file,
@@ -261,15 +264,15 @@ class RerunVisualizer(Visualizer):
             )
         self._recording.write(chunks)
         if self._layout.changed:
-            self._recording.lay_out(self._layout.blueprint())
+            self._recording.write_blueprint(self._layout.blueprint())
 
 
-def _entity(name: str) -> str:
-    """Return the path that the numbers of a name are logged to."""
+def _entity_of(name: str) -> str:
+    """Return the entity path of a number's name."""
     return "/".join(["run", *map(rr.escape_entity_path_part, name.split("/"))])
 
 
-def _unused(folder: Path, name: str) -> Path:
+def _unused_path(folder: Path, name: str) -> Path:
     """Return the path of a recording that does not exist yet."""
     path, number = folder / f"{name}.rrd", 2
     while path.exists():

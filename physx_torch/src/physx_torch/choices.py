@@ -1,4 +1,4 @@
-"""Choosing classes of torch by name, and making them with a user's arguments."""
+"""Chooses classes of torch by name, and creates them with a user's arguments."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from physx_core.errors import ComponentNotFoundError, ConfigError, listed, neare
 from physx_core.plugins import resolve
 
 
-def classes_in(module: ModuleType, base: type[Any]) -> dict[str, type[Any]]:
-    """Return the public subclasses of `base` that a module or its submodules define, by name."""
+def find_classes(module: ModuleType, base: type[Any]) -> dict[str, type[Any]]:
+    """Return the public subclasses of `base` defined in a module or its submodules, by name."""
     return {
         name: value
         for name, value in vars(module).items()
@@ -27,15 +27,15 @@ def classes_in(module: ModuleType, base: type[Any]) -> dict[str, type[Any]]:
 
 
 def choose(what: str, given: Any, known: Mapping[str, Any]) -> Any:
-    """Return what a user named, or what was given if it is no text.
+    """Return the object of a name; anything but a string is returned unchanged.
 
     Args:
-        what: Kind of thing for messages, for example ``"loss"``.
-        given: One of the known names, ``"package.module:Name"``, or the thing itself.
-        known: The things that have a short name.
+        what: Kind of the object for messages, for example ``"loss"``.
+        given: A known name, ``"package.module:Name"``, or the object itself.
+        known: Objects by name.
 
     Raises:
-        ConfigError: Nothing has the name.
+        ConfigError: If there is no object of the name.
     """
     if not isinstance(given, str):
         return given
@@ -50,7 +50,7 @@ def choose(what: str, given: Any, known: Mapping[str, Any]) -> Any:
             ) from error
     raise ConfigError(
         f'torch has no {what} "{given}".{nearest(given, known)} It has: {listed(known)}. '
-        'Your own is named "package.module:Name".'
+        'Name your own as "package.module:Name".'
     )
 
 
@@ -58,7 +58,7 @@ def make(what: str, factory: Callable[..., Any], *args: Any, **kwargs: Any) -> A
     """Return ``factory(*args, **kwargs)``.
 
     Raises:
-        ConfigError: It refuses the arguments; the message says which ones it takes.
+        ConfigError: If it rejects the arguments; the message lists those that it takes.
     """
     try:
         return factory(*args, **kwargs)
@@ -66,7 +66,7 @@ def make(what: str, factory: Callable[..., Any], *args: Any, **kwargs: Any) -> A
         name = getattr(factory, "__name__", repr(factory))
         raise ConfigError(
             f"The {what} {name} rejects its arguments: {error}. "
-            f"It takes: {', '.join(parameters_of(factory)) or 'what its documentation says'}."
+            f"It takes: {', '.join(parameters_of(factory)) or 'see its documentation'}."
         ) from error
 
 
@@ -74,15 +74,15 @@ def make_activation(option: str, given: Any, channels: int) -> torch.nn.Module:
     """Return an activation.
 
     Args:
-        option: What was given, for messages, for example ``"FC.activation"``.
+        option: Name of the option for messages, for example ``"FC.activation"``.
         given: Name of a class in `torch.nn` such as ``"SiLU"``, ``"package.module:Class"``, or a
             class.
-        channels: How many channels it works on: `torch.nn.PReLU` learns a slope for each.
+        channels: Number of its channels: `torch.nn.PReLU` learns a slope for each.
 
     Raises:
-        ConfigError: There is no such activation.
+        ConfigError: If there is no such activation.
     """
-    known = classes_in(torch.nn.modules.activation, torch.nn.Module)
+    known = find_classes(torch.nn.modules.activation, torch.nn.Module)
     chosen = choose("activation", given, {**known, "Identity": torch.nn.Identity})
     slopes = {"num_parameters": channels} if chosen is torch.nn.PReLU else {}
     made = make("activation", chosen, **slopes)
@@ -92,7 +92,7 @@ def make_activation(option: str, given: Any, channels: int) -> torch.nn.Module:
 
 
 def parameters_of(factory: Callable[..., Any]) -> list[str]:
-    """Return the names of a callable's parameters; none where it does not tell them."""
+    """Return the names of a callable's parameters; empty if they are unknown."""
     try:
         return list(inspect.signature(factory).parameters)
     except (TypeError, ValueError):  # some callables written in C have no signature

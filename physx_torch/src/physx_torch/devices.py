@@ -1,4 +1,4 @@
-"""Devices: what "auto", "cuda:1" and the like mean on this machine."""
+"""Resolves device names such as "auto" and "cuda:1" on this machine."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 from physx_core.errors import ConfigError
 
 
-def existing_devices() -> list[str]:
-    """Return the names of the devices that torch can compute on here."""
+def list_devices() -> list[str]:
+    """Return the names of the devices that torch can use on this machine."""
     names = ["cpu", *(f"cuda:{index}" for index in range(torch.cuda.device_count()))]
     if torch.backends.mps.is_available():
         names.append("mps")
@@ -18,17 +18,17 @@ def existing_devices() -> list[str]:
 
 
 def find_device(name: str) -> torch.device:
-    """Return a device that exists.
+    """Return the device of a name.
 
     Args:
         name: ``"cpu"``, ``"cuda"``, ``"cuda:<index>"``, ``"mps"`` or ``"auto"``: the first CUDA
-            device if there is one, otherwise the processor. Where torchrun started several
-            processes, ``"cuda"`` and ``"auto"`` are a device for each.
+            device if there is one, otherwise the processor. If torchrun started several
+            processes, ``"cuda"`` and ``"auto"`` give each its own device.
 
     Raises:
-        ConfigError: The device does not exist on this machine.
+        ConfigError: If the device does not exist on this machine.
     """
-    existing = existing_devices()
+    existing = list_devices()
     own = int(os.environ.get("LOCAL_RANK", "0")) % max(1, torch.cuda.device_count())
     if name == "auto":
         name = f"cuda:{own}" if "cuda:0" in existing else "cpu"

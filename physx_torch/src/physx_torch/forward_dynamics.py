@@ -1,4 +1,4 @@
-"""The forward dynamics of a simulation as a function that gradients go through."""
+"""ForwardDynamics: the forward dynamics of a simulation as a differentiable function."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from physx_core.typing import Vector
 
 
 class ForwardDynamics:
-    """Accelerations that torques cause, differentiable by positions, velocities and torques.
+    """Accelerations as a function of positions, velocities and torques, with gradients.
 
-    Values are those of `Simulation.forward_dynamics`: damping, springs and Coulomb friction act,
-    contacts and limits do not. Gradients are from analytic derivatives, in double precision on the
-    CPU; Coulomb friction counts as constant. The quaternion of a floating base is normalized, and
-    its gradient is that of the normalized one. Second derivatives are not there.
+    Values are those of `Simulation.forward_dynamics`: with damping, springs and Coulomb friction,
+    without contacts and limits. Gradients are computed from analytic derivatives in double
+    precision on the CPU, with constant Coulomb friction. The quaternion of a floating base is
+    normalized, and its gradient is that of the normalized one. There are no second derivatives.
 
     Example:
         >>> dynamics = ForwardDynamics(simulation, processes=2)
         >>> loss = (dynamics(q, v, network(q, v)) - wanted).square().mean()
 
     Args:
-        simulation: Of any engine with the feature ``derivatives``; its state is neither used nor
-            changed. It must stay open.
-        processes: How many processes share a batch of states at most, this one among them. The
-            others start with the first batch that is large enough and end with the simulation.
+        simulation: Simulation of any engine with the feature ``derivatives``; its state is neither
+            used nor changed. It must stay open.
+        processes: Largest number of processes that share a batch of states, including this one.
+            The others start with the first sufficiently large batch and end with the simulation.
 
     Raises:
-        FeatureNotSupportedError: The simulation has no derivatives of its forward dynamics.
-        SimulationError: The number of processes is no integer of at least 1.
+        FeatureNotSupportedError: If the simulation has no derivatives of its forward dynamics.
+        SimulationError: If the number of processes is not an integer of at least 1.
     """
 
     def __init__(self, simulation: Simulation, processes: int = 1) -> None:
@@ -51,7 +51,7 @@ class ForwardDynamics:
         self.simulation, self.processes = simulation, processes
 
     def __call__(self, positions: Tensor, velocities: Tensor, torques: Tensor) -> Tensor:
-        """Return the accelerations, shape (..., nv), in the type and on the device of the input.
+        """Return the accelerations, shape (..., nv), with the type and device of the input.
 
         Args:
             positions: Shape (..., nq), in the convention of `physx_core.simulation.layout`.
@@ -60,8 +60,8 @@ class ForwardDynamics:
                 it, along its own axes. The leading axes of the three are broadcast.
 
         Raises:
-            SimulationError: A shape does not fit, a value is not finite, or a quaternion is not of
-                length 1 (within 0.001); or one of the processes ended.
+            SimulationError: If a shape does not fit, a value is not finite, a quaternion is not of
+                length 1 (within 0.001), or one of the processes ended.
         """
         given = (positions, velocities, torques)
         self._check(given)
@@ -116,13 +116,13 @@ class _Function(torch.autograd.Function):
         arrays = [tensor.detach().numpy() for tensor in (*ctx.saved_tensors, given)]
         gradients = list(simulation.forward_dynamics_gradients_batch(*arrays, processes=processes))
         if ctx.needs_input_grad[1]:
-            gradients[0] = _by_positions(simulation.layout, arrays[0], gradients[0])
+            gradients[0] = _to_position_gradients(simulation.layout, arrays[0], gradients[0])
         needed = zip(gradients, ctx.needs_input_grad[1:], strict=True)
         return None, *(torch.from_numpy(each) if needs else None for each, needs in needed)
 
 
-def _by_positions(layout: Layout, positions: Vector, by_motion: Vector) -> Vector:
-    """Return gradients by the numbers of the positions, (n, nq), from those by small motions."""
+def _to_position_gradients(layout: Layout, positions: Vector, by_motion: Vector) -> Vector:
+    """Return gradients by position coordinates, (n, nq), from those by small motions."""
     found = np.empty(positions.shape)
     for part in layout.parts.values():
         mine, along = found[:, part.positions], by_motion[:, part.velocities]

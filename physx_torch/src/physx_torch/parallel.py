@@ -1,7 +1,7 @@
 """Data-parallel training: several processes of torch.distributed train one network.
 
-``torchrun`` starts the processes. Each computes the gradients of its share of a batch; their mean
-is taken before they are clipped and the optimizer steps, so the parameters stay the same in all.
+``torchrun`` starts the processes. Each computes the gradients of its share of a batch; these are
+averaged before clipping and stepping, so that all processes have the same parameters.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from physx_torch.devices import find_device
 
 
 def join_group(device: str) -> Group:
-    """Return the group that this process belongs to; of one process unless torchrun started it.
+    """Return the group of this process, which is its only member unless torchrun started it.
 
-    The processes talk through NCCL where each has a CUDA device of its own, otherwise through Gloo.
+    The processes communicate by NCCL if each has a CUDA device of its own, otherwise by Gloo.
 
     Args:
-        device: Where the network will compute, as in `NetworkConfig.device`.
+        device: The network's device, as in `NetworkConfig.device`.
 
     Raises:
-        ConfigError: The installed torch cannot do it, or the processes do not find each other.
+        ConfigError: If the installed torch does not support it, or the processes cannot connect.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         return Group()
@@ -42,27 +42,27 @@ class TorchGroup(Group):
     """The processes that torchrun started."""
 
     def __init__(self, device: torch.device) -> None:
-        """Meet the other processes, unless the user's own code has done that already.
+        """Connect to the other processes, unless the user's code has already done so.
 
         Raises:
-            ConfigError: They do not find each other.
+            ConfigError: If the processes cannot connect.
         """
         if not distributed.is_initialized():
-            _meet(device)
+            _connect(device)
         self.rank, self.size = distributed.get_rank(), distributed.get_world_size()
         is_cuda_only = distributed.get_backend() == "nccl"  # a group that the user's code made
         self._device = device if is_cuda_only else torch.device("cpu")
 
     def tell(self, value: Any) -> Any:
-        """Return what the leading process gave."""
+        """Return the leading process's value in all processes."""
         text = json.dumps(value).encode() if self.leads else b""
-        length = self._led(torch.tensor([len(text)]))
+        length = self._broadcast(torch.tensor([len(text)]))
         told = torch.zeros(int(length.item()), dtype=torch.uint8)
         if self.leads:
             told = torch.frombuffer(bytearray(text), dtype=torch.uint8)
-        return json.loads(self._led(told).cpu().numpy().tobytes())
+        return json.loads(self._broadcast(told).cpu().numpy().tobytes())
 
-    def _led(self, tensor: torch.Tensor) -> torch.Tensor:
+    def _broadcast(self, tensor: torch.Tensor) -> torch.Tensor:
         tensor = tensor.to(self._device)
         distributed.broadcast(tensor, 0)
         return tensor
@@ -74,11 +74,11 @@ class TorchGroup(Group):
         return [float(value) for value in sums.tolist()]
 
 
-def _meet(device: torch.device) -> None:
-    """Meet the other processes, once: they stay together until they end.
+def _connect(device: torch.device) -> None:
+    """Connect to the other processes until this one exits.
 
     Raises:
-        ConfigError: They do not find each other.
+        ConfigError: If the processes cannot connect.
     """
     own = device.type == "cuda" and _local("WORLD_SIZE") <= torch.cuda.device_count()
     if own:
@@ -87,53 +87,53 @@ def _meet(device: torch.device) -> None:
         distributed.init_process_group("cpu:gloo,cuda:nccl" if own else "gloo")
     except (RuntimeError, ValueError) as error:
         raise ConfigError(
-            f"The processes that train together do not find each other: {error}. "
+            f"The processes that train together cannot connect: {error}. "
             "Start them with: torchrun --nproc-per-node N -m physx_core.cli train ..."
         ) from error
-    atexit.register(_part)
+    atexit.register(_disconnect)
 
 
-def _part() -> None:
+def _disconnect() -> None:
     if distributed.is_initialized():
         distributed.destroy_process_group()
 
 
-def take_first_values(network: torch.nn.Module) -> None:
-    """Give parameters and buffers the values that they have in the leading process."""
+def broadcast_parameters(network: torch.nn.Module) -> None:
+    """Set parameters and buffers to their values in the leading process."""
     with torch.no_grad():
-        for tensors in _alike([*network.parameters(), *network.buffers()]):
-            flat = _flat(tensors)
+        for tensors in _group_alike([*network.parameters(), *network.buffers()]):
+            flat = _flatten(tensors)
             distributed.broadcast(flat, 0)
-            _put(flat, tensors)
+            _unflatten(flat, tensors)
 
 
 def average_gradients(network: torch.nn.Module) -> None:
     """Replace each gradient by its mean over all processes, and buffers by the leading process's.
 
-    A parameter that no process has a gradient of keeps none; where some have one, it counts as zero
-    in the others.
+    A parameter without gradient in all processes keeps none; if only some have a gradient, it
+    counts as zero in the others.
     """
     parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
     size = distributed.get_world_size()
-    for alike in _alike(parameters):
+    for alike in _group_alike(parameters):
         has = torch.tensor([p.grad is not None for p in alike], device=alike[0].device)
         parts = [torch.zeros_like(p) if p.grad is None else p.grad for p in alike]
-        flat = torch.cat([_flat(parts), has.to(_real(parts[0]).dtype)])
+        flat = torch.cat([_flatten(parts), has.to(_real(parts[0]).dtype)])
         distributed.all_reduce(flat)
         flat, known = flat[: -len(alike)] / size, flat[-len(alike) :].tolist()
-        _put(flat, parts)
+        _unflatten(flat, parts)
         for parameter, part, count in zip(alike, parts, known, strict=True):
             parameter.grad = part if count else None
     buffers = list(network.buffers())
     if buffers:
-        for alike in _alike(buffers):
-            flat = _flat(alike)
+        for alike in _group_alike(buffers):
+            flat = _flatten(alike)
             distributed.broadcast(flat, 0)
-            _put(flat, alike)
+            _unflatten(flat, alike)
 
 
-def _alike(tensors: Iterable[torch.Tensor]) -> list[list[torch.Tensor]]:
-    """Return the tensors in groups of one type and device."""
+def _group_alike(tensors: Iterable[torch.Tensor]) -> list[list[torch.Tensor]]:
+    """Return the tensors in groups of equal type and device."""
     groups: dict[tuple[torch.dtype, torch.device], list[torch.Tensor]] = {}
     for tensor in tensors:
         groups.setdefault((tensor.dtype, tensor.device), []).append(tensor)
@@ -141,16 +141,16 @@ def _alike(tensors: Iterable[torch.Tensor]) -> list[list[torch.Tensor]]:
 
 
 def _real(tensor: torch.Tensor) -> torch.Tensor:
-    """Return a view as real numbers: not every way of talking takes complex ones."""
+    """Return a view as real numbers, as not every backend supports complex ones."""
     return torch.view_as_real(tensor) if tensor.is_complex() else tensor
 
 
-def _flat(tensors: Sequence[torch.Tensor]) -> torch.Tensor:
+def _flatten(tensors: Sequence[torch.Tensor]) -> torch.Tensor:
     return torch.cat([_real(tensor.detach()).reshape(-1) for tensor in tensors])
 
 
-def _put(flat: torch.Tensor, tensors: Sequence[torch.Tensor]) -> None:
-    """Write a flat tensor's values back into the tensors that it was made of."""
+def _unflatten(flat: torch.Tensor, tensors: Sequence[torch.Tensor]) -> None:
+    """Copy a flat tensor's values into the tensors that it was concatenated from."""
     start = 0
     for tensor in tensors:
         real = _real(tensor.detach())

@@ -1,4 +1,4 @@
-"""The hooks of the plugin ``torch``; components are texts, so that torch is imported on use."""
+"""The hooks of the plugin ``torch``; components are references, imported on use."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ def test_help_imports_nothing_heavy():
 def test_import_of_the_core_is_light():
     code = (
         "import sys, physx_core; "
-        "heavy = ('torch', 'dartpy', 'pinocchio', 'rerun', 'h5py', 'gymnasium'); "
+        "heavy = ('torch', 'dartpy', 'pinocchio', 'rerun', 'h5py', 'gymnasium', 'numpy'); "
         "print([m for m in heavy if m in sys.modules])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

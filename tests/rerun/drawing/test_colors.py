@@ -43,13 +43,13 @@ def test_what_is_no_opacity(alpha):
 
 
 def test_colormap_runs_from_first_to_last_color():
-    mapped = colors.mapped(np.array([0.0, 1.0, 2.0]), (0.0, 2.0), "gray", 1.0)
+    mapped = colors.map_values(np.array([0.0, 1.0, 2.0]), (0.0, 2.0), "gray", 1.0)
     assert mapped.tolist() == [0x000000FF, 0x808080FF, 0xFFFFFFFF]
 
 
 def test_unknown_colormap():
     with pytest.raises(ConfigError, match="viridis"):
-        colors.mapped(np.zeros(2), (0, 1), "viridi", 1.0)
+        colors.map_values(np.zeros(2), (0, 1), "viridi", 1.0)
 
 
 def test_curves_go_round():

@@ -225,7 +225,7 @@ def test_names_with_blanks_and_groups(scene):
 def test_every_kind_of_the_scene_is_known(opened):
     visualizer = opened()
     for kind in KINDS:
-        with pytest.raises(VisualizerError, match="never added"):
+        with pytest.raises(VisualizerError, match="not added"):
             visualizer.events(1, 0, [Event("update", kind, "nobody", {})])
     with pytest.raises(VisualizerError, match="unknown kind"):
         visualizer.events(1, 0, [Event("add", "smoke", "cloud", {})])

@@ -95,4 +95,4 @@ def test_the_viewer_is_only_reachable_from_this_machine(receiver):
 
 
 def test_a_port_that_is_free():
-    assert not viewer.listens(f"127.0.0.1:{viewer.free_port()}")
+    assert not viewer.is_listening(f"127.0.0.1:{viewer.find_free_port()}")

@@ -13,7 +13,7 @@ import pytest
 import rerun as rr
 
 from physx_core.components import Factory
-from physx_rerun.drawing.rows import Rows
+from physx_rerun.drawing.chunks import ChunkBuilder
 from physx_rerun.viewer import streams
 from physx_rerun.viewer.streams import LiveWriter
 
@@ -102,10 +102,10 @@ def test_rows_for_a_viewer_that_hangs_are_dropped_and_counted(receiver, monkeypa
     monkeypatch.setattr(streams, "CLOSE_SECONDS", 0.2)
     monkeypatch.setattr(rr, "unregister_shutdown", lambda: None)
     writer = LiveWriter("test", "test", "test", viewer.address)
-    rows = Rows()
+    rows = ChunkBuilder()
     noise = np.random.default_rng(0).random((500_000, 3), np.float32)
     rows.add("cloud", rr.Points3D, {"step": 0}, positions=noise)
-    (chunk,) = rows.take()
+    (chunk,) = rows.pop_chunks()
     viewer.process.send_signal(signal.SIGSTOP)
     try:
         puts = 0

@@ -101,7 +101,7 @@ def test_fields_of_several_axes():
     assert network.predict({"input": x[:0]})["prediction"].shape == (0, 2, 3)
 
 
-def test_several_fields_are_joined_and_dealt_out_in_order():
+def test_several_fields_are_concatenated_and_split_in_order():
     network = FC([2 + 1 + 6, 3 + 1 + 4], net_fields=["a", "b", "c"], opt_fields=["p", "q", "r"])
     network.bind(fields(c=(2, 3), b=(), a=(2,), r=(2, 2), q=(), p=(3,), more=(9,)))
     a, b, c = torch.rand(5, 2), torch.rand(5), torch.rand(5, 2, 3)

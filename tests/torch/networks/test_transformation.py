@@ -113,5 +113,5 @@ def test_gradients_pass_through_apply(network, normalization):
 
 
 def test_network_of_another_library(normalization):
-    with pytest.raises(ConfigError, match="no TorchNetwork"):
+    with pytest.raises(ConfigError, match="not a TorchNetwork"):
         TorchTransformation().set_normalization(normalization, object())

@@ -262,7 +262,7 @@ def test_wrong_options_are_named(options):
 
 
 def test_transformation_of_another_network():
-    with pytest.raises(ConfigError, match="FC is no UNet"):
+    with pytest.raises(ConfigError, match="FC is not a UNet"):
         UNetTransformation().set_normalization({}, FC([2, 1]))
 
 

@@ -151,7 +151,7 @@ def test_network_without_parameters():
 
 
 def test_network_of_another_library():
-    with pytest.raises(ConfigError, match="no TorchNetwork"):
+    with pytest.raises(ConfigError, match="not a TorchNetwork"):
         TorchOptimization().set_optimizer("Adam", object())
 
 

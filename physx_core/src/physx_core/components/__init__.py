@@ -1,4 +1,8 @@
-"""The components that a plugin implements and a pipeline uses."""
+"""Base classes of the components that plugins implement and pipelines use.
+
+A plugin derives its environments, networks, optimizations, transformations, visualizers and
+launchers from these.
+"""
 
 from __future__ import annotations
 

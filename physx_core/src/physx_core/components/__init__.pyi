@@ -1,4 +1,4 @@
-"""The components that a plugin implements and a pipeline uses."""
+"""Base classes of the components that plugins implement and pipelines use."""
 
 from .environment import Environment as Environment
 from .environment import Services as Services

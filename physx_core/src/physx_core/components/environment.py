@@ -1,4 +1,4 @@
-"""Environment: the user's code that makes samples."""
+"""Environment: base class of the user's simulations, which generate samples."""
 
 from __future__ import annotations
 
@@ -15,42 +15,42 @@ from physx_core.typing import Sample
 
 
 class Services(Protocol):
-    """What an environment may ask of the run that it belongs to."""
+    """Requests that an environment can make to its run."""
 
     def predict(self, fields: Sample) -> Sample:
         """Return the network's prediction for one sample, in physical units."""
         ...
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Keep values of one instance for later runs on the same dataset."""
+        """Save values of one instance for later runs on the same dataset."""
         ...
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return the values that one instance kept; empty where it kept none."""
+        """Return the values that one instance saved; empty if it saved none."""
         ...
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:
-        """Hand drawing events to the viewers."""
+        """Pass drawing events to the viewers."""
         ...
 
 
 class Environment:
-    """A simulation that makes one sample in each step.
+    """A simulation that generates one sample in each step.
 
     Subclasses implement `create`, `init_database` and `step`. The methods are called in this
     order: `create`, `init`, `init_database`, `init_visualization` (only with a visualizer), then
-    `step` again and again, and `close` at the end, after a failure too.
+    `step` repeatedly, and `close` at the end, also after a failure.
 
     Attributes:
-        instance_id: Number of this instance among those that run together, counted from 1.
-        instance_nb: How many instances run together.
-        rng: This instance's own stream of random numbers.
-        factory: Draws the environment; None where no visualizer looks on.
-        compute_training_data: False in the sub-steps whose data nobody reads.
-        step_index: Number of steps that were finished before the present one.
-        episode_index: Number of the present trajectory, counted from 0.
-        sample_episode: Number of the trajectory that the last training data belong to.
-        sample: A stored row that the environment shall replay, or None.
+        instance_id: Number of this instance among all instances of the run, from 1.
+        instance_nb: Number of instances in the run.
+        rng: Random number generator of this instance, with its own stream.
+        factory: Draws the environment; None without a visualizer.
+        compute_training_data: False in sub-steps whose data are not used.
+        step_index: Number of finished steps.
+        episode_index: Index of the current trajectory, from 0.
+        sample_episode: Index of the trajectory of the last training data.
+        sample: The stored row to replay, or None.
     """
 
     def __init__(
@@ -61,12 +61,12 @@ class Environment:
         seed: int | Sequence[int] | None = None,
         **kwargs: Any,
     ) -> None:
-        """Keep what identifies the instance.
+        """Set the instance's identity and random stream.
 
         Args:
-            instance_id: Number of this instance, counted from 1.
-            instance_nb: How many instances run together.
-            seed: Seed of the whole run; each instance draws from a stream of its own.
+            instance_id: Number of this instance, from 1.
+            instance_nb: Number of instances in the run.
+            seed: Seed of the run; each instance has its own stream.
             kwargs: Must be empty; a subclass takes its own options by name.
 
         Raises:
@@ -106,83 +106,83 @@ class Environment:
         """Add objects to `factory`."""
 
     def step(self) -> Any:
-        """Simulate one step and give its data with `set_training_data`; may be a coroutine."""
+        """Simulate one step and set its data with `set_training_data`; may be a coroutine."""
         raise UsageError(f"{type(self).__name__} does not implement step().")
 
     def check_sample(self) -> bool:
-        """Return whether the step's sample is to be kept."""
+        """Return whether to keep the step's sample."""
         return True
 
     def apply_prediction(self, prediction: Sample) -> None:
         """Use the network's prediction, in physical units, in the simulation."""
 
     def close(self) -> None:
-        """Free what `create` took."""
+        """Free the resources that `create` acquired."""
 
     # What a subclass calls ------------------------------------------------------------------
 
     @property
     def fields(self) -> list[Field]:
-        """The fields that were defined, in that order."""
+        """The defined fields, in the order of definition."""
         return list(self._fields.values())
 
     def define_training_fields(self, fields: FieldLike | Iterable[FieldLike]) -> None:
         """Define fields that networks read: see `physx_core.fields.as_fields`.
 
         Raises:
-            ConfigError: A field is malformed, reserved or defined twice.
+            ConfigError: If a field is malformed, reserved or defined twice.
         """
         self._define(as_fields(fields, "training"))
 
     def define_additional_fields(self, fields: FieldLike | Iterable[FieldLike]) -> None:
-        """Define fields that are stored beside the training data, for example to replay a state.
+        """Define fields that are stored with the training data, for example to replay a state.
 
         Raises:
-            ConfigError: A field is malformed, reserved or defined twice.
+            ConfigError: If a field is malformed, reserved or defined twice.
         """
         self._define(as_fields(fields, "additional"))
 
     def set_training_data(self, **fields: Any) -> None:
-        """Give this step's training data: every training field, as arrays or numbers."""
+        """Set this step's training data: every training field, as arrays or numbers."""
         self._training = fields
         self.sample_episode = self.episode_index
 
     def new_episode(self) -> None:
-        """Begin a new trajectory: data that are given from now on do not continue those before.
+        """Start a new trajectory, which does not continue the previous data.
 
-        Call it where the state jumps, for example where a new motion is drawn; the first
-        trajectory begins by itself. Rows keep the number in the field ``episode``, so that
-        `Dataset.episodes` can cut the trajectories out again.
+        Call it when the state jumps, for example after drawing a new motion; the first trajectory
+        starts automatically. Rows keep its index in the field ``episode``, from which
+        `Dataset.episodes` recovers the trajectories.
         """
         self.episode_index += 1
 
     def set_additional_data(self, **fields: Any) -> None:
-        """Give this step's additional data: every additional field, as arrays or numbers."""
+        """Set this step's additional data: every additional field, as arrays or numbers."""
         self._additional = fields
 
     def get_prediction(self, **fields: Any) -> Sample:
         """Return the network's prediction within a step, in physical units.
 
         Args:
-            fields: The network's input fields; without any, this step's training data.
+            fields: The network's input fields; if none are given, this step's training data.
 
         Raises:
-            UsageError: The run has no network, or there are no training data yet.
+            UsageError: If the run has no network, or there are no training data yet.
         """
         if not fields and self._training is None:
             raise UsageError("get_prediction() without fields needs set_training_data() before it.")
         return self._run().predict(fields or dict(self._training or {}))
 
     def save_parameters(self, **values: Any) -> None:
-        """Keep numbers, texts, lists, dictionaries and arrays of this instance with the dataset."""
+        """Save numbers, texts, lists, dictionaries and arrays of this instance with the dataset."""
         self._run().save_parameters(self.instance_id, values)
 
     def load_parameters(self) -> dict[str, Any]:
-        """Return what this instance kept with `save_parameters`; empty where it kept nothing."""
+        """Return the values that this instance saved with `save_parameters`, if any."""
         return self._run().load_parameters(self.instance_id)
 
     def update_visualization(self) -> None:
-        """Send what `factory` collected since the last call to the viewers."""
+        """Send the drawing events that `factory` collected since the last call to the viewers."""
         if self.factory is not None:
             self._run().show(self.instance_id, self.step_index, self.factory.take_events())
 
@@ -198,15 +198,15 @@ class Environment:
         return self._services
 
     def take_sample(self) -> dict[str, Any]:
-        """Return this step's data by field name and forget them.
+        """Return and clear this step's data by field name.
 
         Raises:
-            UnknownFieldError: The step gave no training data at all.
+            UnknownFieldError: If the step did not set any training data.
         """
         sample, additional = self._training, self._additional
         if sample is None:
             raise UnknownFieldError(
-                "step() gave no data: call set_training_data() in every step.",
+                "step() did not set any data: call set_training_data() in every step.",
                 instance_id=self.instance_id,
                 step=self.step_index,
             )
@@ -215,7 +215,7 @@ class Environment:
 
 
 def options_of(cls: type[Any]) -> list[str]:
-    """Return the names of all options that the constructors of a class and its bases take."""
+    """Return the option names of the constructors of a class and its bases."""
     names: dict[str, None] = {}
     for base in cls.__mro__:
         if "__init__" not in vars(base):

@@ -11,11 +11,11 @@ from physx_core.typing import Batch
 class Group:
     """The processes that train one network together, each on its share of every batch.
 
-    This class is the group of a process that trains alone; a plugin derives the one of its library.
-    Every method must be called by all processes of the group, in the same order.
+    This class is the group of a single process; a plugin derives the group of its library. All
+    processes of a group must call its methods in the same order.
 
     Attributes:
-        rank: Number of this process, counted from 0.
+        rank: Index of this process, from 0.
         size: Number of processes.
     """
 
@@ -24,29 +24,29 @@ class Group:
 
     @property
     def leads(self) -> bool:
-        """Whether this process writes what the group keeps: session, checkpoints, statistics."""
+        """Whether this process writes the session, checkpoints, and statistics."""
         return self.rank == 0
 
     def tell(self, value: Any) -> Any:
-        """Return what the leading process gave.
+        """Return the leading process's value in all processes.
 
         Args:
-            value: Plain data that JSON can hold; that of the other processes is ignored.
+            value: JSON-compatible data; ignored in the other processes.
         """
         return value
 
     def total(self, values: Sequence[float]) -> list[float]:
-        """Return the sums of the numbers over all processes, each number by itself."""
+        """Return the sum of each number over all processes."""
         return list(values)
 
     def any(self, flag: bool) -> bool:
-        """Return whether one of the processes has the flag set."""
+        """Return whether the flag is set in any process."""
         return flag if self.size == 1 else self.total([float(flag)])[0] > 0
 
     def share_of(self, batch: Batch) -> tuple[Batch, float]:
-        """Return the rows of this process, and their weight in the mean over the whole batch.
+        """Return this process's rows, and their weight in the mean over the whole batch.
 
-        Where a batch has fewer rows than there are processes, some get a row without weight.
+        If a batch has fewer rows than there are processes, some processes get a row of weight 0.
 
         Args:
             batch: The whole batch, the same in all processes.

@@ -1,4 +1,4 @@
-"""Launcher: what starts the client processes of a run, here or on other machines."""
+"""Launcher: starts the client processes of a run, here or on other machines."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
-_LOOK = 0.005
+_POLL_SECONDS = 0.005
 
 
 class ClientHandle(ABC):
-    """One client that a launcher started, and all that runs for it.
+    """A client that a launcher started, with its child processes.
 
     Attributes:
-        instance_id: Number of the instance that it runs, counted from 1.
+        instance_id: Number of its instance, from 1.
     """
 
     instance_id: int
@@ -24,36 +24,36 @@ class ClientHandle(ABC):
 
     @abstractmethod
     def terminate(self) -> None:
-        """Ask the client and all that it started to end; returns at once."""
+        """Ask the client and its child processes to end; return at once."""
 
     @abstractmethod
     def kill(self) -> None:
-        """End the client and all that it started, whether they want to or not."""
+        """Kill the client and its child processes."""
 
     def stderr(self) -> str:
-        """Return the last lines that the client wrote to its standard error, for messages."""
+        """Return the last lines of the client's standard error, for messages."""
         return ""
 
     def wait(self, until: float) -> bool:
-        """Wait for the client's end; return whether it came before `until`, in monotonic s."""
+        """Wait for the client to end; return whether it did before `until`, in monotonic s."""
         while self.exit_status() is None:
             if time.monotonic() >= until:
                 return False
-            time.sleep(_LOOK)
+            time.sleep(_POLL_SECONDS)
         return True
 
 
 class Launcher(ABC):
     """Starts clients; a plugin offers its own with the hook ``physx_launchers``.
 
-    The constructor takes the entries of `EnvironmentConfig.launcher_kwargs`. Whatever it starts has
-    to end up in ``physx client --connect ADDRESS --instance NUMBER``, with the token in the
-    environment variable ``PHYSX_TOKEN`` or in a file that only its owner may read; a command line
-    is no place for the token, for everybody on the machine can read it.
+    The constructor takes the entries of `EnvironmentConfig.launcher_kwargs`. The started processes
+    must run ``physx client --connect ADDRESS --instance NUMBER``, with the token in the environment
+    variable ``PHYSX_TOKEN`` or in a file that only its owner may read. Do not pass the token on a
+    command line, which everybody on the machine can read.
 
     Attributes:
-        by_hand: Whether people start the clients. Then the token is one that they know, and a
-            client may leave and another take its place at any time.
+        by_hand: Whether the user starts the clients. Then the token is one that the user knows, and
+            clients may leave and be replaced at any time.
     """
 
     by_hand: bool = False
@@ -62,18 +62,17 @@ class Launcher(ABC):
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
         """Start a client for each instance and return at once.
 
-        Called again, with a single instance, where a client is started again.
+        Called again, with a single instance, to restart a client.
 
         Args:
-            instances: Numbers of the instances, counted from 1.
-            address: ``HOST:PORT`` at which the server listens. Where it listens at all addresses
-                of its machine, the host is the loopback address: clients elsewhere need the
-                machine's own.
+            instances: Numbers of the instances, from 1.
+            address: ``HOST:PORT`` of the server. If the server listens at all addresses of its
+                machine, the host is the loopback address: clients elsewhere need the machine's own.
             token: Secret of the run.
 
         Returns:
-            A handle for each instance; nothing where they are started by hand.
+            A handle for each instance; empty if they are started by hand.
 
         Raises:
-            ClientError: A client cannot be started; none that was is left behind.
+            ClientError: If a client cannot be started; started ones are ended.
         """

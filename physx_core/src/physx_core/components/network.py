@@ -1,4 +1,4 @@
-"""Network: what learns to predict fields from fields."""
+"""Network: base class of networks, which predict fields from fields."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from physx_core.typing import Batch, Tensors
 class Network(ABC):
     """Base of all networks; a plugin's base class implements it for one library.
 
-    Tensors are of the library's own type. Every dictionary of tensors has the sample axis first.
+    Tensors are of the library's own type. In every dictionary of tensors the first axis is that of
+    the samples.
 
     Attributes:
-        net_fields: Fields that the network reads.
-        opt_fields: Fields that the loss compares the prediction with.
+        net_fields: Input fields of the network.
+        opt_fields: Target fields that the loss compares the prediction with.
         pred_fields: Fields that the network predicts; the i-th has shape, unit and normalization
             of the i-th of `opt_fields`.
         parameters_file: Name of the file that `save_parameters` writes into a checkpoint.
-        default_optimization: Reference of the optimization used where none is configured.
-        default_transformation: Reference of the transformation used where none is configured.
+        default_optimization: Reference of the optimization used if none is configured.
+        default_transformation: Reference of the transformation used if none is configured.
         export_forms: File formats that the network can be exported in.
         exporter: Function that exports, as ``"package.module:function"``. It is called with the
             path, one of `export_forms`, the network, a function from tensors of `net_fields` to
@@ -45,7 +46,7 @@ class Network(ABC):
 
     @classmethod  # noqa: B027
     def set_seed(cls, seed: int) -> None:
-        """Seed the random numbers from which the library draws first parameters.
+        """Seed the library's random numbers, from which initial parameters are drawn.
 
         Args:
             seed: Not negative.
@@ -59,8 +60,8 @@ class Network(ABC):
             device: As for `set_device`.
 
         Raises:
-            ConfigError: There are several, but the network's library cannot work together, or not
-                on this device.
+            ConfigError: If there are several, but the network's library does not support that, or
+                not on this device.
         """
         if int(os.environ.get("WORLD_SIZE", "1")) > 1:
             raise ConfigError(
@@ -69,16 +70,16 @@ class Network(ABC):
         return Group()
 
     def bind(self, fields: Mapping[str, Field]) -> None:
-        """Learn the shapes of the fields in `net_fields` and `opt_fields` before the first batch.
+        """Set the shapes of the fields in `net_fields` and `opt_fields` before the first batch.
 
         Args:
             fields: The dataset's or checkpoint's fields by name.
 
         Raises:
-            FieldsMismatchError: A field is missing, or its shape is not what the network takes.
+            FieldsMismatchError: If a field is missing, or its shape does not fit the network.
         """
         missing = {
-            name: f"not there; there are {listed(fields)}"
+            name: f"missing; there are {listed(fields)}"
             for name in (*self.net_fields, *self.opt_fields)
             if name not in fields
         }
@@ -93,26 +94,26 @@ class Network(ABC):
         """
 
     def forward(self, *inputs: Any) -> Any:
-        """Return what the network makes of the tensors of `net_fields`, given in that order.
+        """Return the network's output for the tensors of `net_fields`, given in that order.
 
-        A library's own base class leaves this to its networks, and calls it in `predict`.
+        A library's base class leaves this to its networks, and calls it in `predict`.
         """
         raise UsageError(f"{type(self).__name__} does not implement forward().")
 
     @abstractmethod
     def set_train(self) -> None:
-        """Get ready to be trained."""
+        """Switch to training mode."""
 
     @abstractmethod
     def set_eval(self) -> None:
-        """Get ready to predict: no gradients are recorded."""
+        """Switch to evaluation mode: no gradients are recorded."""
 
     @abstractmethod
     def set_device(self, device: str) -> None:
-        """Move to a device, ``"auto"``: the fastest that is there.
+        """Move to a device; ``"auto"`` is the fastest available one.
 
         Raises:
-            ConfigError: The device does not exist on this machine.
+            ConfigError: If the device does not exist on this machine.
         """
 
     @abstractmethod
@@ -124,12 +125,12 @@ class Network(ABC):
         """Return the parameters by name."""
 
     def get_gradients(self) -> dict[str, Any]:
-        """Return the gradients of the last step by parameter; empty where the library has none."""
+        """Return the gradients of the last step by parameter; empty if there are none."""
         return {}
 
     @abstractmethod
     def nb_parameters(self) -> int:
-        """Return how many numbers the parameters hold."""
+        """Return the number of real numbers in all parameters."""
 
     @abstractmethod
     def save_parameters(self, path: Path) -> None:
@@ -140,13 +141,13 @@ class Network(ABC):
         """Read parameters that `save_parameters` wrote.
 
         Raises:
-            CheckpointError: The file is missing, damaged or of another architecture.
+            CheckpointError: If the file is missing, damaged or of another architecture.
         """
 
     @abstractmethod
     def numpy_to_tensor(self, batch: Batch) -> Tensors:
-        """Return arrays as tensors of the network's type and device; shares memory if it can."""
+        """Return arrays as tensors of the network's type and device, sharing memory if possible."""
 
     @abstractmethod
     def tensor_to_numpy(self, tensors: Tensors) -> Batch:
-        """Return tensors as arrays on the processor's side."""
+        """Return tensors as NumPy arrays."""

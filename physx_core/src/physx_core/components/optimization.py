@@ -1,4 +1,4 @@
-"""Optimization: computes the loss and improves the network's parameters."""
+"""Optimization: base class of what computes the loss and updates the network's parameters."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Optimization(ABC):
 
     Attributes:
         extra_fields: Fields of the batch that the loss reads beside those of the network.
-        state_file: Name of the file that `save_state` writes into a checkpoint; empty where the
-            optimization keeps nothing from step to step.
+        state_file: Name of the file that `save_state` writes into a checkpoint; empty if the
+            optimization has no state.
     """
 
     state_file: ClassVar[str] = ""
@@ -30,34 +30,34 @@ class Optimization(ABC):
         """Choose the loss function, by class or by its name in the network's library.
 
         Raises:
-            ConfigError: There is no such loss, or one is needed and none was given.
+            ConfigError: If there is no such loss, or one is needed and none was given.
         """
 
     @abstractmethod
     def set_optimizer(
         self, optimizer: str | type[Any] | None, network: Network, **kwargs: Any
     ) -> None:
-        """Choose what changes the network's parameters, by class or by its name.
+        """Choose the optimizer of the network's parameters, by class or by its name.
 
         Args:
             optimizer: Class or name.
-            network: Whose parameters are changed.
-            kwargs: Arguments of the optimizer, ``lr`` among them where it was configured.
+            network: The network to train.
+            kwargs: Arguments of the optimizer, including ``lr`` if it was configured.
 
         Raises:
-            ConfigError: There is no such optimizer, or it refuses the arguments.
+            ConfigError: If there is no such optimizer, or it rejects the arguments.
         """
 
     def set_scheduler(self, scheduler: str | type[Any], **kwargs: Any) -> None:
-        """Choose what changes the learning rate after each epoch, by class or by its name.
+        """Choose the scheduler of the learning rate, by class or by its name.
 
         Args:
             scheduler: Class or name.
             kwargs: Arguments of the scheduler.
 
         Raises:
-            ConfigError: There is no such scheduler, or it refuses the arguments.
-            UsageError: There is no optimizer yet.
+            ConfigError: If there is no such scheduler, or it rejects the arguments.
+            UsageError: If there is no optimizer yet.
         """
         raise ConfigError(f"{type(self).__name__} has no schedulers: leave out scheduler.")
 
@@ -74,29 +74,30 @@ class Optimization(ABC):
     def transform_loss(self, loss: Any, data: Tensors) -> dict[str, Any]:
         """Return the statistics of this step; entries beside ``loss`` are recorded too.
 
-        Called after `optimize`. All entries are numbers, or what ``float`` makes one of.
+        Called after `optimize`. All entries are numbers or can be converted with ``float``.
 
         Args:
-            loss: What `compute_loss` returned.
+            loss: The result of `compute_loss`.
             data: The whole batch.
         """
         return {"loss": loss}
 
     @abstractmethod
     def optimize(self, loss: Any) -> None:
-        """Change the parameters along the gradient of the loss."""
+        """Update the parameters along the gradient of the loss."""
 
     def learning_rate(self) -> float | None:
-        """Return the present learning rate; None where there is no such thing."""
+        """Return the current learning rate; None if there is none."""
         return None
 
     def join(self, group: Group) -> None:
-        """Improve the parameters by the gradients of all processes of a group.
+        """Train with the gradients of all processes of a group from now on.
 
-        Called once, when the network has its first parameters; those of the leading process count.
+        Called once, when the network has its initial parameters; all processes take those of the
+        leading one.
 
         Raises:
-            ConfigError: There are several processes, but the optimization cannot work together.
+            ConfigError: If there are several processes and the optimization does not support it.
         """
         if group.size > 1:
             raise ConfigError(
@@ -104,22 +105,22 @@ class Optimization(ABC):
             )
 
     def epoch_end(self, loss: float) -> None:  # noqa: B027
-        """An epoch of the training is over, for example for a schedule of the learning rate.
+        """Called after each epoch, for example to schedule the learning rate.
 
         Args:
-            loss: What the epoch is judged by: the loss of its validation, or its mean training loss
-                where nothing is validated. NaN: not validated, though other epochs are.
+            loss: Validation loss of the epoch, or its mean training loss if nothing is validated.
+                NaN: not validated, though other epochs are.
         """
 
     def save_state(self, path: Path) -> None:  # noqa: B027
-        """Write what a later training needs, beside the parameters, to go on exactly here.
+        """Write the state that a training needs, beside the parameters, to resume exactly here.
 
-        Called only where `state_file` is not empty; the file can be read without running code.
+        Called only if `state_file` is not empty; the file must be readable without running code.
         """
 
     def load_state(self, path: Path) -> None:  # noqa: B027
-        """Read what `save_state` wrote, once loss and optimizer are chosen.
+        """Read the state that `save_state` wrote; loss and optimizer are chosen.
 
         Raises:
-            CheckpointError: The file is missing, damaged or of another optimization.
+            CheckpointError: If the file is missing, damaged or of another optimization.
         """

@@ -21,7 +21,7 @@ class Event:
         action: ``add`` or ``update``.
         kind: Kind of the object, for example ``mesh``.
         name: The object's name, unique in its environment.
-        values: What is set: arrays are copies, everything else is plain data.
+        values: Options that are set: copies of arrays, and plain data.
     """
 
     action: Literal["add", "update"]
@@ -43,7 +43,7 @@ ARRAYS: dict[str, tuple[tuple[int | None, ...], type]] = {
     "eye": ((3,), np.float32),
     "target": ((3,), np.float32),
 }
-"""Options that are arrays: shape (None: any number) and type."""
+"""Array options: shape (None: any number) and type."""
 
 _LOOK = ("color", "alpha")
 _POSE = ("position", "orientation")
@@ -60,18 +60,18 @@ KINDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "robot": (("urdf", "bodies"), (*_LOOK, "package_dirs", "poses")),
     "view": (("title",), ("eye", "target", "follow")),
 }
-"""Kinds of objects: options that must be given when one is added, and those that may be."""
+"""Kinds of objects: required and optional options when adding one."""
 
 _FIXED = frozenset({"cells", "colormap", "labels", "urdf", "bodies", "package_dirs", "half_sizes"})
-"""Options that cannot be changed once the object is there."""
+"""Options that cannot be changed after adding."""
 
 
 class Factory:
-    """Collects what an environment draws.
+    """Collects drawing events of an environment.
 
     Add objects in `Environment.init_visualization`, change them in `Environment.step`, then call
-    `Environment.update_visualization`. An object is known by its name. Lengths are in m, positions
-    in the world frame; orientations are quaternions in the order x, y, z, w.
+    `Environment.update_visualization`. Objects are identified by their names.
+    Lengths are in m, positions in the world frame; orientations are quaternions x, y, z, w.
     """
 
     def __init__(self) -> None:
@@ -79,7 +79,7 @@ class Factory:
         self._events: list[Event] = []
 
     def take_events(self) -> list[Event]:
-        """Return the events since the last call and forget them."""
+        """Return and clear the events since the last call."""
         events, self._events = self._events, []
         return events
 
@@ -160,7 +160,7 @@ class Factory:
         return self._add("scalars", name, labels=list(labels), **values)
 
     def update_scalars(self, name: str, values: ArrayLike) -> None:
-        """Give the curves' next ``values``, shape (labels,)."""
+        """Set the curves' next ``values``, shape (labels,)."""
         self._update("scalars", name, {"values": values})
 
     def add_robot(
@@ -178,7 +178,7 @@ class Factory:
             name: Name of the object; also returned.
             urdf: Path of the URDF file.
             bodies: Names of the links that `update_robot` places, in its order.
-            package_dirs: Folder of each package that the URDF's mesh names begin with.
+            package_dirs: Folder of each package that the URDF's mesh names start with.
             look: ``color`` and ``alpha`` replace the URDF's own: a translucent robot for a
                 prediction or a reference; ``poses`` as in `update_robot`.
         """
@@ -196,13 +196,13 @@ class Factory:
         self._update("robot", name, changes)
 
     def set_view(self, title: str, follow: str | None = None, **camera: ArrayLike) -> None:
-        """Name the environment's window and place its camera; to be called once.
+        """Set the title of the environment's window and place its camera; call it once.
 
         Args:
-            title: What stands above the window.
-            follow: Name of an object that the camera moves along with.
-            camera: ``eye`` (3,) and ``target`` (3,), where the camera is and what it looks at, in
-                m; without them it looks at all objects.
+            title: Title of the window.
+            follow: Name of an object that the camera follows.
+            camera: ``eye`` (3,) and ``target`` (3,), position and target of the camera in m; by
+                default it shows all objects.
         """
         wanted = {} if follow is None else {"follow": follow}
         self._add("view", "view", title=title, **wanted, **camera)
@@ -215,7 +215,7 @@ class Factory:
         if unknown:
             raise UnknownOptionError(f"add_{kind}", unknown, (*needed, *optional))
         self._kinds[name] = kind
-        self._events.append(Event("add", kind, name, _plain(values)))
+        self._events.append(Event("add", kind, name, _to_plain(values)))
         return name
 
     def _update(self, kind: str, name: str, changes: Mapping[str, Any]) -> None:
@@ -229,10 +229,10 @@ class Factory:
         unknown = changes.keys() - set(allowed)
         if unknown:
             raise UnknownOptionError(f"update_{kind}", unknown, allowed)
-        self._events.append(Event("update", kind, name, _plain(changes)))
+        self._events.append(Event("update", kind, name, _to_plain(changes)))
 
 
-def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+def _to_plain(values: Mapping[str, Any]) -> dict[str, Any]:
     plain: dict[str, Any] = {}
     for name, value in values.items():
         if name not in ARRAYS:
@@ -244,6 +244,6 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
             want in (None, have) for want, have in zip(shape, array.shape, strict=True)
         )
         if not fits:
-            raise ConfigError(f"{name} has shape {array.shape}, wanted {shape} (None: any).")
+            raise ConfigError(f"{name} has shape {array.shape}, expected {shape} (None: any).")
         plain[name] = array
     return plain

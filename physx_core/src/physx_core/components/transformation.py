@@ -1,4 +1,4 @@
-"""Transformation: what happens to tensors between dataset, network and environment."""
+"""Transformation: base class of what converts tensors between dataset, network, and environment."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ class Transformation:
     """Identity; plugins derive their own.
 
     Attributes:
-        normalization: Mean and standard deviation by field; empty where nothing is normalized.
-            They travel with the checkpoint.
+        normalization: Mean and standard deviation by field; empty if nothing is normalized. They
+            are stored in checkpoints.
     """
 
     def __init__(self) -> None:
@@ -23,11 +23,11 @@ class Transformation:
     def set_normalization(
         self, normalization: Mapping[str, Normalization], network: Network
     ) -> None:
-        """Keep the coefficients; called before the first batch and whenever they change."""
+        """Set the coefficients; called before the first batch and whenever they change."""
         self.normalization = dict(normalization)
 
     def transform_before_prediction(self, data: Tensors) -> Tensors:
-        """Return what the network reads, from data in physical units.
+        """Return the network's inputs, from data in physical units.
 
         Args:
             data: The network's `net_fields`.
@@ -40,15 +40,15 @@ class Transformation:
         """Return prediction and targets as the loss compares them.
 
         Args:
-            prediction: As the network gave it.
+            prediction: The network's prediction.
             targets: The network's `opt_fields` in physical units.
         """
         return prediction, targets
 
     def transform_before_apply(self, prediction: Tensors) -> Tensors:
-        """Return the prediction as the environment gets it, in physical units.
+        """Return the prediction for the environment, in physical units.
 
         Args:
-            prediction: As the network gave it.
+            prediction: The network's prediction.
         """
         return prediction

@@ -1,4 +1,4 @@
-"""Observer and Visualizer: they look on and never take part."""
+"""Observer and Visualizer: base classes of read-only callbacks, which cannot affect a run."""
 
 from __future__ import annotations
 
@@ -13,46 +13,46 @@ if TYPE_CHECKING:
 
 
 class Observer:
-    """Looks on while a pipeline runs. All methods do nothing until a subclass fills them.
+    """Receives the events of a running pipeline. All methods do nothing unless overridden.
 
-    An observer that raises is reported once and then left out; the run goes on.
+    An observer that raises is reported once and then left out; the run continues.
     """
 
     def open(self, run_name: str, session_dir: Path, instance_nb: int) -> None:
-        """A run begins.
+        """Called at the start of a run.
 
         Args:
             run_name: Name of the session.
             session_dir: The session's folder.
-            instance_nb: How many environment instances may draw.
+            instance_nb: Number of environment instances that can draw.
         """
 
     def begin(self, task: str, total: int | None, unit: str) -> None:
-        """A loop begins.
+        """Called at the start of a loop.
 
         Args:
-            task: What is done, for example ``training``.
-            total: How many units there are to do; None: nobody knows.
-            unit: What is counted, for example ``samples``.
+            task: Name of the loop, for example ``training``.
+            total: Number of units in the loop; None: unknown.
+            unit: Name of the units, for example ``samples``.
         """
 
     def advance(self, count: int) -> None:
-        """The loop did `count` units more."""
+        """Called after `count` more units of the loop."""
 
     def end(self) -> None:
-        """The loop is over."""
+        """Called at the end of the loop."""
 
     def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
-        """Numbers to record.
+        """Record numbers.
 
         Args:
-            values: Name to value; a ``/`` in a name makes groups, as in ``loss/training``.
+            values: Name to value; a ``/`` in a name separates groups, as in ``loss/training``.
             step: Position on the timeline.
             timeline: ``batch``, ``epoch`` or ``step``.
         """
 
     def histograms(self, values: Mapping[str, Array], step: int, timeline: str) -> None:
-        """Arrays of numbers whose distribution is to be recorded.
+        """Record the distribution of numbers in arrays.
 
         Args:
             values: Name to array, for example ``weights/layers.0.weight``.
@@ -61,18 +61,18 @@ class Observer:
         """
 
     def note(self, text: str) -> None:
-        """Something worth telling happened, for example that a training stopped early."""
+        """Receive a message, for example that a training stopped early."""
 
     def events(self, instance_id: int, step: int, events: list[Event]) -> None:
-        """Drawing events of one environment instance at one of its steps."""
+        """Receive drawing events of one environment instance at one of its steps."""
 
     def close(self) -> None:
-        """The run is over, whether it succeeded or not."""
+        """Called at the end of the run, also after a failure."""
 
 
 class Visualizer(Observer):
-    """An observer that draws what the environments' factories emit."""
+    """An observer that draws the events of the environments' factories."""
 
     def capture(self) -> Array | None:
-        """Return a picture, shape (height, width, 3), uint8; None: it makes no pictures."""
+        """Return a picture, shape (height, width, 3), uint8; None if pictures are not supported."""
         return None

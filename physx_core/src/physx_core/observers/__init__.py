@@ -1,4 +1,4 @@
-"""Observers: progress, statistics and viewers look on while a pipeline runs."""
+"""Observers of a running pipeline: progress bar, statistics, and viewers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The observers that the user chose to send a run's numbers to."""
+"""Creates the observers that a user chose for a run's statistics."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ def statistics_observers(
     kwargs: Mapping[str, Mapping[str, Any]],
     environment: EnvironmentConfig | None,
 ) -> list[Observer]:
-    """Return the observers that numbers go to.
+    """Return the observers of a run's statistics.
 
     Args:
-        given: References of visualizers; a text is one of them.
+        given: References of visualizers; a string is a single one.
         kwargs: Keyword arguments by reference.
-        environment: Its visualizer sees the numbers anyway and is not made twice.
+        environment: Its visualizer receives the statistics anyway and is not created again.
 
     Raises:
-        UnknownOptionError: There are arguments for something else.
-        PhysxError: A reference leads nowhere.
+        UnknownOptionError: If there are arguments for another reference.
+        PhysxError: If a reference cannot be resolved.
     """
     references = [given] if isinstance(given, str) else list(given)
     unknown = kwargs.keys() - set(map(str, references))

@@ -1,4 +1,4 @@
-"""ProgressBar: shows how far a run is."""
+"""ProgressBar: shows the progress of a run."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from physx_core.components.visualizer import Observer
 
 
 class ProgressBar(Observer):
-    """A bar on a terminal; elsewhere one line a minute and one at the end, fit for a log."""
+    """A bar on a terminal; otherwise one line a minute and one at the end, suited for logs."""
 
     def __init__(self) -> None:
         self._bar: Any = None
         self._is_terminal = sys.stderr.isatty()
 
     def begin(self, task: str, total: int | None, unit: str) -> None:
-        """Begin a bar."""
+        """Start a bar."""
         from tqdm.auto import tqdm
 
         self.end()
@@ -35,12 +35,12 @@ class ProgressBar(Observer):
         )
 
     def advance(self, count: int) -> None:
-        """Move the bar on."""
+        """Advance the bar."""
         if self._bar is not None:
             self._bar.update(count)
 
     def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
-        """Show the numbers of an epoch behind the bar, but for those of several epochs."""
+        """Show the statistics of an epoch behind the bar, except those over several epochs."""
         if self._bar is not None and timeline == "epoch":
             shown = {k: v for k, v in values.items() if not k.endswith(("_mean", "_variance"))}
             self._bar.set_postfix_str(", ".join(f"{k} {v:.3g}" for k, v in shown.items()), False)
@@ -52,11 +52,11 @@ class ProgressBar(Observer):
         tqdm.write(text, file=sys.stderr)
 
     def end(self) -> None:
-        """Leave the finished bar standing."""
+        """Finish the bar and leave it visible."""
         if self._bar is not None:
             self._bar.close()
             self._bar = None
 
     def close(self) -> None:
-        """Leave the bar standing."""
+        """Finish the bar and leave it visible."""
         self.end()

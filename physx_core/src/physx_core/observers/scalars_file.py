@@ -1,4 +1,4 @@
-"""ScalarsFile: keeps every recorded number in a CSV file."""
+"""ScalarsFile: stores every recorded number in a CSV file."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ FLUSH_SECONDS = 0.2
 class ScalarsFile(Observer):
     """Appends rows (timeline, step, name, value) to ``stats/scalars.csv`` of the session.
 
-    Rows reach the file at least five times a second, and at once those of an epoch: a run that is
-    killed keeps its numbers.
+    Rows are flushed five times a second, and those of an epoch at once, so that a killed run keeps
+    its statistics.
     """
 
     def __init__(self) -> None:
@@ -50,7 +50,7 @@ class ScalarsFile(Observer):
             self._stream.flush()
 
     def end(self) -> None:
-        """Let all numbers reach the file."""
+        """Flush the file."""
         if self._stream is not None:
             self._stream.flush()
 
@@ -62,7 +62,7 @@ class ScalarsFile(Observer):
 
 
 def _cut_unfinished_line(path: Path) -> None:
-    """Remove what a killed run wrote of its last line."""
+    """Remove the incomplete last line of a killed run."""
     if path.exists():
         content = path.read_bytes()
         if not content.endswith(b"\n"):
@@ -71,19 +71,17 @@ def _cut_unfinished_line(path: Path) -> None:
 
 
 def read_scalars(session_dir: Path) -> dict[tuple[str, str], dict[int, float]]:
-    """Return the numbers of a session: (timeline, name) to step to value, in the order of writing.
+    """Return a session's statistics: (timeline, name) to step to value, in the order of writing.
 
-    Where a resumed run recorded a step again, its number counts. A last line that a killed run
-    wrote in part is left out.
+    If a resumed run recorded a step again, the later value counts. An incomplete last line is left
+    out.
 
     Raises:
-        SessionError: The session has no such file, or it is none of physx.
+        SessionError: If the session has no such file, or it was not written by physx.
     """
     path = session_dir / "stats" / "scalars.csv"
     if not path.is_file():
-        raise SessionError(
-            f"There is no {path}: a session has numbers once something was trained in it."
-        )
+        raise SessionError(f"There is no {path}: a session has statistics after a training.")
     found: dict[tuple[str, str], dict[int, float]] = {}
     with path.open(encoding="utf-8", newline="") as stream:
         for timeline, step, name, value in _rows(path, stream):
@@ -94,7 +92,7 @@ def read_scalars(session_dir: Path) -> dict[tuple[str, str], dict[int, float]]:
 def _rows(path: Path, stream: io.TextIOBase) -> Iterator[tuple[str, int, str, float]]:
     lines = csv.reader(line for line in stream if line.endswith("\n"))
     if tuple(next(lines, ())) not in (HEADER, ()):
-        raise SessionError(f"{path} is no file of physx: it must begin with {','.join(HEADER)}.")
+        raise SessionError(f"{path} is not a file of physx: it must begin with {','.join(HEADER)}.")
     for line in lines:
         try:
             timeline, step, name, value = line

@@ -1,9 +1,9 @@
-"""Observers: several observers as one, of which none can end a run."""
+"""Observers: passes a run's events to several observers, none of which can end the run."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +13,16 @@ from physx_core.typing import Array
 
 
 class Observers(Observer):
-    """Hands everything to each observer; one that raises is reported once and left out."""
+    """Passes everything to each observer; one that raises is reported once and then left out."""
 
     def __init__(self, observers: Iterable[Observer]) -> None:
         self._observers = list(observers)
 
     def open(self, run_name: str, session_dir: Path, instance_nb: int) -> None:
-        """Tell all that a run begins. An observer that cannot begin is an error of the user's.
+        """Announce a run. Here the errors of observers are raised, as they are the user's.
 
         Raises:
-            PhysxError: An observer cannot begin, for example a viewer that is not there.
+            PhysxError: If an observer cannot start, for example because a viewer is not reachable.
         """
         opened: list[Observer] = []
         try:
@@ -35,55 +35,46 @@ class Observers(Observer):
             raise
 
     def begin(self, task: str, total: int | None, unit: str) -> None:
-        """Tell all that a loop begins."""
-        self._each(lambda observer: observer.begin(task, total, unit))
+        """Announce a loop."""
+        self._call("begin", task, total, unit)
 
     def advance(self, count: int) -> None:
-        """Tell all that the loop went on."""
-        for observer in self._observers:
-            try:
-                observer.advance(count)
-            except Exception as error:
-                self._mute(observer, error)
+        """Report the progress of the loop."""
+        self._call("advance", count)
 
     def end(self) -> None:
-        """Tell all that the loop is over."""
-        self._each(lambda observer: observer.end())
+        """Announce the end of the loop."""
+        self._call("end")
 
     def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
-        """Give numbers to all."""
-        for observer in self._observers:
-            try:
-                observer.scalars(values, step, timeline)
-            except Exception as error:
-                self._mute(observer, error)
+        """Pass on numbers."""
+        self._call("scalars", values, step, timeline)
 
     def histograms(self, values: Mapping[str, Array], step: int, timeline: str) -> None:
-        """Give arrays to all."""
-        self._each(lambda observer: observer.histograms(values, step, timeline))
+        """Pass on arrays."""
+        self._call("histograms", values, step, timeline)
 
     def note(self, text: str) -> None:
-        """Tell all that something happened."""
-        self._each(lambda observer: observer.note(text))
+        """Pass on a message."""
+        self._call("note", text)
 
     def events(self, instance_id: int, step: int, events: list[Event]) -> None:
-        """Give drawing events to all."""
-        self._each(lambda observer: observer.events(instance_id, step, events))
+        """Pass on drawing events."""
+        self._call("events", instance_id, step, events)
 
     def close(self) -> None:
-        """Tell all that the run is over."""
-        self._each(lambda observer: observer.close())
+        """Announce the end of the run."""
+        self._call("close")
 
-    def _each(self, call: Callable[[Observer], Any]) -> None:
-        for observer in list(self._observers):
+    def _call(self, method: str, *arguments: Any) -> None:
+        for observer in self._observers:
             try:
-                call(observer)
+                getattr(observer, method)(*arguments)
             except Exception as error:
-                self._mute(observer, error)
-
-    def _mute(self, observer: Observer, error: Exception) -> None:
-        # A new list: the loop that called this may still go through the old one.
-        self._observers = [other for other in self._observers if other is not observer]
-        name = type(observer).__name__
-        summary = f"{type(error).__name__}: {error}"
-        warnings.warn(f"{name} failed and is left out from here on: {summary}", stacklevel=4)
+                # A new list: this loop continues with the old one.
+                self._observers = [other for other in self._observers if other is not observer]
+                warnings.warn(
+                    f"{type(observer).__name__} failed and is left out from here on: "
+                    f"{type(error).__name__}: {error}",
+                    stacklevel=3,
+                )

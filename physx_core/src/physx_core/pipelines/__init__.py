@@ -1,4 +1,7 @@
-"""Pipelines: data generation, training, prediction, and replay."""
+"""Pipelines: data generation, training, prediction, and replay.
+
+The pipelines to run or to derive from, and `load_learner`, which loads a trained network.
+"""
 
 from __future__ import annotations
 

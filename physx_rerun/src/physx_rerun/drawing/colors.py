@@ -1,4 +1,4 @@
-"""Colors: from what the scene's objects say to the numbers that Rerun stores."""
+"""Converts the colors of scene objects to Rerun's numbers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NAMES = {
     "white": "#ffffff",
     "yellow": "#f5d63d",
 }
-"""Names of colors; most are a little softer than the web's, so that shapes keep their shading."""
+"""Named colors, most a little softer than on the web, so that shading stays visible."""
 
 COLORMAPS = {
     "viridis": ("#440154", "#3b528b", "#21918c", "#5ec962", "#fde725"),
@@ -40,14 +40,14 @@ COLORMAPS = {
     "coolwarm": ("#3b4cc0", "#9abbff", "#dddddd", "#f4987a", "#b40426"),
     "gray": ("#000000", "#ffffff"),
 }
-"""Colormaps as colors at equal distances, linear in between."""
+"""Colormaps as equidistant colors, interpolated linearly."""
 
 CURVES = ("#4c9be8", "#ff9f43", "#2ecc71", "#ff6b6b", "#a78bfa", "#1dd1a1", "#feca57", "#f78fb3")
-"""Colors of curves, one after the other."""
+"""Colors of successive curves."""
 
 
-def packed(rgba: Array) -> Array:
-    """Return colors as numbers 0xRRGGBBAA.
+def pack_rgba(rgba: Array) -> Array:
+    """Pack colors into numbers 0xRRGGBBAA.
 
     Args:
         rgba: Red, green, blue and alpha in [0, 1], shape (..., 4).
@@ -59,21 +59,21 @@ def packed(rgba: Array) -> Array:
     return (parts << np.array([24, 16, 8, 0], np.uint32)).sum(axis=-1, dtype=np.uint32)
 
 
-def rgb(color: Color) -> tuple[float, float, float]:
+def parse_rgb(color: Color) -> tuple[float, float, float]:
     """Return red, green and blue in [0, 1].
 
     Args:
         color: A name of `NAMES`, ``#rrggbb``, or three numbers in [0, 1].
 
     Raises:
-        ConfigError: It is none of these.
+        ConfigError: If it is not one of these.
     """
     if not isinstance(color, str):
         return _from_numbers(color)
     text = NAMES.get(color.lower(), color)
     if not re.fullmatch("#[0-9a-fA-F]{6}", text):
         raise ConfigError(
-            f'"{color}" is no color.{nearest(color, NAMES)} Give "#rrggbb", three numbers in '
+            f'"{color}" is not a color.{nearest(color, NAMES)} Give "#rrggbb", three numbers in '
             f"[0, 1], or a name: {listed(NAMES)}."
         )
     number = int(text[1:], 16)
@@ -93,19 +93,19 @@ def rgba(color: Color, alpha: float = 1.0) -> Array:
     """Return one color as a number 0xRRGGBBAA, shape (1,).
 
     Raises:
-        ConfigError: The color or its opacity is none.
+        ConfigError: If the color or its opacity is invalid.
     """
     if not isinstance(alpha, (int, float, np.number)) or not 0 <= alpha <= 1:
         raise ConfigError(f"alpha is {alpha!r} but must be a number in [0, 1].")
-    return packed(np.array([[*rgb(color), alpha]]))
+    return pack_rgba(np.array([[*parse_rgb(color), alpha]]))
 
 
-def mapped(values: Array, limits: tuple[float, float], colormap: str, alpha: float) -> Array:
-    """Return the colors of values.
+def map_values(values: Array, limits: tuple[float, float], colormap: str, alpha: float) -> Array:
+    """Return the colors of values in a colormap.
 
     Args:
         values: Any numbers, shape (n,).
-        limits: Values shown by the first and the last color.
+        limits: Values of the first and the last color.
         colormap: A name of `COLORMAPS`.
         alpha: Opacity in [0, 1].
 
@@ -113,7 +113,7 @@ def mapped(values: Array, limits: tuple[float, float], colormap: str, alpha: flo
         Colors 0xRRGGBBAA, shape (n,).
 
     Raises:
-        ConfigError: There is no such colormap.
+        ConfigError: If there is no such colormap.
     """
     if colormap not in COLORMAPS:
         raise ConfigError(
@@ -121,19 +121,19 @@ def mapped(values: Array, limits: tuple[float, float], colormap: str, alpha: flo
             f"Colormaps: {listed(COLORMAPS)}."
         )
     low, high = limits
-    anchors = np.array([rgb(color) for color in COLORMAPS[colormap]])
+    anchors = np.array([parse_rgb(color) for color in COLORMAPS[colormap]])
     place = (np.nan_to_num(values) - low) / max(high - low, 1e-12) * (len(anchors) - 1)
     ticks = np.arange(len(anchors))
     channels = [np.interp(place, ticks, anchors[:, channel]) for channel in range(3)]
-    return packed(np.stack([*channels, np.full(len(values), alpha)], axis=-1))
+    return pack_rgba(np.stack([*channels, np.full(len(values), alpha)], axis=-1))
 
 
 def curves(count: int, shift: int = 0) -> Array:
     """Return colors 0xRRGGBBAA for curves of one plot, shape (count,).
 
     Args:
-        count: How many curves.
-        shift: How many curves the plot has already.
+        count: Number of curves.
+        shift: Number of curves that the plot already has.
     """
     chosen = [CURVES[(shift + number) % len(CURVES)] for number in range(count)]
     return np.array([rgba(color)[0] for color in chosen], np.uint32)

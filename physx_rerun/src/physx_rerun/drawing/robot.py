@@ -1,4 +1,4 @@
-"""Robots: the visual shapes of a URDF, each fixed to the frame of its link."""
+"""Draws robots: the visual shapes of a URDF, each attached to the frame of its link."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import rerun as rr
 from physx_core.rotations import from_matrix_rows, rotate_rows
 from physx_core.typing import Array
 from physx_rerun.drawing import colors
-from physx_rerun.drawing.rows import Rows, Times
+from physx_rerun.drawing.chunks import ChunkBuilder, Times
 from physx_rerun.drawing.urdf import MESH_TYPES, VisualShape, read
 
 _SILVER = (0.75, 0.78, 0.81, 1.0)
@@ -22,22 +22,22 @@ DrawnShape = tuple[str, VisualShape]
 
 
 def draw_robot(
-    rows: Rows, entity: str, values: dict[str, Any], frames: Sequence[str], world: str
+    rows: ChunkBuilder, entity: str, values: dict[str, Any], frames: Sequence[str], world: str
 ) -> tuple[list[DrawnShape], Array]:
     """Draw the visual shapes of a robot; warn of mesh files that do not exist.
 
     Args:
-        rows: Where rows go.
+        rows: Collects the rows.
         entity: Path of the robot's entity.
-        values: What the robot was added with.
+        values: Options of the robot.
         frames: Names of the bodies' frames.
-        world: Name of the frame that shapes stand in which belong to no body.
+        world: Name of the frame of shapes without body.
 
     Returns:
         The shapes drawn, and the bodies' poses with all joints at zero, shape (bodies, 7).
 
     Raises:
-        VisualizerError: The URDF file cannot be read.
+        VisualizerError: If the URDF file cannot be read.
     """
     model = read(values["urdf"], values["bodies"], values.get("package_dirs") or {})
     if model.missing:
@@ -55,21 +55,21 @@ def draw_robot(
             quaternions=from_matrix_rows(shape.pose[np.newaxis, :3, :3]),
             scales=[shape.size] if shape.kind == "mesh" else None,
         )
-        rows.static(path, rr.CoordinateFrame(frame), pose, _geometry(shape))
+        rows.add_static(path, rr.CoordinateFrame(frame), pose, _geometry(shape))
         drawn.append((path, shape))
     return drawn, model.rest
 
 
-def tint_robot(rows: Rows, values: dict[str, Any], times: Times) -> None:
-    """Give a robot's shapes its color and opacity, or those of the URDF where it has none.
+def tint_robot(rows: ChunkBuilder, values: dict[str, Any], times: Times) -> None:
+    """Set the color and opacity of a robot's shapes, by default those of the URDF.
 
     Args:
-        rows: Where rows go.
+        rows: Collects the rows.
         values: The robot's values, with its ``shapes``.
-        times: Since when.
+        times: Time of the change.
 
     Raises:
-        ConfigError: The color does not exist.
+        ConfigError: If the color does not exist.
     """
     color, alpha = values.get("color"), values.get("alpha")
     for path, shape in values["shapes"]:
@@ -96,15 +96,15 @@ _LOOKS: dict[str, tuple[type[Any], str]] = {
 
 
 def corners_of(shapes: Sequence[VisualShape], poses: Array) -> Array:
-    """Return points that a robot spans: its bodies' origins, and the corners around its shapes.
+    """Return points that bound a robot: its bodies' origins, and the corners of its shapes.
 
     Args:
-        shapes: Its shapes; of a mesh just the origin is known.
+        shapes: Its shapes; of a mesh only the origin is known.
         poses: Poses of the bodies, shape (bodies, 7).
     """
     found = [poses[:, :3]]
     for shape in shapes:
-        points = _SIGNS * _reach(shape) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
+        points = _SIGNS * _half_extents(shape) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
         if shape.body is not None:
             points = rotate_rows(poses[shape.body, 3:], points) + poses[shape.body, :3]
         found.append(points)
@@ -114,8 +114,8 @@ def corners_of(shapes: Sequence[VisualShape], poses: Array) -> Array:
 _SIGNS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 
 
-def _reach(shape: VisualShape) -> Array:
-    """Return how far a shape reaches from its origin along its axes."""
+def _half_extents(shape: VisualShape) -> Array:
+    """Return a shape's half extents along its axes."""
     if shape.kind == "mesh":
         return np.zeros(3)
     if shape.kind == "box":

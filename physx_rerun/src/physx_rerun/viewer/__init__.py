@@ -1,1 +1,1 @@
-"""Viewer processes and the streams that feed them."""
+"""Viewer processes, and streams that write to them."""

@@ -1,4 +1,4 @@
-"""One picture after another of a scene that moves, made by a viewer without a window."""
+"""Renders successive pictures of a moving scene with a viewer without window."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from PIL import Image
 
 from physx_core.errors import VisualizerError
 from physx_core.typing import Array
-from physx_rerun.viewer.headless import Camera, start
+from physx_rerun.viewer.headless import Camera, start_viewer
 
-_MARGIN = (16, 80)  # pixels of the window around a view, and some more: its frame, its title
-_NOTES = 10  # pictures after which the viewer's notes of its start are gone
-_PATIENCE = 60.0  # s that a picture may take
+_MARGIN = (16, 80)  # pixels of the window around a view: frame and title, with some reserve
+_NOTES = 10  # pictures after which the viewer's notifications at its start are gone
+_PATIENCE = 60.0  # s per picture
 
 
 class OffscreenViewer:
-    """A viewer without a window.
+    """A viewer without window.
 
     Attributes:
-        address: Where it listens, ``127.0.0.1:PORT``.
+        address: Address of the viewer, ``127.0.0.1:PORT``.
     """
 
     def __init__(self, size: tuple[int, int], memory_limit: str) -> None:
-        """Start it.
+        """Start the viewer.
 
         Args:
             size: Width and height of its pictures, in pixels.
-            memory_limit: Memory that it may use before it forgets the oldest rows.
+            memory_limit: Memory of the viewer, beyond which it drops the oldest rows.
 
         Raises:
-            VisualizerError: There is no graphics driver, or it does not start.
+            VisualizerError: If there is no graphics driver, or the viewer does not start.
         """
         self._size = size
         self._folder = tempfile.TemporaryDirectory(prefix="physx-rerun-")
         window = (size[0] + _MARGIN[0], size[1] + _MARGIN[1])
         limits = ("--memory-limit", memory_limit, "--server-memory-limit", "100MB")
-        self._viewer = start(window, Path(self._folder.name), *limits)
+        self._viewer = start_viewer(window, Path(self._folder.name), *limits)
         self._camera: Camera | None = None
         self.address = self._viewer.address
         try:
@@ -54,11 +54,11 @@ class OffscreenViewer:
 
         Args:
             step: Position on the timeline ``step`` to draw.
-            mark: Timeline on which the last row that must have arrived lies.
-            number: Its position there.
+            mark: Timeline of the last row that must have arrived.
+            number: Its position on that timeline.
 
         Raises:
-            VisualizerError: There is no scene, or the viewer ended or takes too long.
+            VisualizerError: If there is no scene, or the viewer ended or takes too long.
         """
         deadline = time.monotonic() + _PATIENCE
         try:
@@ -69,17 +69,17 @@ class OffscreenViewer:
             if is_first:
                 camera.wait_for_recording()
             camera.go_to("step", step)
-            scene = camera.scene()
+            scene = camera.scene_view()
             if scene is None:
-                raise VisualizerError("There is nothing to take a picture of: nothing was drawn.")
+                raise VisualizerError("There is no scene to render: nothing was drawn.")
             for _ in range(_NOTES if is_first else 0):
-                camera.glance(scene)
-            drawn = camera.shoot(scene) if is_first else camera.glance(scene)
+                camera.screenshot(scene)
+            drawn = camera.wait_for_picture(scene) if is_first else camera.screenshot(scene)
         except OSError as error:
             self._viewer.check(wait=2.0)
-            raise VisualizerError(f"The Rerun viewer drew no picture: {error}.") from error
+            raise VisualizerError(f"The Rerun viewer rendered no picture: {error}.") from error
         self._camera = camera
-        return _cut(Image.open(io.BytesIO(drawn)), self._size)
+        return _crop(Image.open(io.BytesIO(drawn)), self._size)
 
     def close(self) -> None:
         """End the viewer."""
@@ -87,8 +87,8 @@ class OffscreenViewer:
         self._folder.cleanup()
 
 
-def _cut(picture: Image.Image, size: tuple[int, int]) -> Array:
-    """Return the middle of a picture; one that is smaller is enlarged first."""
+def _crop(picture: Image.Image, size: tuple[int, int]) -> Array:
+    """Crop a picture to its center; a smaller one is enlarged first."""
     factor = max(1.0, *(want / have for want, have in zip(size, picture.size, strict=True)))
     if factor > 1.0:
         whole = [round(factor * have) for have in picture.size]

@@ -1,4 +1,4 @@
-"""Streams: one recording written to a file, to a live viewer, or to both."""
+"""RecordingStreams: writes a recording to a file, to a live viewer, or to both."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from physx_core.errors import VisualizerError
-from physx_rerun.drawing.rows import Chunk
+from physx_rerun.drawing.chunks import Chunk
 
 QUEUE_BYTES = 64_000_000
-"""Size of the rows that may wait for a live viewer; beyond, rows are dropped."""
+"""Largest size of the rows that wait for a live viewer; further rows are dropped."""
 QUEUE_LENGTH = 4096
-"""Number of chunks that may wait for a live viewer; beyond, rows are dropped."""
+"""Largest number of chunks that wait for a live viewer; further rows are dropped."""
 CLOSE_SECONDS = 3.0
-"""How long the end of a run waits for a live viewer."""
+"""Time that the end of a run waits for a live viewer."""
 
 
-class Recording:
-    """The run's recording. The file gets everything; a live viewer what it can keep up with."""
+class RecordingStreams:
+    """A run's recording. The file gets all rows, a live viewer those that it can keep up with."""
 
     def __init__(
         self,
@@ -36,18 +36,18 @@ class Recording:
         *,
         owns_viewer: bool,
     ) -> None:
-        """Begin to write.
+        """Open the streams.
 
         Args:
-            application_id: Name under which viewers keep a user's own layout.
+            application_id: Name under which viewers store the user's layout.
             run_name: Name of the recording.
             path: File to write; None: none.
             address: Address of a live viewer, ``HOST:PORT``; None: none.
-            owns_viewer: Whether the viewer was started for this run, so that its layout may be
+            owns_viewer: Whether the viewer was started for this run, so that its layout can be
                 replaced.
 
         Raises:
-            VisualizerError: The file cannot be written.
+            VisualizerError: If the file cannot be written.
         """
         self._owns_viewer = owns_viewer
         recording_id = str(uuid.uuid4())
@@ -66,22 +66,22 @@ class Recording:
         )
 
     def write(self, chunks: Iterable[Chunk]) -> None:
-        """Write chunks; never waits for a live viewer."""
+        """Write chunks, without waiting for a live viewer."""
         for chunk in chunks:
             if self._file:
                 chunk.send(self._file)
             if self._live:
                 self._live.put(chunk)
 
-    def lay_out(self, blueprint: rrb.Blueprint) -> None:
+    def write_blueprint(self, blueprint: rrb.Blueprint) -> None:
         """Write the layout of the windows."""
         if self._file:
             self._file.send_blueprint(blueprint)
         if self._live:
-            self._live.put(_Windows(blueprint, make_active=self._owns_viewer))
+            self._live.put(_QueuedBlueprint(blueprint, make_active=self._owns_viewer))
 
     def close(self) -> None:
-        """Finish the file and let the live viewer go; warns of rows that it did not get."""
+        """Finish the file and disconnect the live viewer; warn of rows that it did not get."""
         if self._file:
             self._file.disconnect()
             self._file = None
@@ -90,8 +90,8 @@ class Recording:
             self._live = None
 
 
-class _Windows:
-    """The layout of the windows, on its way to a live viewer."""
+class _QueuedBlueprint:
+    """The layout of the windows, queued for a live viewer."""
 
     is_static = True
     nbytes = 0
@@ -105,7 +105,7 @@ class _Windows:
 
 
 class LiveWriter:
-    """Writes to a live viewer from a thread of its own, for a viewer that hangs blocks its writer.
+    """Writes to a live viewer in a thread of its own, as a hanging viewer blocks its writer.
 
     Attributes:
         dropped: Chunks that were dropped because the viewer could not keep up.
@@ -115,14 +115,14 @@ class LiveWriter:
         """Start the thread.
 
         Args:
-            application_id: As in `Recording`.
+            application_id: As in `RecordingStreams`.
             recording_id: Identity of the recording, the same as the file's.
             run_name: Name of the recording.
             address: Address of the viewer, ``HOST:PORT``.
         """
         self.dropped = 0
         self._address = address
-        self._queue: queue.SimpleQueue[Chunk | _Windows | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[Chunk | _QueuedBlueprint | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._waiting_bytes = 0
         self._failure: BaseException | None = None
@@ -134,8 +134,8 @@ class LiveWriter:
         )
         self._thread.start()
 
-    def put(self, item: Chunk | _Windows) -> None:
-        """Hand over an item; rows are dropped while too much waits, what is static never."""
+    def put(self, item: Chunk | _QueuedBlueprint) -> None:
+        """Queue an item; rows are dropped while the queue is full, static data never."""
         with self._lock:
             is_full = self._waiting_bytes > QUEUE_BYTES or self._queue.qsize() > QUEUE_LENGTH
             if is_full and not item.is_static:
@@ -145,7 +145,7 @@ class LiveWriter:
         self._queue.put(item)
 
     def close(self) -> None:
-        """Wait a moment for the viewer to get the rest, then let it go."""
+        """Give the viewer some time to receive the rest, then disconnect."""
         self._queue.put(None)
         self._thread.join(CLOSE_SECONDS)
         if self._thread.is_alive():
@@ -153,12 +153,12 @@ class LiveWriter:
             rr.unregister_shutdown()
             warnings.warn(f"The Rerun viewer at {self._address} does not respond.", stacklevel=3)
         elif self._failure is not None:
-            text = f"The Rerun viewer at {self._address} went away: {self._failure}."
+            text = f"The Rerun viewer at {self._address} disconnected: {self._failure}."
             warnings.warn(text, stacklevel=3)
         if self.dropped:
             warnings.warn(
-                f"The Rerun viewer at {self._address} was too slow: it did not get "
-                f"{self.dropped} blocks of rows. A file that was saved has them.",
+                f"The Rerun viewer at {self._address} was too slow: it missed "
+                f"{self.dropped} blocks of rows. A saved file contains them.",
                 stacklevel=3,
             )
 
@@ -172,7 +172,7 @@ class LiveWriter:
                 with self._lock:
                     self._waiting_bytes -= item.nbytes
             stream.flush(timeout_sec=CLOSE_SECONDS)
-        except Exception as error:  # a viewer may fail in any way, and never ends a run
+        except Exception as error:  # a viewer can fail in any way, which must not end a run
             self._failure = error
         with contextlib.suppress(Exception):
             stream.disconnect()

@@ -1,4 +1,4 @@
-"""The native Rerun viewer as a process of its own, reachable from this machine only."""
+"""Viewer: the native Rerun viewer in its own process, reachable from this machine only."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ import rerun_cli
 from physx_core.errors import VisualizerError
 
 NO_VULKAN_STATUS = 102
-"""Exit status of a viewer that finds nothing to draw with."""
+"""Exit status of a viewer without graphics driver."""
 NO_VULKAN = (
     "The Rerun viewer found no graphics driver: install a software Vulkan driver, "
     "for example: apt install mesa-vulkan-drivers"
 )
 
 
-def executable() -> Path:
-    """Return the viewer's file; the command ``rerun`` is a script that outlives being ended.
+def find_executable() -> Path:
+    """Return the viewer's executable; ending the command ``rerun``, a script, leaves it running.
 
     Raises:
-        VisualizerError: The package `rerun-sdk` came without it.
+        VisualizerError: If the package `rerun-sdk` lacks it.
     """
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
     path = Path(rerun_cli.__file__).parent / name
@@ -43,8 +43,8 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def listens(address: str, timeout: float = 0.5) -> bool:
-    """Return whether somebody listens at ``HOST:PORT``."""
+def is_listening(address: str, timeout: float = 0.5) -> bool:
+    """Return whether a process listens at ``HOST:PORT``."""
     host, _, port = address.rpartition(":")
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout):
@@ -53,8 +53,8 @@ def listens(address: str, timeout: float = 0.5) -> bool:
         return False
 
 
-def free_port() -> int:
-    """Return a port that nobody listens at."""
+def find_free_port() -> int:
+    """Return an unused port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -65,7 +65,7 @@ class Viewer:
     """A viewer process.
 
     Attributes:
-        address: Where it listens, ``127.0.0.1:PORT``.
+        address: Address of the viewer, ``127.0.0.1:PORT``.
         process: The process.
     """
 
@@ -75,21 +75,21 @@ class Viewer:
         options: Sequence[str],
         *,
         environment: Mapping[str, str] | None = None,
-        lives_on: bool = False,
+        outlives: bool = False,
     ) -> None:
         """Start the process.
 
         Args:
-            port: Port that it listens at; 0: any free one.
-            options: Further options of its command line.
+            port: Port of the viewer; 0: any free one.
+            options: Further command-line options.
             environment: Environment variables beside those of this process.
-            lives_on: Whether the viewer outlives this process and its Ctrl-C.
+            outlives: Whether the viewer outlives this process and its Ctrl-C.
         """
-        port = port or free_port()
+        port = port or find_free_port()
         self.address = f"127.0.0.1:{port}"
         self.process = subprocess.Popen(
             [
-                str(executable()),
+                str(find_executable()),
                 *("--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"),
                 *options,
             ],
@@ -97,17 +97,17 @@ class Viewer:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            start_new_session=lives_on,
+            start_new_session=outlives,
         )
 
     def wait_until_ready(self, timeout: float = 30.0) -> None:
         """Wait until the viewer listens.
 
         Raises:
-            VisualizerError: It ended, or does not listen in time.
+            VisualizerError: If it ended, or does not listen in time.
         """
         deadline = time.monotonic() + timeout
-        while not listens(self.address):
+        while not is_listening(self.address):
             self.check()
             if time.monotonic() > deadline:
                 self.end()
@@ -118,10 +118,10 @@ class Viewer:
         """Raise if the process ended.
 
         Args:
-            wait: Time in s that it is given to end.
+            wait: Time in s to wait for its end.
 
         Raises:
-            VisualizerError: It did; names the remedy where the graphics driver is missing.
+            VisualizerError: If it ended; the message tells how to install a graphics driver.
         """
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(wait)

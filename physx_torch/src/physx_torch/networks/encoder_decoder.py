@@ -1,4 +1,4 @@
-"""EncoderDecoder: fully connected layers through a short code in the middle."""
+"""EncoderDecoder: fully connected encoder and decoder with a code in between."""
 
 from __future__ import annotations
 
@@ -8,19 +8,17 @@ from typing import Any
 import torch
 
 from physx_core.errors import ConfigError
-from physx_torch.networks.fc import FC, layer_sizes
+from physx_torch.networks.fc import FC, check_layer_sizes
 
 
 class EncoderDecoder(FC):
-    """Fully connected encoder and decoder: all that the outputs depend on goes through a code.
+    """Fully connected encoder and decoder: outputs depend on inputs through a code only.
 
-    The form follows from the lists: symmetric, where no decoder is given and it mirrors the
-    encoder; rectangular, where all hidden layers have one width, as in ``encoder=[300, 64, 64]``;
-    asymmetric, where a decoder of one's own is given. Fields are read and predicted as in `FC`.
-    For grids, a `UNet` with ``skip_merge=True`` is an encoder and decoder of convolutions.
+    By default the decoder mirrors the encoder. Fields are read and predicted as in `FC`. For grids,
+    a `UNet` with ``skip_merge=True`` is a convolutional encoder and decoder.
 
     Attributes:
-        code_size: Numbers in the code.
+        code_size: Number of values in the code.
     """
 
     def __init__(
@@ -31,29 +29,26 @@ class EncoderDecoder(FC):
         nb_outputs: int | None = None,
         **options: Any,
     ) -> None:
-        """Make the layers.
+        """Create the layers.
 
         Args:
             encoder: Number of inputs, of neurons of each hidden layer, and of the code, for
                 example ``[300, 64, 8]``.
-            decoder: Number of neurons of each layer behind the code, the outputs last, for
-                example ``[32, 30]``; None: those of the encoder in reverse order.
-            nb_outputs: Number of outputs, where no decoder is given; None: as many as inputs.
+            decoder: Number of neurons of each layer after the code, the outputs last, for example
+                ``[32, 30]``; None: those of the encoder in reverse order.
+            nb_outputs: Number of outputs if no decoder is given; None: as many as inputs.
             options: ``activation``, ``biases``, ``output_shape`` and the names of the fields as in
                 `FC`.
 
         Raises:
-            ConfigError: A list has the wrong content, or `nb_outputs` is given with a decoder.
+            ConfigError: If a list is invalid, or `nb_outputs` is given with a decoder.
         """
-        own = layer_sizes(f"{type(self).__name__}.encoder", encoder, "[300, 64, 8]")
+        own = check_layer_sizes(f"{type(self).__name__}.encoder", encoder, "[300, 64, 8]")
         if decoder is None:
             last = own[0] if nb_outputs is None else nb_outputs
             decoder = (*reversed(own[1:-1]), last)
         elif nb_outputs is not None:
-            raise ConfigError(
-                f"{type(self).__name__}.nb_outputs is given, but so is the decoder, whose last "
-                "number says it."
-            )
+            raise ConfigError(f"{type(self).__name__}: give nb_outputs or the decoder, not both.")
         super().__init__((*own, *decoder), **options)
         self.code_size = own[-1]
         self._split = 2 * len(own) - 3  # modules up to the code: linear layers and activations
@@ -64,7 +59,7 @@ class EncoderDecoder(FC):
         Args:
             inputs: One tensor for each of `net_fields`, of shape (samples, *field shape).
         """
-        code: torch.Tensor = self.layers[: self._split](self.joined(inputs))
+        code: torch.Tensor = self.layers[: self._split](self.concatenate(inputs))
         return code
 
     def decode(self, code: torch.Tensor) -> torch.Tensor | list[torch.Tensor]:
@@ -73,4 +68,4 @@ class EncoderDecoder(FC):
         Args:
             code: Shape (samples, code_size).
         """
-        return self.dealt_out(self.layers[self._split :](code))
+        return self.split_outputs(self.layers[self._split :](code))

@@ -1,4 +1,4 @@
-"""FC: layers in which every neuron is connected with every one of the next layer."""
+"""FC: fully connected network."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from physx_torch.networks.network import TorchNetwork
 class FC(TorchNetwork):
     """Fully connected network.
 
-    The values of all `net_fields` of a sample are put behind one another, in that order, and go
-    through the layers; an activation follows each layer but the last. The outputs are dealt out
-    to the prediction fields in order, in the shapes of `opt_fields`.
+    The values of all `net_fields` of a sample are concatenated in that order and passed through the
+    layers, with an activation after each layer but the last. The outputs are split into the
+    prediction fields in order, in the shapes of `opt_fields`.
 
     Attributes:
         layers: The linear layers and activations.
@@ -36,24 +36,24 @@ class FC(TorchNetwork):
         output_shape: int | Sequence[int] | None = None,
         **fields: Any,
     ) -> None:
-        """Make the layers.
+        """Create the layers.
 
         Args:
             layers: Number of inputs, of neurons of each hidden layer, and of outputs, for example
                 ``[27, 256, 256, 9]``.
             activation: Class of an activation, or its name in `torch.nn`. ``"PReLU"`` learns one
                 slope for each neuron.
-            biases: Whether the layers have a bias: all of them, or one truth value for each of the
+            biases: Whether layers have a bias: one value for all, or one for each of the
                 ``len(layers) - 1`` layers.
             output_shape: Shape of one sample's prediction; None: that of the field in
                 `opt_fields`.
             fields: ``net_fields``, ``opt_fields`` and ``pred_fields`` as in `TorchNetwork`.
 
         Raises:
-            ConfigError: A list has the wrong length or content, or there is no such activation.
+            ConfigError: If a list has the wrong length or content, or there is no such activation.
         """
         super().__init__(**fields)
-        self.sizes = layer_sizes(f"{type(self).__name__}.layers", layers)
+        self.sizes = check_layer_sizes(f"{type(self).__name__}.layers", layers)
         flags = _flags(type(self).__name__, biases, len(self.sizes) - 1)
         self.layers = _stack(self.sizes, activation, flags)
         self._shape = self._fixed_shape(output_shape)
@@ -74,10 +74,10 @@ class FC(TorchNetwork):
         return shape
 
     def bind(self, fields: Mapping[str, Field]) -> None:
-        """Learn the shapes of the fields before the first batch.
+        """Set the shapes of the fields before the first batch.
 
         Raises:
-            FieldsMismatchError: A field is missing, its shape is unknown, or the fields do not
+            FieldsMismatchError: If a field is missing, its shape is unknown, or the fields do not
                 have as many values as the first and the last layer.
         """
         super().bind(fields)
@@ -95,7 +95,7 @@ class FC(TorchNetwork):
 
     def _check(self, which: str, size: int, fields: Mapping[str, Field]) -> None:
         unknown = {
-            name: "its shape is not known before its first sample"
+            name: "its shape is not known before the first sample"
             for name, field in fields.items()
             if field.shape is None
         }
@@ -119,26 +119,26 @@ class FC(TorchNetwork):
         Args:
             inputs: One tensor for each field, of shape (samples, *field shape).
         """
-        return self.dealt_out(self.layers(self.joined(inputs)))
+        return self.split_outputs(self.layers(self.concatenate(inputs)))
 
-    def joined(self, inputs: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Return the values of all fields of each sample behind one another.
+    def concatenate(self, inputs: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Return the concatenated values of all fields of each sample, shape (samples, number).
 
         Args:
             inputs: One tensor for each field, of shape (samples, *field shape).
         """
         if len(inputs) == 1:
-            return self._flat(inputs[0])
-        return torch.cat([self._flat(tensor) for tensor in inputs], dim=1)
+            return self._flatten(inputs[0])
+        return torch.cat([self._flatten(tensor) for tensor in inputs], dim=1)
 
-    def dealt_out(self, output: torch.Tensor) -> torch.Tensor | list[torch.Tensor]:
-        """Return the prediction fields in their shapes, from outputs of shape (samples, number)."""
+    def split_outputs(self, output: torch.Tensor) -> torch.Tensor | list[torch.Tensor]:
+        """Split outputs of shape (samples, number) into prediction fields of their shapes."""
         if len(self._shapes) == 1:
-            return _shaped(output, self._shapes[0])
+            return _reshape(output, self._shapes[0])
         parts = output.split([math.prod(shape) for shape in self._shapes], dim=1)
-        return [_shaped(part, shape) for part, shape in zip(parts, self._shapes, strict=True)]
+        return [_reshape(part, shape) for part, shape in zip(parts, self._shapes, strict=True)]
 
-    def _flat(self, tensor: torch.Tensor) -> torch.Tensor:
+    def _flatten(self, tensor: torch.Tensor) -> torch.Tensor:
         if not tensor.is_floating_point():
             tensor = tensor.to(self.data_type)
         if tensor.dim() == 2:
@@ -146,24 +146,24 @@ class FC(TorchNetwork):
         return tensor.unsqueeze(1) if tensor.dim() == 1 else tensor.flatten(1)
 
 
-def _shaped(output: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
+def _reshape(output: torch.Tensor, shape: tuple[int, ...]) -> torch.Tensor:
     if len(shape) == 1:
         return output
     return output.unflatten(1, shape) if shape else output.squeeze(1)
 
 
-def layer_sizes(
+def check_layer_sizes(
     option: str, given: Sequence[int], example: str = "[27, 256, 256, 9]"
 ) -> tuple[int, ...]:
-    """Return numbers of neurons as a user gave them.
+    """Return numbers of neurons after validating them.
 
     Args:
-        option: What was given, for the message.
+        option: Name of the option, for the message.
         given: At least two positive integers.
-        example: How it may look.
+        example: Example for the message.
 
     Raises:
-        ConfigError: It is something else.
+        ConfigError: If it is anything else.
     """
     sizes = () if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
     right = all(type(size) is int and size > 0 for size in sizes)

@@ -1,4 +1,4 @@
-"""Grids: how values of a regular grid lie in a field, and how a grid is padded for a UNet."""
+"""Grids: the layout of a regular grid in a field, and its padding for a UNet."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from physx_core import Field
 
 
 class Border(NamedTuple):
-    """How one axis of a grid is padded, and which part of the output belongs to it.
+    """Padding of one axis of a grid, and the part of the output that corresponds to it.
 
     Attributes:
         size: Points of the grid along the axis.
-        before: Points that are added in front.
-        after: Points that are added behind.
-        start: Point of the output that belongs to the first point of the grid.
+        before: Points added in front.
+        after: Points added behind.
+        start: Point of the output that corresponds to the first point of the grid.
     """
 
     size: int
@@ -28,20 +28,20 @@ class Border(NamedTuple):
 
     @property
     def padded(self) -> int:
-        """Points of the padded axis."""
+        """Number of points of the padded axis."""
         return self.before + self.size + self.after
 
 
-def border(size: int, steps: int, sublayers: int, same: bool) -> Border:
-    """Return the least padding with which a UNet gives a value for each point of an axis.
+def make_border(size: int, steps: int, sublayers: int, same: bool) -> Border:
+    """Return the least padding with which a UNet predicts a value for each point of an axis.
 
     Each of the `steps` halves the axis on the way down, which must be even there, and doubles it on
     the way up. Without padding of their own (`same` is False), the `sublayers` convolutions of each
-    level take away one point at either end.
+    level remove one point at either end.
 
     Args:
         size: Points of the grid along the axis.
-        steps: How often the axis is halved.
+        steps: Number of times that the axis is halved.
         sublayers: Convolutions in each level.
         same: Whether convolutions keep the size.
     """
@@ -58,8 +58,8 @@ def border(size: int, steps: int, sublayers: int, same: bool) -> Border:
     return Border(size, margin + start, margin + surplus - start, start)
 
 
-class Layout(NamedTuple):
-    """How a field holds the values of a grid.
+class GridLayout(NamedTuple):
+    """Layout of a grid's values in a field.
 
     Attributes:
         shape: Shape of the field.
@@ -71,12 +71,12 @@ class Layout(NamedTuple):
 
 
 def grid_size(shape: Sequence[int], nb_dims: int) -> tuple[int, ...] | None:
-    """Return the grid that a shape shows, with or without an axis of channels; None if none."""
+    """Return the grid of a shape, with or without an axis of channels; None if it does not fit."""
     return tuple(shape[:nb_dims]) if len(shape) in (nb_dims, nb_dims + 1) else None
 
 
-def layout(field: Field, size: tuple[int, ...]) -> Layout | None:
-    """Return how a field holds a grid; None where it does not.
+def find_layout(field: Field, size: tuple[int, ...]) -> GridLayout | None:
+    """Return the layout of a grid in a field; None if the field does not contain one.
 
     A field has the axes of the grid, or one axis with all points in row-major order; an axis of
     channels may follow.
@@ -84,7 +84,7 @@ def layout(field: Field, size: tuple[int, ...]) -> Layout | None:
     shape = tuple(field.shape or ())
     for points in (size, (math.prod(size),)):
         if shape[: len(points)] == points and len(shape) - len(points) in (0, 1):
-            return Layout(shape, shape[-1] if len(shape) > len(points) else 1)
+            return GridLayout(shape, shape[-1] if len(shape) > len(points) else 1)
     return None
 
 
@@ -102,16 +102,16 @@ def pad(tensor: torch.Tensor, borders: Sequence[Border]) -> torch.Tensor:
 
 
 def crop(tensor: torch.Tensor, borders: Sequence[Border]) -> torch.Tensor:
-    """Return the part of an output (samples, *axes, channels) that belongs to the grid."""
+    """Return the part of an output (samples, *axes, channels) that corresponds to the grid."""
     for number, axis in enumerate(borders, 1):
         tensor = tensor.narrow(number, axis.start, axis.size)
     return tensor
 
 
-def misfits(fields: Mapping[str, Field], size: tuple[int, ...]) -> dict[str, str]:
-    """Return what is wrong with each field that does not hold a grid of this size."""
+def find_mismatches(fields: Mapping[str, Field], size: tuple[int, ...]) -> dict[str, str]:
+    """Return an error for each field that does not contain a grid of this size."""
     return {
-        name: f"shape {field.shape} is no grid of {' x '.join(map(str, size))} points"
+        name: f"shape {field.shape} is not a grid of {' x '.join(map(str, size))} points"
         for name, field in fields.items()
-        if layout(field, size) is None
+        if find_layout(field, size) is None
     }

@@ -1,4 +1,4 @@
-"""ModuleNetwork: any plain PyTorch module as a network."""
+"""ModuleNetwork: adapts a plain PyTorch module as a network."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from physx_torch.networks.network import TorchNetwork
 
 
 class ModuleNetwork(TorchNetwork):
-    """A `torch.nn.Module` that knows nothing of physx, with names for its inputs and outputs.
+    """A plain `torch.nn.Module` with names for its inputs and outputs.
 
-    Its ``forward`` gets the tensors of `net_fields` in that order and returns one tensor, several
+    Its ``forward`` takes the tensors of `net_fields` in that order and returns one tensor, several
     in the order of `pred_fields`, or a dictionary by those names.
 
     Attributes:
@@ -32,10 +32,10 @@ class ModuleNetwork(TorchNetwork):
         module_kwargs: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
-        """Make the module.
+        """Create the module.
 
         The keyword arguments of the module's constructor can be given beside the others, or in
-        `module_kwargs`, as they must be where it takes one of the names below itself.
+        `module_kwargs`, which is necessary if it takes one of the names below itself.
 
         Args:
             module: Class of the module, or ``"package.module:Class"``, or ``"script.py:Class"``.
@@ -47,8 +47,8 @@ class ModuleNetwork(TorchNetwork):
             arguments: Keyword arguments of the module's constructor.
 
         Raises:
-            ConfigError: There is no such class, it refuses the arguments, is no plain module, or it
-                is not clear whom an argument is for.
+            ConfigError: If there is no such class, it rejects the arguments, does not create a
+                plain module, or an argument is ambiguous.
         """
         super().__init__(net_fields=net_fields, opt_fields=opt_fields, pred_fields=pred_fields)
         names = {
@@ -58,9 +58,9 @@ class ModuleNetwork(TorchNetwork):
         }
         chosen = choose("module", module, {})
         given = [name for name, value in names.items() if value is not None]
-        made = make("module", chosen, **_own_arguments(chosen, given, module_kwargs, arguments))
+        made = make("module", chosen, **_module_arguments(chosen, given, module_kwargs, arguments))
         if not isinstance(made, torch.nn.Module):
-            raise ConfigError(f"{module!r} made a {type(made).__name__}, not a torch.nn.Module.")
+            raise ConfigError(f"{module!r} returned {type(made).__name__}, not a torch.nn.Module.")
         if isinstance(made, TorchNetwork):
             raise ConfigError(
                 f"{type(made).__name__} is a network already: choose it as NetworkConfig.network."
@@ -68,23 +68,23 @@ class ModuleNetwork(TorchNetwork):
         self.module = made
 
     def forward(self, *inputs: torch.Tensor) -> Any:
-        """Return what the module makes of the tensors of `net_fields`."""
+        """Return the module's output for the tensors of `net_fields`."""
         return self.module(*inputs)
 
 
-def _own_arguments(
+def _module_arguments(
     module: Any,
     given: Iterable[str],
     module_kwargs: Mapping[str, Any] | None,
     arguments: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the arguments that are for the module.
+    """Return the arguments of the module.
 
     Args:
         module: Class of the module.
-        given: Names of the arguments that the network took for itself.
-        module_kwargs: Those that are certainly for the module, if the user said so.
-        arguments: Those that the network did not take.
+        given: Names of the arguments that the network takes itself.
+        module_kwargs: Arguments that the user gave for the module, if any.
+        arguments: Other arguments that the network does not take.
     """
     name = getattr(module, "__name__", repr(module))
     if module_kwargs is not None:
@@ -98,7 +98,7 @@ def _own_arguments(
     for option in given:
         if option in taken:
             raise ConfigError(
-                f'{name} takes an argument "{option}" itself, so it is not clear whom it is for. '
+                f'{name} takes an argument "{option}" itself, so it is ambiguous. '
                 f"Put the arguments of {name} into module_kwargs={{...}}."
             )
     return dict(arguments)

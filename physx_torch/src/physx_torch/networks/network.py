@@ -1,4 +1,4 @@
-"""TorchNetwork: what every network of PyTorch has in common."""
+"""TorchNetwork: base class of PyTorch networks."""
 
 from __future__ import annotations
 
@@ -25,22 +25,21 @@ from physx_torch.parallel import join_group
 from physx_torch.storage.parameters import check_match, read_tensors, write_tensors
 
 DATA_TYPES = {"float32": torch.float32, "float64": torch.float64}
-"""Names of the floating types that a network can compute in."""
+"""Floating types that a network can compute in, by name."""
 
 
 class TorchNetwork(torch.nn.Module, Network):
     """Base of PyTorch networks: a module whose inputs and outputs are fields.
 
-    A subclass makes its layers in the constructor and implements ``forward``, which gets the
+    A subclass creates its layers in the constructor and implements ``forward``, which takes the
     tensors of `net_fields` in that order, of shape (samples, *field shape), and returns those of
     `pred_fields`: one tensor, several in that order, or a dictionary by name.
 
     The names of the fields are class attributes of the subclass or arguments of the constructor.
-    Where `opt_fields` are given and `pred_fields` are not, a prediction has the name of the field
-    that it is compared with.
+    If `opt_fields` are given and `pred_fields` are not, predictions are named like their targets.
 
     Attributes:
-        device: Where the parameters are.
+        device: Device of the parameters.
         data_type: Floating type of parameters and tensors.
     """
 
@@ -58,17 +57,17 @@ class TorchNetwork(torch.nn.Module, Network):
         pred_fields: str | Iterable[str] | None = None,
         **kwargs: Any,
     ) -> None:
-        """Keep the names of the fields.
+        """Set the names of the fields.
 
         Args:
-            net_fields: Name or names of the fields that the network reads.
-            opt_fields: Name or names of the fields that the loss compares the prediction with.
-            pred_fields: Name or names of the fields that the network predicts.
+            net_fields: Name or names of the input fields.
+            opt_fields: Name or names of the target fields.
+            pred_fields: Name or names of the predicted fields.
             kwargs: Must be empty; a subclass takes its own options by name.
 
         Raises:
-            UnknownOptionError: An option that no class of the network takes.
-            ConfigError: Names are missing, are given twice, or do not fit together in number.
+            UnknownOptionError: If no class of the network takes an option.
+            ConfigError: If names are missing or duplicate, or their numbers do not match.
         """
         if kwargs:
             raise UnknownOptionError(type(self).__name__, kwargs, options_of(type(self)))
@@ -98,7 +97,7 @@ class TorchNetwork(torch.nn.Module, Network):
         """Join the processes that torchrun started to train this network together.
 
         Raises:
-            ConfigError: The device does not exist, or the processes do not find each other.
+            ConfigError: If the device does not exist, or the processes cannot connect.
         """
         return join_group(device)
 
@@ -106,14 +105,14 @@ class TorchNetwork(torch.nn.Module, Network):
         """Return ``{field: tensor}`` for `pred_fields` from the `net_fields` in `data`.
 
         Raises:
-            MissingFieldError: `data` lacks one of `net_fields`.
-            FieldsMismatchError: ``forward`` returned something else than `pred_fields`.
+            MissingFieldError: If `data` lacks one of `net_fields`.
+            FieldsMismatchError: If ``forward`` does not return `pred_fields`.
         """
         try:
             inputs = [data[name] for name in self.net_fields]
         except KeyError as error:
             raise MissingFieldError(
-                f'{type(self).__name__} reads the field "{error.args[0]}", which is not given. '
+                f'{type(self).__name__} reads the field "{error.args[0]}", which is missing. '
                 f"Given: {listed(data)}.",
                 field=str(error.args[0]),
             ) from None
@@ -123,26 +122,26 @@ class TorchNetwork(torch.nn.Module, Network):
             return self._by_field(self(*inputs))
 
     def forward(self, *inputs: torch.Tensor) -> Any:
-        """Return the tensors of `pred_fields`; what a subclass implements.
+        """Return the tensors of `pred_fields`; implemented by subclasses.
 
         Args:
             inputs: The tensors of `net_fields` in that order, of shape (samples, *field shape).
 
         Raises:
-            UsageError: The subclass does not implement it.
+            UsageError: If the subclass does not implement it.
         """
         raise UsageError(f"{type(self).__name__} does not implement forward().")
 
     def __call__(self, *inputs: Any) -> Any:
-        """Return what ``forward`` makes of the tensors of `net_fields`."""
+        """Return the result of ``forward`` for the tensors of `net_fields`."""
         if self.training and self._training_forward is not None:
             return self._training_forward(*inputs)
         return super().__call__(*inputs)
 
     def set_training_forward(self, forward: Callable[..., Any] | None) -> None:
-        """Choose what takes the place of ``forward`` while the network is trained; None: nothing.
+        """Replace ``forward`` in training mode; None: do not replace it.
 
-        The optimization does so, to compile it or to compute in mixed precision.
+        For optimizations that compile it or compute in mixed precision.
         """
         self._training_forward = forward
 
@@ -159,16 +158,16 @@ class TorchNetwork(torch.nn.Module, Network):
             given = f"{len(output)} values"
         raise FieldsMismatchError(
             f"{type(self).__name__}.forward() does not return its pred_fields",
-            dict.fromkeys(names, f"expected; returned was: {given}"),
+            dict.fromkeys(names, f"expected; returned: {given}"),
         )
 
     def set_train(self) -> None:
-        """Get ready to be trained."""
+        """Switch to training mode."""
         self.train()
 
     def set_eval(self) -> None:
-        """Get ready to predict: no gradients are recorded."""
-        if self.training:  # to look at every layer takes as long as a small network's prediction
+        """Switch to evaluation mode: no gradients are recorded."""
+        if self.training:  # visiting every layer takes as long as a small network's prediction
             self.eval()
 
     def set_device(self, device: str) -> None:
@@ -177,7 +176,7 @@ class TorchNetwork(torch.nn.Module, Network):
         ``"auto"`` is the first CUDA device if there is one, otherwise the processor.
 
         Raises:
-            ConfigError: The device does not exist on this machine, or cannot hold the data type.
+            ConfigError: If the device does not exist, or does not support the data type.
         """
         found = find_device(device)
         _check_type(self.data_type, found)
@@ -188,16 +187,16 @@ class TorchNetwork(torch.nn.Module, Network):
         """Compute in ``"float32"`` or ``"float64"``.
 
         Raises:
-            ConfigError: Another type, or one that the device cannot hold.
+            ConfigError: If it is another type, or the device does not support it.
         """
         if data_type not in DATA_TYPES:
             raise ConfigError(f'data_type is "{data_type}" but must be {listed(DATA_TYPES)}.')
         _check_type(DATA_TYPES[data_type], self.device)
         self.data_type = DATA_TYPES[data_type]
-        self._apply(lambda tensor: _in_precision(tensor, self.data_type))
+        self._apply(lambda tensor: _to_precision(tensor, self.data_type))
 
     def get_parameters(self) -> dict[str, torch.Tensor]:
-        """Return the parameters that are trained by name; they are the network's own."""
+        """Return the trainable parameters by name; they are the network's own."""
         return dict(self.named_parameters())
 
     def get_gradients(self) -> dict[str, torch.Tensor]:
@@ -206,28 +205,28 @@ class TorchNetwork(torch.nn.Module, Network):
         return {name: p.grad for name, p in named if p.grad is not None}
 
     def set_gradients(self, gradients: Mapping[str, torch.Tensor]) -> None:
-        """Take over gradients that `get_gradients` returned; parameters without one get none.
+        """Set the gradients, as returned by `get_gradients`; other parameters get none.
 
         Raises:
-            ValueError: A parameter is missing or has another shape.
+            ValueError: If a parameter is missing or has another shape.
         """
         own = self.get_parameters()
         for name, gradient in gradients.items():
             if name not in own or own[name].shape != gradient.shape:
-                raise ValueError(f"it has no parameter {name} of shape {tuple(gradient.shape)}")
+                raise ValueError(f"there is no parameter {name} of shape {tuple(gradient.shape)}")
         for name, parameter in own.items():
             found = gradients.get(name)
             parameter.grad = None if found is None else found.to(parameter.device, parameter.dtype)
 
     def nb_parameters(self) -> int:
-        """Return how many real numbers the parameters hold; a complex one is two of them."""
+        """Return the number of real numbers in the parameters; a complex one counts as two."""
         return sum(p.numel() * (2 if p.is_complex() else 1) for p in self.parameters())
 
     def save_parameters(self, path: Path) -> None:
         """Write parameters and buffers to a safetensors file.
 
         Raises:
-            CheckpointError: The file cannot be written, or the state holds more than tensors.
+            CheckpointError: If the file cannot be written, or the state contains non-tensors.
         """
         write_tensors(path, self._state())
 
@@ -235,15 +234,15 @@ class TorchNetwork(torch.nn.Module, Network):
         """Read parameters and buffers that `save_parameters` wrote, in any floating type.
 
         Raises:
-            CheckpointError: The file is missing, damaged or of another architecture; the network
-                is unchanged then.
+            CheckpointError: If the file is missing, damaged or of another architecture; the network
+                is not changed then.
         """
         tensors, _ = read_tensors(path)
         check_match(path, type(self).__name__, tensors, self._state())
         self.load_state_dict(tensors)
 
     def _state(self) -> dict[str, Any]:
-        """Return parameters, buffers and extra states, without what a module notes about itself."""
+        """Return parameters, buffers and extra states, without other entries of the state."""
         return {
             name: value
             for name, value in self.state_dict().items()
@@ -253,8 +252,8 @@ class TorchNetwork(torch.nn.Module, Network):
     def numpy_to_tensor(self, batch: Batch) -> Tensors:
         """Return arrays as tensors on the network's device.
 
-        Floating arrays get the network's data type; integers, booleans and complex numbers keep
-        theirs. On the processor a writable array of the right type shares its memory.
+        Floating arrays are converted to the network's data type; integers, booleans and complex
+        numbers keep theirs. On the processor, writable arrays of the right type share memory.
 
         Args:
             batch: Arrays by field, each of shape (samples, *field shape).
@@ -262,18 +261,18 @@ class TorchNetwork(torch.nn.Module, Network):
         return {name: self._tensor(array) for name, array in batch.items()}
 
     def _tensor(self, array: Array) -> torch.Tensor:
-        tensor = torch.from_numpy(_plain(array))
+        tensor = torch.from_numpy(_to_compatible(array))
         if tensor.is_floating_point():
             return tensor.to(self.device, self.data_type)
         return tensor.to(self.device)
 
     def tensor_to_numpy(self, tensors: Tensors) -> Batch:
-        """Return tensors as arrays; those on the processor share their memory."""
+        """Return tensors as arrays; those on the processor share memory."""
         return {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
 
 
-def _plain(array: Array) -> Array:
-    # torch takes neither read-only memory, nor foreign byte orders, nor negative strides.
+def _to_compatible(array: Array) -> Array:
+    # torch accepts neither read-only memory, nor foreign byte orders, nor negative strides.
     flags = array.flags
     regular = flags.writeable and array.dtype.isnative
     if regular and (flags.c_contiguous or min(array.strides) >= 0):
@@ -288,13 +287,13 @@ def _names(
     names = (chosen,) if isinstance(chosen, str) else tuple(chosen)
     if not names or len(set(names)) != len(names) or not all(isinstance(n, str) for n in names):
         raise ConfigError(
-            f"{option} is {chosen!r} but must be a field's name or several that differ."
+            f"{option} is {chosen!r} but must be one field name or several different ones."
         )
     return names
 
 
-def _in_precision(tensor: torch.Tensor, data_type: torch.dtype) -> torch.Tensor:
-    """Return floating and complex tensors in a precision, others as they are."""
+def _to_precision(tensor: torch.Tensor, data_type: torch.dtype) -> torch.Tensor:
+    """Convert floating and complex tensors to a precision; others are not changed."""
     if tensor.is_complex():
         return tensor.to(data_type.to_complex())
     return tensor.to(data_type) if tensor.is_floating_point() else tensor
@@ -302,4 +301,6 @@ def _in_precision(tensor: torch.Tensor, data_type: torch.dtype) -> torch.Tensor:
 
 def _check_type(data_type: torch.dtype, device: torch.device) -> None:
     if device.type == "mps" and data_type == torch.float64:
-        raise ConfigError('The device "mps" has no float64: use float32 or the device "cpu".')
+        raise ConfigError(
+            'The device "mps" does not support float64: use float32 or the device "cpu".'
+        )

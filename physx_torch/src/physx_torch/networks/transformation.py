@@ -1,4 +1,4 @@
-"""TorchTransformation: normalizes what the network reads, and brings predictions back."""
+"""TorchTransformation: normalizes inputs and targets, and denormalizes predictions."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ class _Scale(NamedTuple):
 
 
 class TorchTransformation(Transformation):
-    """Gives the network and the loss each component with mean 0 and standard deviation 1.
+    """Normalizes each component to mean 0 and standard deviation 1 for the network and the loss.
 
     Fields of `net_fields` and `opt_fields` are normalized with their own coefficients; the i-th of
-    `pred_fields` is brought back to physical units with those of the i-th of `opt_fields`. Fields
-    without coefficients stay as they are.
+    `pred_fields` is converted to physical units with those of the i-th of `opt_fields`. Fields
+    without coefficients are not changed.
 
-    All of it is computed in the network's data type: values far from zero that vary little (an
-    offset of 1e6 spreads) lose their last digits in float32 before the mean is subtracted; use
-    float64 for those.
+    Everything is computed in the network's data type: values with a large offset (1e6 standard
+    deviations) lose their last digits in float32 before the mean is subtracted; use float64 for
+    those.
     """
 
     def __init__(self) -> None:
@@ -41,9 +41,9 @@ class TorchTransformation(Transformation):
     def set_normalization(
         self, normalization: Mapping[str, Normalization], network: Network
     ) -> None:
-        """Keep the coefficients as tensors of the network's device and data type.
+        """Set the coefficients as tensors of the network's device and data type.
 
-        Call it again when the network's device or data type has changed.
+        Call it again after changing the network's device or data type.
 
         Args:
             normalization: Mean and standard deviation by field; fields that the network does not
@@ -51,10 +51,10 @@ class TorchTransformation(Transformation):
             network: The network whose fields are transformed.
 
         Raises:
-            ConfigError: The network is not one of PyTorch.
+            ConfigError: If it is not a PyTorch network.
         """
         if not isinstance(network, TorchNetwork):
-            raise ConfigError(f"{type(network).__name__} is no TorchNetwork.")
+            raise ConfigError(f"{type(network).__name__} is not a TorchNetwork.")
         super().set_normalization(normalization, network)
         scales = {name: _scale(item, network) for name, item in normalization.items()}
         self._inputs = {n: scales[n] for n in network.net_fields if n in scales}
@@ -64,13 +64,13 @@ class TorchTransformation(Transformation):
 
     def transform_before_prediction(self, data: Tensors) -> Tensors:
         """Return the data with `net_fields` normalized."""
-        return _normalized(data, self._inputs)
+        return _normalize(data, self._inputs)
 
     def transform_before_loss(
         self, prediction: Tensors, targets: Tensors
     ) -> tuple[Tensors, Tensors]:
-        """Return the prediction as it is, and the targets normalized as the network's own are."""
-        return prediction, _normalized(targets, self._targets)
+        """Return the prediction unchanged, and the targets normalized."""
+        return prediction, _normalize(targets, self._targets)
 
     def transform_before_apply(self, prediction: Tensors) -> Tensors:
         """Return the prediction in physical units."""
@@ -92,7 +92,7 @@ def _scale(item: Normalization, network: TorchNetwork) -> _Scale:
     return _Scale(mean, std)
 
 
-def _normalized(data: Tensors, scales: Mapping[str, _Scale]) -> Tensors:
+def _normalize(data: Tensors, scales: Mapping[str, _Scale]) -> Tensors:
     if not scales:
         return data
     changed = {

@@ -11,41 +11,47 @@ import torch
 from physx_core import Field
 from physx_core.errors import ConfigError, FieldsMismatchError
 from physx_torch.choices import make_activation
-from physx_torch.networks.grid import Border, Layout, border, grid_size, layout, misfits
+from physx_torch.networks.grid import (
+    Border,
+    GridLayout,
+    find_layout,
+    find_mismatches,
+    grid_size,
+    make_border,
+)
 from physx_torch.networks.network import TorchNetwork
 
 Modules = list[torch.nn.Module]
 
 GROUPS = 8
-"""Greatest number of groups of channels that are normalized apart."""
+"""Largest number of groups of channels for group normalization."""
 NORMALIZATIONS = ("none", "batch", "group")
 
 
 class UNet(TorchNetwork):
     """U-shaped convolutional network (Ronneberger et al., 2015) in two or three dimensions.
 
-    On the way down, each step convolves, keeps the result, and halves the grid, with twice as many
-    channels below; on the way up, each step doubles the grid, puts what was kept beside it, and
+    On the way down, each step convolves, stores the result, and halves the grid, with twice as many
+    channels below; on the way up, each step doubles the grid, concatenates the stored result, and
     convolves. Convolutions have kernels of 3 points, and are followed by a normalization and an
     activation.
 
-    Normalization ``"none"``: the layers begin with weights that keep the size of what goes through
-    them (He et al., 2015). ``"batch"``: by the mean and deviation of the batch, and of all batches
-    for predictions: it learns quickly at first, but batches differ, which limits how exact fields
-    become, the more the smaller they are. ``"group"``: by those of each sample alone, in up to 8
-    groups of channels.
+    Normalization ``"none"``: initial weights preserve the variance of activations (He et al.,
+    2015). ``"batch"``: by mean and deviation of the batch, or of all batches for predictions: it
+    trains quickly at first, but varying batch statistics limit the accuracy, the more the smaller
+    the batches. ``"group"``: by those of each sample, in up to 8 groups of channels.
 
-    A sample's field has the shape ``(*grid, channels)``, ``grid`` where there is one channel, or
+    A sample's field has the shape ``(*grid, channels)``, ``grid`` if there is one channel, or
     ``(points, channels)`` with the points of the grid in row-major order. Several `net_fields` are
-    put behind one another as channels; the output's channels are dealt out to `pred_fields`.
-    `UNetTransformation` pads the grid to the least size that the network takes and cuts the
-    prediction out again; ``forward`` itself reads and returns padded grids.
+    concatenated as channels; the output's channels are split into `pred_fields`.
+    `UNetTransformation` pads the grid to the smallest size that the network accepts and crops the
+    prediction; ``forward`` itself reads and returns padded grids.
 
     Attributes:
         size: Points of the grid along each axis; empty before `bind`.
-        borders: How each axis is padded; empty before `bind`.
-        layouts: How each field holds the grid, by name; empty before `bind`.
-        data_scale: What targets are multiplied by.
+        borders: Padding of each axis; empty before `bind`.
+        layouts: Layout of the grid in each field, by name; empty before `bind`.
+        data_scale: Factor of the targets.
     """
 
     default_transformation: ClassVar[str] = "torch/unet"
@@ -68,30 +74,30 @@ class UNet(TorchNetwork):
         input_size: Sequence[int] | None = None,
         **fields: Any,
     ) -> None:
-        """Make the layers.
+        """Create the layers.
 
         Args:
             nb_dims: 2 or 3 axes of the grid.
-            nb_input_channels: Values at each point that the network reads, of all fields.
-            nb_output_channels: Values at each point that it predicts, of all fields.
-            nb_first_layer_channels: Channels of the finest level; each further one has twice that.
-            nb_steps: How often the grid is halved.
+            nb_input_channels: Input values at each point, of all fields.
+            nb_output_channels: Predicted values at each point, of all fields.
+            nb_first_layer_channels: Channels of the finest level; they double with each level.
+            nb_steps: Number of times that the grid is halved.
             two_sublayers: Two convolutions in each level, instead of one.
-            border_mode: ``"valid"``: convolutions take away the outermost points, so that no value
-                depends on what lies beyond the padded grid; ``"same"``: they keep the size, which
+            border_mode: ``"valid"``: convolutions remove the outermost points, so that no value
+                depends on points beyond the padded grid; ``"same"``: they keep the size, which
                 needs less padding.
-            skip_merge: Whether what was kept on the way down is left out on the way up: an
-                encoder and decoder of convolutions.
-            data_scale: What targets are multiplied by for the loss, and predictions divided by.
-            normalization: ``"none"``, ``"batch"`` or ``"group"``, as said above.
+            skip_merge: Whether to leave out the skip connections: a convolutional encoder and
+                decoder.
+            data_scale: Factor of the targets in the loss, by which predictions are divided.
+            normalization: ``"none"``, ``"batch"`` or ``"group"``, as described above.
             activation: Class, or name in `torch.nn` such as ``"SiLU"``.
-            positions: Whether the network also reads where each point is, as one more channel for
-                each axis from -1 to 1: for bodies that are held at some place.
+            positions: Whether the network also reads the position of each point, as one more
+                channel per axis from -1 to 1: for bodies that are fixed somewhere.
             input_size: Points of the grid along each axis; None: taken from the fields' shapes.
             fields: ``net_fields``, ``opt_fields`` and ``pred_fields`` as in `TorchNetwork`.
 
         Raises:
-            ConfigError: An option is not what the network takes.
+            ConfigError: If an option is invalid.
         """
         super().__init__(**fields)
         channels = (nb_input_channels, nb_output_channels)
@@ -101,7 +107,7 @@ class UNet(TorchNetwork):
         self.data_scale = float(data_scale)
         self.size: tuple[int, ...] = ()
         self.borders: list[Border] = []
-        self.layouts: dict[str, Layout] = {}
+        self.layouts: dict[str, GridLayout] = {}
         self._channels = channels
         self._given_size = None if input_size is None else tuple(input_size)
         self._dims, self._steps, self._same = nb_dims, nb_steps, border_mode == "same"
@@ -128,16 +134,16 @@ class UNet(TorchNetwork):
         self.join = torch.nn.ModuleList(self._level(merged * w, w) for w in below[1:])
         self.last = last(first, outputs, kernel_size=1)
         if self._normalization == "none":
-            self._keep_size()
+            self._initialize_weights()
 
-    def _keep_size(self) -> None:
-        """Draw weights with which outputs vary as much as inputs, through all layers."""
+    def _initialize_weights(self) -> None:
+        """Draw weights that preserve the variance of activations through all layers."""
         for name, parameter in self.named_parameters():
             if name.endswith("bias"):
                 torch.nn.init.zeros_(parameter)
             elif name.startswith("up."):  # each value below makes one of each kernel's points
                 torch.nn.init.normal_(parameter, std=parameter.shape[0] ** -0.5)
-            elif parameter.dim() > 1:  # else it belongs to an activation
+            elif parameter.dim() > 1:  # else it is of an activation
                 followed_by: Literal["linear", "relu"] = "linear" if name[:4] == "last" else "relu"
                 torch.nn.init.kaiming_normal_(parameter, nonlinearity=followed_by)
 
@@ -156,7 +162,7 @@ class UNet(TorchNetwork):
         return torch.nn.Sequential(*modules)
 
     def _normalized(self, channels: int) -> Modules:
-        """Return what normalizes the channels of a level."""
+        """Return the normalization layers of a level."""
         if self._normalization == "none":
             return []
         if self._normalization == "group":
@@ -165,30 +171,30 @@ class UNet(TorchNetwork):
         return [batch(channels)]
 
     def bind(self, fields: Mapping[str, Field]) -> None:
-        """Learn the grid from the fields before the first batch.
+        """Set the grid from the fields before the first batch.
 
         Raises:
-            FieldsMismatchError: A field is missing, holds another grid, or the fields have not as
-                many channels as the network.
+            FieldsMismatchError: If a field is missing, has another grid, or the fields do not have
+                as many channels as the network.
         """
         super().bind(fields)
         mine = {name: fields[name] for name in (*self.net_fields, *self.opt_fields)}
         self.size = self._given_size or self._size_of(mine[self.net_fields[0]])
-        wrong = misfits(mine, self.size)
+        wrong = find_mismatches(mine, self.size)
         if wrong:
             raise FieldsMismatchError("UNet needs values on one grid", wrong)
-        found = {name: layout(field, self.size) for name, field in mine.items()}
+        found = {name: find_layout(field, self.size) for name, field in mine.items()}
         self.layouts = {name: item for name, item in found.items() if item is not None}
         self._check_channels("nb_input_channels", self._channels[0], self.net_fields)
         self._check_channels("nb_output_channels", self._channels[1], self.opt_fields)
         self.borders = [
-            border(points, self._steps, self._sublayers, self._same) for points in self.size
+            make_border(points, self._steps, self._sublayers, self._same) for points in self.size
         ]
 
     def _size_of(self, field: Field) -> tuple[int, ...]:
         size = grid_size(field.shape or (), self._dims)
         if size is None:
-            text = f"shape {field.shape} shows no grid of {self._dims} axes: give input_size"
+            text = f"shape {field.shape} is not a grid of {self._dims} axes: give input_size"
             raise FieldsMismatchError("UNet needs values on a grid", {field.name: text})
         return size
 
@@ -210,7 +216,7 @@ class UNet(TorchNetwork):
         x = inputs[0] if len(inputs) == 1 else torch.cat(inputs, dim=-1)
         x = x.to(self.last.weight.dtype).movedim(-1, 1)
         if self._positions:
-            x = torch.cat([x, _places(x)], dim=1)
+            x = torch.cat([x, _grid_positions(x)], dim=1)
         kept: list[torch.Tensor] = []
         for level in self.down[:-1]:
             x = level(x)
@@ -219,15 +225,15 @@ class UNet(TorchNetwork):
         x = self.down[-1](x)
         for up, join in zip(self.up, self.join, strict=True):
             x, left = up(x), kept.pop()
-            x = join(torch.cat([_middle(left, x), x], dim=1) if self._merges else x)
+            x = join(torch.cat([_crop_center(left, x), x], dim=1) if self._merges else x)
         output = self.last(x).movedim(1, -1)
         if len(self.opt_fields) == 1:
             return output
         return list(output.split([self.layouts[name].channels for name in self.opt_fields], -1))
 
 
-def _middle(tensor: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """Return the middle part of a tensor (samples, channels, *axes) that is as large as another."""
+def _crop_center(tensor: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """Crop a tensor (samples, channels, *axes) to the center part with the size of another."""
     for axis in range(2, tensor.dim()):
         surplus = tensor.shape[axis] - like.shape[axis]
         if surplus:
@@ -235,14 +241,14 @@ def _middle(tensor: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
     return tensor
 
 
-def _places(like: torch.Tensor) -> torch.Tensor:
-    """Return the place of each point, from -1 to 1 along each axis, (samples, axes, *axes)."""
+def _grid_positions(like: torch.Tensor) -> torch.Tensor:
+    """Return the position of each point, from -1 to 1 along each axis, (samples, axes, *axes)."""
     axes = [
         torch.linspace(-1, 1, points, dtype=like.dtype, device=like.device)
         for points in like.shape[2:]
     ]
-    places = torch.stack(torch.meshgrid(*axes, indexing="ij"))
-    return places.expand(like.shape[0], *places.shape)
+    positions = torch.stack(torch.meshgrid(*axes, indexing="ij"))
+    return positions.expand(like.shape[0], *positions.shape)
 
 
 def _positive(value: Any) -> bool:

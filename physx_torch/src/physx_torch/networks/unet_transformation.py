@@ -1,4 +1,4 @@
-"""UNetTransformation: pads grids for a UNet, and cuts its predictions out again."""
+"""UNetTransformation: pads grids for a UNet, and crops its predictions."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from physx_torch.networks.unet import UNet
 
 
 class UNetTransformation(TorchTransformation):
-    """Normalizes as `TorchTransformation` does, and brings fields to the grid that a `UNet` takes.
+    """Normalizes as `TorchTransformation` does, and converts fields to the grid of a `UNet`.
 
-    What the network reads is padded with zeros to the least size that it takes. Predictions are
-    cut to the grid and have the shape of the field that they are compared with: each value is
-    where its point was. Targets are multiplied by `UNet.data_scale`, predictions divided by it.
+    Inputs are padded with zeros to the smallest size that the network accepts. Predictions are
+    cropped to the grid and get the shape of their target field, each value at its point. Targets
+    are multiplied by `UNet.data_scale`, predictions divided by it.
     """
 
     def __init__(self) -> None:
@@ -27,13 +27,13 @@ class UNetTransformation(TorchTransformation):
     def set_normalization(
         self, normalization: Mapping[str, Normalization], network: Network
     ) -> None:
-        """Keep the coefficients and the network, whose fields are bound already.
+        """Set the coefficients and the network, whose fields are bound already.
 
         Raises:
-            ConfigError: The network is no UNet.
+            ConfigError: If the network is not a UNet.
         """
         if not isinstance(network, UNet):
-            raise ConfigError(f"{type(network).__name__} is no UNet: leave out its transformation.")
+            raise ConfigError(f"{type(network).__name__} is not a UNet: omit its transformation.")
         super().set_normalization(normalization, network)
         self._network = network
 
@@ -53,7 +53,7 @@ class UNetTransformation(TorchTransformation):
         self, prediction: Tensors, targets: Tensors
     ) -> tuple[Tensors, Tensors]:
         """Return the prediction in the fields' shapes, and the targets normalized and scaled."""
-        prediction, targets = super().transform_before_loss(self._cut(prediction), targets)
+        prediction, targets = super().transform_before_loss(self._crop(prediction), targets)
         scale = self._unet().data_scale
         if scale != 1:
             targets = {name: values * scale for name, values in targets.items()}
@@ -61,13 +61,13 @@ class UNetTransformation(TorchTransformation):
 
     def transform_before_apply(self, prediction: Tensors) -> Tensors:
         """Return the prediction in the fields' shapes and in physical units."""
-        prediction = self._cut(prediction)
+        prediction = self._crop(prediction)
         scale = self._unet().data_scale
         if scale != 1:
             prediction = {name: values / scale for name, values in prediction.items()}
         return super().transform_before_apply(prediction)
 
-    def _cut(self, prediction: Tensors) -> Tensors:
+    def _crop(self, prediction: Tensors) -> Tensors:
         network = self._unet()
         pairs = zip(network.pred_fields, network.opt_fields, strict=True)
         fields = {

@@ -1,4 +1,4 @@
-"""Parameter files: a module's parameters and buffers in safetensors, which runs no code."""
+"""Parameter files: a module's parameters and buffers as safetensors, which contain no code."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def write_tensors(
 
     Args:
         path: The file; an existing one is replaced.
-        tensors: Tensors by name. Those that share memory are written one by one.
-        metadata: Texts that the file holds beside them.
+        tensors: Tensors by name. Those that share memory are written separately.
+        metadata: Further strings to write.
 
     Raises:
-        CheckpointError: An entry is no tensor, or the file cannot be written.
+        CheckpointError: If an entry is not a tensor, or the file cannot be written.
     """
     for name, value in tensors.items():
         if not isinstance(value, torch.Tensor):
             raise CheckpointError(
-                f'"{name}" is a {type(value).__name__}; a checkpoint only holds tensors. '
+                f'"{name}" is a {type(value).__name__}; a checkpoint contains tensors only. '
                 "Register it as a buffer of the module, or pass it to the constructor."
             )
     plain = {
@@ -43,10 +43,10 @@ def write_tensors(
 
 
 def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Return the tensors and the texts of a safetensors file, the tensors on the processor.
+    """Return the tensors, on the processor, and the metadata of a safetensors file.
 
     Raises:
-        CheckpointError: The file is missing or damaged.
+        CheckpointError: If the file is missing or damaged.
     """
     if not path.is_file():
         raise CheckpointError(f"There is no file {path}.")
@@ -56,11 +56,11 @@ def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
             return tensors, file.metadata() or {}
     except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} is damaged or no safetensors file: {error}.") from error
+        raise CheckpointError(f"{path} is damaged or not a safetensors file: {error}.") from error
 
 
 def check_match(path: Path, name: str, found: Mapping[str, Any], own: Mapping[str, Any]) -> None:
-    """Check that tensors of a file are those of a network, by name and shape.
+    """Check that the tensors of a file fit a network, by name and shape.
 
     Args:
         path: The file, for the message.
@@ -69,7 +69,7 @@ def check_match(path: Path, name: str, found: Mapping[str, Any], own: Mapping[st
         own: Tensors of the network.
 
     Raises:
-        CheckpointError: They differ; the message names each tensor that does.
+        CheckpointError: If they differ; the message lists the differences.
     """
     lines = [f"{key}: not in the file" for key in own if key not in found]
     lines += [f"{key}: only in the file" for key in found if key not in own]
@@ -80,6 +80,6 @@ def check_match(path: Path, name: str, found: Mapping[str, Any], own: Mapping[st
     ]
     if lines:
         raise CheckpointError(
-            f"{path} holds the parameters of another network than this {name}:\n  "
+            f"{path} contains the parameters of another network than this {name}:\n  "
             + "\n  ".join(lines)
         )

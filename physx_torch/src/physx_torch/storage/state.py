@@ -1,4 +1,4 @@
-"""State files: nested plain data with tensors in them, in safetensors, which runs no code."""
+"""State files: nested plain data and tensors as safetensors, which contain no code."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _KEY = "state"
 
 
 def write_state(path: Path, state: Mapping[str, Any]) -> None:
-    """Write dictionaries, lists, numbers, texts and tensors, nested in any way.
+    """Write nested dictionaries, lists, numbers, strings and tensors.
 
     Raises:
-        CheckpointError: There is something else in it, or the file cannot be written.
+        CheckpointError: If the state contains anything else, or the file cannot be written.
     """
     tensors: dict[str, torch.Tensor] = {}
     plain = _split(state, "", tensors)
@@ -27,21 +27,21 @@ def write_state(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Return what `write_state` wrote; tuples have become lists.
+    """Return the state that `write_state` wrote, with tuples as lists.
 
     Raises:
-        CheckpointError: The file is missing, damaged or holds something else.
+        CheckpointError: If the file is missing, damaged or does not contain a state.
     """
     tensors, texts = read_tensors(path)
     try:
         state: dict[str, Any] = _join(json.loads(texts[_KEY]), tensors)
     except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{path} holds no state of an optimization.") from error
+        raise CheckpointError(f"{path} does not contain the state of an optimization.") from error
     return state
 
 
 def random_state(device: torch.device) -> dict[str, torch.Tensor]:
-    """Return the state of the random numbers that torch draws on a device and the processor."""
+    """Return the state of torch's random numbers on a device and the processor."""
     state = {"cpu": torch.get_rng_state()}
     if device.type == "cuda":
         state["cuda"] = torch.cuda.get_rng_state(device)
@@ -49,7 +49,7 @@ def random_state(device: torch.device) -> dict[str, torch.Tensor]:
 
 
 def set_random_state(state: Mapping[str, torch.Tensor], device: torch.device) -> None:
-    """Let torch go on drawing random numbers where `random_state` was called."""
+    """Restore the state of torch's random numbers that `random_state` returned."""
     torch.set_rng_state(state["cpu"])
     if device.type == "cuda" and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"], device)
@@ -68,7 +68,7 @@ def _split(value: Any, where: str, tensors: dict[str, torch.Tensor]) -> dict[str
         return {"value": value}
     raise CheckpointError(
         f'"{where}" of the optimization\'s state is a {type(value).__name__}, which cannot be '
-        "written without running code when it is read."
+        "stored without code."
     )
 
 

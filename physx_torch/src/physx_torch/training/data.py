@@ -1,4 +1,4 @@
-"""StoredDataset: a stored dataset as PyTorch's `DataLoader` takes it."""
+"""StoredDataset: a stored dataset for PyTorch's `DataLoader`."""
 
 from __future__ import annotations
 
@@ -16,16 +16,15 @@ Tensors = dict[str, torch.Tensor]
 
 
 class StoredDataset(torch.utils.data.Dataset[Tensors]):
-    """The samples of one mode of a dataset, by their number.
+    """The samples of one mode of a dataset, by index.
 
     Works with any number of `DataLoader` workers, forked or spawned: each process opens the dataset
-    when it first reads, and what is pickled is only where it lies. The processes share the system's
-    memory for the files, however many they are::
+    on its first read, and only the path is pickled. All processes share the system's file cache::
 
         samples = StoredDataset("sessions/run", "training", dtype="float32")
         for batch in DataLoader(samples, batch_size=32, shuffle=True, num_workers=2): ...
 
-    For large batches, let PyTorch ask for whole batches, which it then has not to put together::
+    For large batches, let PyTorch request whole batches, which it need not assemble::
 
         sampler = BatchSampler(RandomSampler(samples), 1024, drop_last=False)
         for batch in DataLoader(samples, batch_size=None, sampler=sampler, num_workers=2): ...
@@ -35,7 +34,7 @@ class StoredDataset(torch.utils.data.Dataset[Tensors]):
     Attributes:
         directory: The dataset's folder, absolute.
         mode: The mode.
-        fields: Names of the fields that samples hold.
+        fields: Names of the samples' fields.
     """
 
     def __init__(
@@ -45,17 +44,17 @@ class StoredDataset(torch.utils.data.Dataset[Tensors]):
         fields: Sequence[str] | None = None,
         dtype: DTypeLike | None = None,
     ) -> None:
-        """Look which samples there are; those that come later are not seen.
+        """Select the current samples; later ones are not included.
 
         Args:
-            directory: The dataset's folder, or the session's folder that holds it.
+            directory: The dataset's folder, or the session's folder that contains it.
             mode: The mode.
-            fields: Names of the fields to give; None: all of them.
-            dtype: NumPy type that floating fields are given in; None: their own.
+            fields: Names of the fields to read; None: all.
+            dtype: NumPy type of floating fields; None: their own.
 
         Raises:
-            DatasetNotFoundError: There is no dataset.
-            DatasetError: There is no such mode or field, or a partition is missing or damaged.
+            DatasetNotFoundError: If there is no dataset.
+            DatasetError: If there is no such mode or field, or a partition is missing or damaged.
         """
         with Dataset.open(directory) as dataset:
             self.directory, self.mode = dataset.directory.absolute(), mode
@@ -70,14 +69,14 @@ class StoredDataset(torch.utils.data.Dataset[Tensors]):
         return self._length
 
     def __getitem__(self, index: Any) -> Tensors:
-        """Return one sample for a number, and a batch for several numbers.
+        """Return one sample for an index, and a batch for several indices.
 
         Args:
-            index: A number, a slice, or a list, array or tensor of numbers.
+            index: An index, a slice, or a list, array or tensor of indices.
 
         Raises:
-            IndexError: There is no such sample.
-            DatasetError: A partition is missing, truncated or damaged.
+            IndexError: If there is no such sample.
+            DatasetError: If a partition is missing, truncated or damaged.
         """
         if isinstance(index, (int, np.integer)):
             return {name: values[0] for name, values in self._batch([int(index)]).items()}
@@ -86,7 +85,7 @@ class StoredDataset(torch.utils.data.Dataset[Tensors]):
         return self._batch(index)
 
     def __getitems__(self, indices: Sequence[int]) -> list[Tensors]:
-        """Return several samples, read at once: what `DataLoader` calls for a batch."""
+        """Return several samples, read at once; called by `DataLoader` for a batch."""
         batch = self._batch(indices)
         columns = zip(*(values.unbind() for values in batch.values()), strict=True)
         return [dict(zip(batch, row, strict=True)) for row in columns]
@@ -102,11 +101,9 @@ class StoredDataset(torch.utils.data.Dataset[Tensors]):
         if self._opened is None:
             self._opened = Dataset.open(self.directory)
         columns = self._opened[self.mode]
-        return {
-            name: torch.from_numpy(self._converted(columns[name][rows])) for name in self.fields
-        }
+        return {name: torch.from_numpy(self._convert(columns[name][rows])) for name in self.fields}
 
-    def _converted(self, values: Any) -> Any:
+    def _convert(self, values: Any) -> Any:
         if self._dtype is None or values.dtype.kind != "f":
             return values
         return values.astype(self._dtype, copy=False)

@@ -21,16 +21,21 @@ from physx_core.errors import (
     listed,
 )
 from physx_core.typing import Tensors
-from physx_torch.choices import choose, classes_in, make
+from physx_torch.choices import choose, find_classes, make
 from physx_torch.networks.network import TorchNetwork
-from physx_torch.parallel import average_gradients, take_first_values
+from physx_torch.parallel import average_gradients, broadcast_parameters
 from physx_torch.storage.state import random_state, read_state, set_random_state, write_state
-from physx_torch.training.training_forward import PRECISIONS, Forward, compiled, in_precision
+from physx_torch.training.training_forward import (
+    PRECISIONS,
+    Forward,
+    compile_forward,
+    run_in_precision,
+)
 
 Loss = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
-def _forget_gradients(optimizer: torch.optim.Optimizer) -> None:
+def _clear_gradients(optimizer: torch.optim.Optimizer) -> None:
     # As optimizer.zero_grad() does, without its hooks: they take as long as a small network.
     for group in optimizer.param_groups:
         for parameter in group["params"]:
@@ -47,7 +52,7 @@ class TorchOptimization(Optimization):
     Attributes:
         loss: The loss function; None before `set_loss`.
         optimizer: The optimizer; None before `set_optimizer`.
-        scheduler: Changes the learning rate after each epoch; None where it stays.
+        scheduler: Scheduler of the learning rate; None if the rate is constant.
     """
 
     state_file: ClassVar[str] = "optimization.safetensors"
@@ -60,22 +65,22 @@ class TorchOptimization(Optimization):
         compile: bool | str = False,
         loss_kwargs: Mapping[str, Any] | None = None,
     ) -> None:
-        """Keep the options.
+        """Set the options.
 
         Args:
-            gradient_clip: Longest Euclidean norm of all gradients together; longer ones are
-                scaled down to it. None: they are taken as they are.
-            accumulate: Batches whose mean gradient makes one step of the optimizer. Those left at
-                the end of an epoch wait for the next one's.
-            mixed_precision: ``"bfloat16"`` or ``"float16"``: the network computes in it what needs
-                no more digits, while it is trained; parameters and loss stay float32. Gradients
-                are scaled for float16, which has a small range. None: all in the network's type.
-            compile: Whether ``torch.compile`` makes the network faster while it is trained, or the
-                name of the backend that does; True is ``"inductor"``.
-            loss_kwargs: Keyword arguments of the loss, where it is a class.
+            gradient_clip: Largest Euclidean norm of all gradients together, to which larger ones
+                are scaled down. None: no limit.
+            accumulate: Number of batches whose mean gradient is used in one step of the optimizer.
+                Batches left at the end of an epoch are continued in the next one.
+            mixed_precision: ``"bfloat16"`` or ``"float16"``: type of those operations that do not
+                need more digits, in training; parameters and loss stay float32. Gradients are
+                scaled for float16, which has a small range. None: all in the network's type.
+            compile: Whether to compile the network for training with ``torch.compile``, or the
+                name of its backend; True is ``"inductor"``.
+            loss_kwargs: Keyword arguments of the loss, if it is a class.
 
         Raises:
-            ConfigError: An option has an unfit value.
+            ConfigError: If an option is invalid.
         """
         if gradient_clip is not None and not gradient_clip > 0:
             raise ConfigError(f"gradient_clip is {gradient_clip!r} but must be positive.")
@@ -105,55 +110,55 @@ class TorchOptimization(Optimization):
                 class; a module; or a function of prediction and target.
 
         Raises:
-            ConfigError: There is no such loss, it refuses `loss_kwargs`, or none was given.
+            ConfigError: If there is no such loss, it rejects `loss_kwargs`, or none was given.
         """
-        known = classes_in(torch.nn.modules.loss, torch.nn.Module)
+        known = find_classes(torch.nn.modules.loss, torch.nn.Module)
         if loss is None:
             raise ConfigError('A training needs a loss, for example loss="MSELoss".')
         chosen = choose("loss", loss, known)
         if isinstance(chosen, type):
             chosen = make("loss", chosen, **self._loss_kwargs)
         elif self._loss_kwargs:
-            raise ConfigError(f"loss_kwargs are for a loss that is a class, not {chosen!r}.")
+            raise ConfigError(f"loss_kwargs needs a loss that is a class, not {chosen!r}.")
         if not callable(chosen):
             raise ConfigError(f"The loss {loss!r} cannot be called with prediction and target.")
         self.loss = chosen
         self._place_loss()
 
     def _place_loss(self) -> None:
-        # Losses may hold tensors of their own, for example weights of classes.
+        # Losses may have tensors of their own, for example class weights.
         if isinstance(self.loss, torch.nn.Module) and self._network is not None:
             self.loss.to(self._network.device, self._network.data_type)
 
     def set_optimizer(
         self, optimizer: str | type[Any] | None, network: Network, **kwargs: Any
     ) -> None:
-        """Choose the optimizer, and how the network computes while it is trained.
+        """Choose the optimizer, and compile the network as configured.
 
         Args:
             optimizer: Class, name in `torch.optim` such as ``"Adam"``, or
                 ``"package.module:Class"``.
-            network: Whose parameters are changed.
+            network: The network to train.
             kwargs: Arguments of the optimizer, ``lr`` among them.
 
         Raises:
-            ConfigError: There is no such optimizer, it refuses the arguments, the network has no
-                parameters, or cannot compute as the options say.
+            ConfigError: If there is no such optimizer, it rejects the arguments, the network has no
+                parameters, or it does not support the options.
         """
         if optimizer is None:
             raise ConfigError('A training needs an optimizer, for example optimizer="Adam".')
         if not isinstance(network, TorchNetwork):
-            raise ConfigError(f"{type(network).__name__} is no TorchNetwork.")
-        chosen = choose("optimizer", optimizer, classes_in(torch.optim, torch.optim.Optimizer))
+            raise ConfigError(f"{type(network).__name__} is not a TorchNetwork.")
+        chosen = choose("optimizer", optimizer, find_classes(torch.optim, torch.optim.Optimizer))
         trained = [p for p in network.parameters() if p.requires_grad]
         made = make("optimizer", chosen, trained, **kwargs)
         if not isinstance(made, torch.optim.Optimizer):
-            raise ConfigError(f"{optimizer!r} made a {type(made).__name__}, not an optimizer.")
+            raise ConfigError(f"{optimizer!r} returned {type(made).__name__}, not an optimizer.")
         closure = inspect.signature(made.step).parameters.get("closure")
         if closure is not None and closure.default is inspect.Parameter.empty:
             raise ConfigError(
                 f"{type(made).__name__} evaluates the loss several times in a step, which physx "
-                "does not do. Choose another optimizer."
+                "does not support. Choose another optimizer."
             )
         self.optimizer = made
         self._network = network
@@ -163,12 +168,12 @@ class TorchOptimization(Optimization):
     def _set_forward(self, network: TorchNetwork) -> None:
         forward: Forward | None = None
         if self._backend:
-            forward = compiled(network.forward, self._backend)
+            forward = compile_forward(network.forward, self._backend)
         if self._precision is not None:
             if network.data_type != torch.float32:
                 raise ConfigError('mixed_precision needs data_type="float32".')
             device = network.device
-            forward = in_precision(
+            forward = run_in_precision(
                 forward or network.forward, device, self._precision, network.data_type
             )
             if self._precision == torch.float16:
@@ -176,24 +181,24 @@ class TorchOptimization(Optimization):
         network.set_training_forward(forward)
 
     def set_scheduler(self, scheduler: str | type[Any], **kwargs: Any) -> None:
-        """Choose what changes the learning rate after each epoch.
+        """Choose the scheduler of the learning rate.
 
         Args:
             scheduler: Class, or name in `torch.optim.lr_scheduler` such as
-                ``"CosineAnnealingLR"``. ``"ReduceLROnPlateau"`` looks at the loss of the
-                validation, or else at the mean training loss of the epoch.
+                ``"CosineAnnealingLR"``. ``"ReduceLROnPlateau"`` takes the validation loss,
+                or else the mean training loss of the epoch.
             kwargs: Arguments of the scheduler.
 
         Raises:
-            ConfigError: There is no such scheduler, or it refuses the arguments.
-            UsageError: There is no optimizer yet.
+            ConfigError: If there is no such scheduler, or it rejects the arguments.
+            UsageError: If there is no optimizer yet.
         """
         if self.optimizer is None:
             raise UsageError("set_scheduler() needs set_optimizer() before it.")
-        chosen = choose("scheduler", scheduler, classes_in(torch.optim.lr_scheduler, LRScheduler))
+        chosen = choose("scheduler", scheduler, find_classes(torch.optim.lr_scheduler, LRScheduler))
         made = make("scheduler", chosen, self.optimizer, **kwargs)
         if not isinstance(made, LRScheduler):
-            raise ConfigError(f"{scheduler!r} made a {type(made).__name__}, not a scheduler.")
+            raise ConfigError(f"{scheduler!r} returned {type(made).__name__}, not a scheduler.")
         self.scheduler = made
 
     def compute_loss(self, prediction: Tensors, targets: Tensors, data: Tensors) -> torch.Tensor:
@@ -205,8 +210,8 @@ class TorchOptimization(Optimization):
             data: The whole batch; not used.
 
         Raises:
-            UsageError: Loss or optimizer were not chosen yet.
-            FieldsMismatchError: A prediction has another shape than what it is compared with.
+            UsageError: If loss or optimizer were not chosen yet.
+            FieldsMismatchError: If the shapes of a prediction and its target differ.
         """
         if self.loss is None or self._network is None:
             raise UsageError("compute_loss() needs set_loss() and set_optimizer() before it.")
@@ -214,7 +219,7 @@ class TorchOptimization(Optimization):
         names = zip(self._network.pred_fields, self._network.opt_fields, strict=True)
         for pred_name, opt_name in names:
             pred, target = prediction[pred_name], targets[opt_name]
-            # With class indices, which are integers, the shapes differ rightly.
+            # Targets that are class indices, which are integers, have other shapes.
             if pred.shape != target.shape and target.is_floating_point():
                 text = f'shape {tuple(pred.shape)}, but "{opt_name}" has {tuple(target.shape)}'
                 raise FieldsMismatchError("Prediction and target differ", {pred_name: text})
@@ -226,29 +231,33 @@ class TorchOptimization(Optimization):
         return {"loss": loss.item()}
 
     def optimize(self, loss: torch.Tensor) -> None:
-        """Change the parameters along the gradient of the loss, or of several batches' mean loss.
+        """Update the parameters along the gradient of the loss, or of the mean of several batches.
 
         Raises:
-            UsageError: There is no optimizer yet.
+            UsageError: If there is no optimizer yet.
         """
-        if self.optimizer is None or self._network is None:
-            raise UsageError("optimize() needs set_optimizer() before it.")
+        optimizer, network = self._prepared("optimize")
         if self._accumulated == 0:
-            _forget_gradients(self.optimizer)
+            _clear_gradients(optimizer)
         if self._accumulate > 1:
             loss = loss / self._accumulate
         if self._scaler is not None:
             loss = self._scaler.scale(loss)
         loss.backward()
         if self._is_shared:
-            average_gradients(self._network)
+            average_gradients(network)
         self._accumulated += 1
         if self._accumulated >= self._accumulate:
             self._accumulated = 0
-            self._step(self.optimizer, self._network)
+            self._step(optimizer, network)
+
+    def _prepared(self, method: str) -> tuple[torch.optim.Optimizer, TorchNetwork]:
+        if self.optimizer is None or self._network is None:
+            raise UsageError(f"{method}() needs set_optimizer() before it.")
+        return self.optimizer, self._network
 
     def _step(self, optimizer: torch.optim.Optimizer, network: TorchNetwork) -> None:
-        """Change the parameters along the gradients that they have."""
+        """Update the parameters along their gradients."""
         if self._gradient_clip is not None:
             if self._scaler is not None:
                 self._scaler.unscale_(optimizer)
@@ -260,16 +269,15 @@ class TorchOptimization(Optimization):
             self._scaler.update()
 
     def join(self, group: Group) -> None:
-        """Use the mean of the gradients of all processes from here on; see `Optimization.join`.
+        """Average the gradients of all processes from now on; see `Optimization.join`.
 
         Raises:
-            UsageError: There is no optimizer yet.
+            UsageError: If there is no optimizer yet.
         """
-        if self._network is None:
-            raise UsageError("join() needs set_optimizer() before it.")
+        _, network = self._prepared("join")
         self._is_shared = group.size > 1
         if self._is_shared:
-            take_first_values(self._network)
+            broadcast_parameters(network)
 
     def __str__(self) -> str:
         scheduler = type(self.scheduler).__name__ if self.scheduler is not None else "no scheduler"
@@ -282,7 +290,7 @@ class TorchOptimization(Optimization):
         return float(self.optimizer.param_groups[0]["lr"])
 
     def epoch_end(self, loss: float) -> None:
-        """Let the scheduler change the learning rate; see `Optimization.epoch_end`."""
+        """Step the scheduler; see `Optimization.epoch_end`."""
         if isinstance(self.scheduler, ReduceLROnPlateau):
             if not math.isnan(loss):
                 self.scheduler.step(loss)
@@ -293,47 +301,45 @@ class TorchOptimization(Optimization):
         """Write the state of optimizer, scheduler, unfinished step and torch's random numbers.
 
         Raises:
-            UsageError: There is no optimizer yet.
-            CheckpointError: A part of the state cannot be written as plain data.
+            UsageError: If there is no optimizer yet.
+            CheckpointError: If a part of the state is neither plain data nor a tensor.
         """
-        if self.optimizer is None or self._network is None:
-            raise UsageError("save_state() needs set_optimizer() before it.")
+        optimizer, network = self._prepared("save_state")
         state: dict[str, Any] = {
             "kinds": self._kinds(),
-            "optimizer": self.optimizer.state_dict(),
-            "random": random_state(self._network.device),
+            "optimizer": optimizer.state_dict(),
+            "random": random_state(network.device),
         }
         for name, item in (("scheduler", self.scheduler), ("scaler", self._scaler)):
             if item is not None:
                 state[name] = item.state_dict()
         if self._accumulated:
             state["accumulated"] = self._accumulated
-            state["gradients"] = self._network.get_gradients()
+            state["gradients"] = network.get_gradients()
         write_state(path, state)
 
     def load_state(self, path: Path) -> None:
-        """Go on where `save_state` was called, also with torch's random numbers.
+        """Restore the state that `save_state` wrote, including torch's random numbers.
 
         Raises:
-            UsageError: There is no optimizer yet.
-            CheckpointError: The file is missing, damaged, or of another optimizer or scheduler.
+            UsageError: If there is no optimizer yet.
+            CheckpointError: If the file is missing, damaged, or of another optimizer or scheduler.
         """
-        if self.optimizer is None or self._network is None:
-            raise UsageError("load_state() needs set_optimizer() before it.")
+        optimizer, network = self._prepared("load_state")
         state = read_state(path)
         if state.get("kinds") != self._kinds():
             found, own = (" and ".join(kinds) for kinds in (state.get("kinds", []), self._kinds()))
-            raise CheckpointError(f"{path} holds the state of {found or 'nothing'}, not of {own}.")
+            raise CheckpointError(f"{path} is the state of {found or 'nothing'}, not of {own}.")
         try:
-            self.optimizer.load_state_dict(state["optimizer"])
+            optimizer.load_state_dict(state["optimizer"])
             self._accumulated = state.get("accumulated", 0)
-            self._network.set_gradients(state.get("gradients", {}))
+            network.set_gradients(state.get("gradients", {}))
         except (KeyError, ValueError) as error:
             raise CheckpointError(f"{path} is of another network: {error}.") from error
         for name, item in (("scheduler", self.scheduler), ("scaler", self._scaler)):
             if item is not None:
                 item.load_state_dict(state[name])
-        set_random_state(state["random"], self._network.device)
+        set_random_state(state["random"], network.device)
 
     def _kinds(self) -> list[str]:
         used = (self.optimizer, self.scheduler, self._scaler)

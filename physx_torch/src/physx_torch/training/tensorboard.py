@@ -1,4 +1,4 @@
-"""TensorBoard: the observer that writes what TensorBoard shows."""
+"""TensorBoard: an observer that writes statistics and geometry for TensorBoard."""
 
 from __future__ import annotations
 
@@ -21,26 +21,25 @@ from physx_core.typing import Array
 class TensorBoard(Visualizer):
     """Writes numbers, histograms, point clouds and meshes to ``stats/tensorboard`` of the session.
 
-    ``physx stats SESSION --tensorboard`` shows them; nothing is opened by itself. TensorBoard draws
-    a thousand points of a curve at most, and each costs as much as a small batch: so of the numbers
-    of batches, some in a second are written, while ``stats/scalars.csv`` holds all of them.
+    ``physx stats SESSION --tensorboard`` shows them. TensorBoard draws at most a thousand points of
+    a curve, and writing one takes as long as a small batch, so only some numbers of batches are
+    written per second, while ``stats/scalars.csv`` contains all of them.
 
-    Chosen as `EnvironmentConfig.visualizer` it also shows the points and meshes that environments
-    draw.
+    As `EnvironmentConfig.visualizer` it also shows the points and meshes of environments.
     """
 
     def __init__(self, interval: float = 0.1, drawing_interval: float = 1.0) -> None:
-        """Keep the options.
+        """Set the options.
 
         Args:
             interval: Least time in s between two points of a curve over batches.
             drawing_interval: Least time in s between two pictures of one drawn object.
 
         Raises:
-            ConfigError: A time is negative.
+            ConfigError: If a time is negative.
         """
         if interval < 0 or drawing_interval < 0:
-            raise ConfigError("interval and drawing_interval are times in s, at least 0.")
+            raise ConfigError("interval and drawing_interval must be at least 0 (s).")
         self._interval, self._drawing_interval = interval, drawing_interval
         self._writer: Any = None
         self._waiting: dict[str, tuple[float, int]] = {}
@@ -49,10 +48,10 @@ class TensorBoard(Visualizer):
         self._drawn: dict[str, float] = {}
 
     def open(self, run_name: str, session_dir: Path, instance_nb: int) -> None:
-        """Begin a file beside those of earlier runs of the session.
+        """Start a file beside those of earlier runs of the session.
 
         Raises:
-            MissingLibraryError: TensorBoard is not installed.
+            MissingLibraryError: If TensorBoard is not installed.
         """
         try:
             from torch.utils.tensorboard import SummaryWriter
@@ -64,7 +63,7 @@ class TensorBoard(Visualizer):
         self._writer = SummaryWriter(str(folder), max_queue=1000, flush_secs=5)
 
     def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
-        """Write the numbers; those of a batch that comes soon after another one wait."""
+        """Write the numbers; those of batches at limited rate."""
         if self._writer is None:
             return
         self._waiting.update((name, (value, step)) for name, value in values.items())
@@ -79,7 +78,7 @@ class TensorBoard(Visualizer):
         self._waiting.clear()
 
     def histograms(self, values: Mapping[str, Array], step: int, timeline: str) -> None:
-        """Write the distributions of the finite numbers; those without any are left out."""
+        """Write the distributions of the finite numbers, if any."""
         if self._writer is None:
             return
         for name, array in values.items():
@@ -88,12 +87,12 @@ class TensorBoard(Visualizer):
                 self._writer.add_histogram(name, finite, step)
 
     def note(self, text: str) -> None:
-        """Write the text to the page of texts."""
+        """Write the text to the text page."""
         if self._writer is not None:
             self._writer.add_text("notes", text)
 
     def events(self, instance_id: int, step: int, events: list[Event]) -> None:
-        """Write the points and meshes that an environment draws; nothing else can be shown."""
+        """Write the points and meshes of an environment; other objects are not supported."""
         for event in events:
             if event.kind not in ("points", "mesh"):
                 continue
@@ -119,11 +118,11 @@ class TensorBoard(Visualizer):
         """Write a mesh, or a point cloud.
 
         Args:
-            name: Name of the object; a ``/`` makes groups.
+            name: Name of the object; a ``/`` separates groups.
             positions: Vertices or points, shape (n, 3), in m.
             cells: Indices of the vertices of each triangle, shape (m, 3); None: points.
             color: Red, green and blue in [0, 1], for all points or shape (n, 3) for each, or
-                ``"#rrggbb"``. Other names of colors are not known: TensorBoard chooses.
+                ``"#rrggbb"``. For other names TensorBoard chooses a color.
             step: Position on the slider.
         """
         if self._writer is None:
@@ -139,7 +138,7 @@ class TensorBoard(Visualizer):
         )
 
     def close(self) -> None:
-        """Write what waits and finish the file."""
+        """Write the remaining numbers and finish the file."""
         if self._writer is not None:
             self._write_waiting()
             self._writer.close()
@@ -147,7 +146,7 @@ class TensorBoard(Visualizer):
 
 
 def _colors(color: Any, number: int) -> Array | None:
-    """Return red, green and blue of each point, shape (number, 3), 0 to 255; None: unknown."""
+    """Return red, green and blue of each point, shape (number, 3), 0 to 255; None if unknown."""
     if isinstance(color, str):
         if not re.fullmatch("#[0-9a-fA-F]{6}", color):
             return None

@@ -1,4 +1,4 @@
-"""How a network computes while it is trained: compiled, or in mixed precision."""
+"""Compiles a network's forward function for training, or runs it in mixed precision."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from physx_core.errors import ConfigError, listed
 Forward = Callable[..., Any]
 
 PRECISIONS = {"bfloat16": torch.bfloat16, "float16": torch.float16}
-"""Names of the types that mixed precision computes in."""
+"""Types of mixed precision by name."""
 
 
-def compiled(forward: Forward, backend: str) -> Forward:
-    """Return a function compiled by ``torch.compile``, which happens at its first call.
+def compile_forward(forward: Forward, backend: str) -> Forward:
+    """Return a function compiled by ``torch.compile`` on its first call.
 
     Args:
-        forward: What is compiled.
+        forward: The function.
         backend: Name of a backend of ``torch.compile``, for example ``"inductor"``.
 
     Raises:
-        ConfigError: There is no such backend; the returned function: compiling fails on this
-            machine.
+        ConfigError: If there is no such backend, or, by the returned function, if compiling fails
+            on this machine.
     """
     known = torch.compiler.list_backends(exclude_tags=())
     if backend not in known:
@@ -46,15 +46,15 @@ def compiled(forward: Forward, backend: str) -> Forward:
     return run
 
 
-def in_precision(
+def run_in_precision(
     forward: Forward, device: torch.device, precision: torch.dtype, back: torch.dtype
 ) -> Forward:
     """Return a function that computes in mixed precision and returns floating tensors as `back`.
 
     Args:
-        forward: What computes.
-        device: Where.
-        precision: Floating type of those operations that do without more digits.
+        forward: The function.
+        device: Device of the network.
+        precision: Floating type of operations that do not need more digits.
         back: Floating type of the network, in which the loss is computed.
     """
 

@@ -1,4 +1,4 @@
-"""Rows: what was drawn since the last flush, gathered into columns.
+"""ChunkBuilder: gathers the rows drawn since the last flush into columns.
 
 One call of Rerun for each object and step costs some 100 µs; the same as columns of many steps
 costs a few µs and stores far less.
@@ -24,11 +24,11 @@ TIME = "time"
 
 @dataclass(frozen=True)
 class Chunk:
-    """Rows of one entity, ready to be sent.
+    """Rows of one entity, ready to send.
 
     Attributes:
         entity: Path of the entity.
-        indexes: One column for each timeline; none: the row holds at all times.
+        indexes: One column for each timeline; none: the row is valid at all times.
         columns: One column for each component.
         nbytes: Size of the components in bytes.
     """
@@ -40,7 +40,7 @@ class Chunk:
 
     @property
     def is_static(self) -> bool:
-        """Whether it holds at all times."""
+        """Whether it is valid at all times."""
         return not self.indexes
 
     def send(self, stream: rr.RecordingStream) -> None:
@@ -55,11 +55,11 @@ class _Block:
     values: dict[str, list[Any]] = field(default_factory=dict)
 
 
-class Rows:
-    """Collects rows and turns them into few chunks.
+class ChunkBuilder:
+    """Collects rows and combines them into few chunks.
 
     Attributes:
-        nbytes: Size of the arrays that wait, in bytes.
+        nbytes: Size of the collected arrays in bytes.
     """
 
     def __init__(self) -> None:
@@ -67,8 +67,8 @@ class Rows:
         self._whole: list[Chunk] = []
         self._blocks: dict[tuple[Any, ...], _Block] = {}
 
-    def static(self, entity: str, *archetypes: Any) -> None:
-        """Add what holds at all times.
+    def add_static(self, entity: str, *archetypes: Any) -> None:
+        """Add components that are valid at all times.
 
         Args:
             entity: Path of the entity.
@@ -76,8 +76,8 @@ class Rows:
         """
         self._whole.append(Chunk(entity, [], _components(archetypes)))
 
-    def add_whole(self, entity: str, archetype: Any, times: Times) -> None:
-        """Add one row of an archetype that cannot be gathered into columns, such as a tensor's."""
+    def add_archetype(self, entity: str, archetype: Any, times: Times) -> None:
+        """Add one row of an archetype that cannot be combined into columns, such as a tensor."""
         block = _Block([times], [1])
         indexes = [_index(timeline, block) for timeline in times]
         self._whole.append(Chunk(entity, indexes, _components([archetype])))
@@ -88,13 +88,13 @@ class Rows:
         Args:
             entity: Path of the entity.
             archetype: A Rerun archetype.
-            times: Where the row lies on the timelines.
-            values: The archetype's fields: arrays or lists whose first axis counts instances.
+            times: Position of the row on the timelines.
+            values: The archetype's fields: arrays or lists whose first axis is that of instances.
         """
         self._put(entity, archetype, times, values, 1, "row")
 
     def add_many(self, entity: str, archetype: type[Any], times: Times, **values: Any) -> None:
-        """Add several rows of the same time; the first axis of the values counts rows."""
+        """Add several rows of the same time; the first axis of the values is that of rows."""
         count = len(next(iter(values.values())))
         self._put(entity, archetype, times, values, count, "rows")
 
@@ -115,8 +115,8 @@ class Rows:
             block.values.setdefault(name, []).append(value)
             self.nbytes += value.nbytes if isinstance(value, np.ndarray) else 50 * len(value)
 
-    def take(self) -> list[Chunk]:
-        """Return everything as chunks, those that hold at all times first, and forget it."""
+    def pop_chunks(self) -> list[Chunk]:
+        """Return and clear everything as chunks, static ones first."""
         chunks, self._whole = self._whole, []
         blocks, self._blocks = self._blocks, {}
         self.nbytes = 0

@@ -6,9 +6,9 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from physx_core.components import Factory
+from physx_rerun.drawing.chunks import ChunkBuilder
 from physx_rerun.drawing.drawing import Drawing
-from physx_rerun.drawing.layout import Layout
-from physx_rerun.drawing.rows import Rows
+from physx_rerun.drawing.windows import WindowLayout
 
 
 def views(container):
@@ -20,14 +20,14 @@ def views(container):
 
 
 def drawn(instance_nb, **view):
-    layout = Layout(instance_nb)
+    layout = WindowLayout(instance_nb)
     for instance_id in range(1, instance_nb + 1):
         factory = Factory()
         if view and instance_id == 1:
             factory.set_view(**view)
         factory.add_sphere("ball", 0.1)
         factory.add_scalars("error", ["position"])
-        drawing = Drawing(instance_id, Rows(), layout, in_full=True)
+        drawing = Drawing(instance_id, ChunkBuilder(), layout, draws_shapes=True)
         drawing.draw(factory.take_events(), {"step": 0})
     return layout.blueprint().root_container
 

@@ -1,4 +1,4 @@
-"""Layout: the windows of the viewer, made from what was drawn."""
+"""WindowLayout: lays out the viewer's windows for the drawn objects."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from physx_core.typing import Array
-from physx_rerun.drawing.rows import TIME
+from physx_rerun.drawing.chunks import TIME
 
 _VIEW_FROM = np.array([1.0, -1.1, 0.65]) / np.linalg.norm([1.0, -1.1, 0.65])
 _BACKGROUND = (25, 28, 36)
 _GRID = (58, 63, 76)
 
-_ROW = 3  # so many scenes fit beside one another
-_COLUMN = 4  # so many plots fit one above the other
-_LEGEND = 8  # so many names fit into a plot
+_ROW = 3  # largest number of scenes side by side
+_COLUMN = 4  # largest number of plots in a column
+_LEGEND = 8  # largest number of names in a plot's legend
 
 Container = rrb.Grid | rrb.Vertical | rrb.Horizontal | rrb.Tabs
 Box = tuple[Array, Array]
@@ -28,13 +28,13 @@ Box = tuple[Array, Array]
 
 
 @dataclass
-class Layout:
-    """What there is to see, and how the viewer's windows are laid out for it.
+class WindowLayout:
+    """Registers scenes, plots and texts, and lays out the viewer's windows for them.
 
     Attributes:
-        instance_nb: How many environment instances may draw.
-        changed: Whether something was added since `blueprint` was asked for.
-        has_time_panel: Whether the panel with the time is shown.
+        instance_nb: Number of environment instances that can draw.
+        changed: Whether something was added since the last call of `blueprint`.
+        has_time_panel: Whether to show the time panel.
     """
 
     instance_nb: int
@@ -51,54 +51,54 @@ class Layout:
     _followed: dict[int, str] = field(default_factory=dict)
 
     def set_view(self, instance_id: int, title: str, **camera: Array) -> None:
-        """Name the window of an instance and place its camera."""
+        """Set the title of an instance's window and place its camera."""
         self._titles[instance_id] = title
         self._cameras[instance_id] = camera
         self._kinds.add(("view", title))
         self.changed = True
 
     def follow(self, instance_id: int, entity: str) -> None:
-        """Let the camera of an instance move along with an entity."""
+        """Let the camera of an instance follow an entity."""
         self._followed[instance_id] = entity
         self._kinds.add(("follow", entity))
         self.changed = True
 
     def title(self, instance_id: int) -> str:
-        """Return what an instance is called: its number, if it did not name itself."""
+        """Return the title of an instance, by default its number."""
         return self._titles.get(instance_id, str(instance_id))
 
     def add_object(self, instance_id: int, kind: str, name: str) -> None:
-        """Make room for a shape in the scene of an instance."""
+        """Register a shape in the scene of an instance."""
         self.changed |= instance_id not in self._scenes
         self._scenes.setdefault(instance_id, {})
         self._kinds.add((kind, name))
 
     def add_plot(self, name: str, entity: str, timeline: str, curve_nb: int) -> None:
-        """Make room for an entity with some curves in the plot of that name."""
+        """Register an entity with some curves in the plot of that name."""
         self._plots.setdefault(name, {})[entity] = curve_nb
         self._timelines.add(timeline)
         self._kinds.add(("plot", name))
         self.changed = True
 
     def add_histogram(self, group: str, label: str, entity: str) -> None:
-        """Make room for an entity with the bars of a distribution, as a tab of its group."""
+        """Register an entity with a histogram, as a tab of its group."""
         self._histograms.setdefault(group, {})[label] = entity
         self._kinds.add(("histogram", f"{group}/{label}"))
         self.changed = True
 
     def add_text(self, instance_id: int, name: str, entity: str) -> None:
-        """Make room for a text of an instance."""
+        """Register a text of an instance."""
         self._texts.setdefault(name, {})[instance_id] = entity
         self._kinds.add(("text", name))
         self.changed = True
 
     def place(self, instance_id: int, name: str, points: Array) -> None:
-        """Tell where an object is, once; the camera looks at what was told.
+        """Register the place of an object, once; by default the camera shows all places.
 
         Args:
-            instance_id: Instance that drew it.
+            instance_id: The object's instance.
             name: Name of the object.
-            points: Points that it spans, shape (n, 3), in m.
+            points: Points that the object contains, shape (n, 3), in m.
         """
         scene = self._scenes.setdefault(instance_id, {})
         if name not in scene and len(points) and np.isfinite(points).all():
@@ -201,7 +201,7 @@ class Layout:
         )
 
     def _bounds(self, instance_id: int) -> Box:
-        """Return the corners of what is to be seen; a floor much larger than the rest is not."""
+        """Return the bounding box of the scene, without a floor much larger than the rest."""
         boxes = sorted(self._scenes[instance_id].values(), key=_diagonal)
         while len(boxes) > 1:
             rest = _union(boxes[:-1])
