@@ -41,14 +41,14 @@ def test_missing_sessions_are_named_with_those_that_exist(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["", "a/b", ".."])
-def test_names_that_are_no_folders_are_refused(tmp_path, name):
+def test_invalid_names_are_rejected(tmp_path, name):
     with pytest.raises(SessionError):
         Session.create(tmp_path, name)
 
 
 def test_a_file_in_the_way_is_an_error(tmp_path):
     (tmp_path / "sessions").write_text("")
-    with pytest.raises(SessionError, match="Cannot make"):
+    with pytest.raises(SessionError, match="Cannot create"):
         Session.create(tmp_path / "sessions", "run")
 
 

@@ -117,7 +117,7 @@ def test_rows_for_a_viewer_that_hangs_are_dropped_and_counted(receiver, monkeypa
         with pytest.warns(UserWarning) as warned:
             writer.close()
         texts = [str(warning.message) for warning in warned]
-        assert any(f"did not get {writer.dropped} blocks" in text for text in texts)
+        assert any(f"missed {writer.dropped} blocks" in text for text in texts)
     finally:
         viewer.process.send_signal(signal.SIGCONT)
 
