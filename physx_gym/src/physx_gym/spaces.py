@@ -1,7 +1,7 @@
 """Trees of spaces and of their values, and the fields that stand for their leaves.
 
 A tree is a `Dict` or `Tuple` space, or the dictionaries, lists and tuples that are its elements;
-whatever else is in it is a leaf. A path is the keys that lead to a leaf.
+anything else in it is a leaf. A path is the keys that lead to a leaf.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ class SpaceFields:
         self.space = space
         self.fields: list[Field] = []
         self.leaves: list[Leaf] = []
-        self._paths: dict[str, Path] = {}
+        self._places: dict[str, tuple[Path, np.dtype[Any]]] = {}
         for path, leaf in leaves(space):
             if not isinstance(leaf, Leaf):
                 raise ConfigError(
@@ -172,18 +172,18 @@ class SpaceFields:
                     "Tuple spaces of those, can be stored and sent."
                 )
             name = stem = "_".join([prefix, *(re.sub(r"\W", "_", str(key)) for key in path)])
-            while name in self._paths:
-                name = f"{stem}_{len(self._paths)}"
-            self._paths[name] = path
+            while name in self._places:
+                name = f"{stem}_{len(self._places)}"
+            self._places[name] = path, np.dtype(leaf.dtype)
             self.leaves.append(leaf)
             self.fields.append(Field(name, tuple(leaf.shape or ()), np.dtype(leaf.dtype)))
-        self._names = {path: name for name, path in self._paths.items()}
+        self._names = {path: name for name, (path, _) in self._places.items()}
 
     def arrays(self, value: Any) -> dict[str, Array]:
         """Return an element of the space, or a batch of them, as an array for each field."""
         found = {}
-        for (name, path), leaf in zip(self._paths.items(), self.leaves, strict=True):
-            found[name] = np.asarray(value_at(value, path), leaf.dtype)
+        for name, (path, dtype) in self._places.items():
+            found[name] = np.asarray(value_at(value, path), dtype)
         return found
 
     def value(self, arrays: Mapping[str, Any]) -> Any:

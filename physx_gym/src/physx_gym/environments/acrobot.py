@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 
 from physx_core.typing import Vector
-from physx_gym.defaults import BACKEND
 from physx_gym.env.pipeline_env import Info
 from physx_gym.environments import limits
 from physx_gym.environments.one_motor import OneMotorEnv
 
-TORQUE = 1.0
 HEIGHT = 1.0
 
 
@@ -28,19 +26,8 @@ class AcrobotEnv(OneMotorEnv):
     The task is that of R. S. Sutton, "Generalization in reinforcement learning", 1996.
     """
 
-    def __init__(self, *, backend: Any = BACKEND, continuous: bool = False, **options: Any) -> None:
-        """Create the environment.
-
-        Args:
-            backend: Reference of the engine.
-            continuous: Whether the action is a number instead of a choice.
-            options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
-        """
-        options = {"simulation_duration_max": 100.0, **options}
-        super().__init__(
-            "acrobot", "elbow", TORQUE, 1.25e-2, 0.2, backend=backend, continuous=continuous,
-            **options,
-        )  # fmt: skip
+    MODEL, JOINT, STRENGTH = "acrobot", "elbow", 1.0
+    PERIOD, STEP, DURATION = 1.25e-2, 0.2, 100.0
 
     def _initialize_observation_space(self) -> None:
         self.observation_space = limits.box(np.ones(4), limits.joint_velocities(self.simulator))

@@ -7,12 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from physx_core.typing import Vector
-from physx_gym.defaults import BACKEND
 from physx_gym.env.pipeline_env import Info
 from physx_gym.environments import limits
 from physx_gym.environments.one_motor import OneMotorEnv
 
-FORCE = 10.0
 FARTHEST = 2.2
 STEEPEST = math.radians(12.0)
 
@@ -29,19 +27,8 @@ class CartpoleEnv(OneMotorEnv):
     that can solve difficult learning control problems", 1983.
     """
 
-    def __init__(self, *, backend: Any = BACKEND, continuous: bool = False, **options: Any) -> None:
-        """Create the environment.
-
-        Args:
-            backend: Reference of the engine.
-            continuous: Whether the action is a number instead of a choice.
-            options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
-        """
-        options = {"simulation_duration_max": 10.0, **options}
-        super().__init__(
-            "cartpole", "slider", FORCE, 1e-2, 0.02, backend=backend, continuous=continuous,
-            **options,
-        )  # fmt: skip
+    MODEL, JOINT, STRENGTH = "cartpole", "slider", 10.0
+    PERIOD, STEP, DURATION = 1e-2, 0.02, 10.0
 
     def _initialize_observation_space(self) -> None:
         fastest = limits.joint_velocities(self.simulator)

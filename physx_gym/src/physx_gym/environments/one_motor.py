@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -22,47 +22,44 @@ class OneMotorEnv(RobotEnv):
     or, if `continuous`, a number from -1 to 1 is the fraction of the motor's strength.
 
     Attributes:
+        MODEL: Name of the robot; it does not collide.
+        JOINT: The joint that the motor drives.
+        STRENGTH: Largest torque or force of the motor, in N m or N.
+        PERIOD: Duration of a physics step, in s.
+        STEP: Duration of a step of the environment, in s.
+        DURATION: Time after which an episode is truncated, in s.
         continuous: Whether the action is a number instead of a choice.
-        strength: Largest torque or force of the motor, in N m or N.
     """
 
-    def __init__(
-        self,
-        robot: str,
-        joint: str,
-        strength: float,
-        period: float,
-        step_dt: float,
-        /,
-        *,
-        backend: Any,
-        continuous: bool,
-        **options: Any,
-    ) -> None:
+    MODEL: ClassVar[str]
+    JOINT: ClassVar[str]
+    STRENGTH: ClassVar[float]
+    PERIOD: ClassVar[float]
+    STEP: ClassVar[float]
+    DURATION: ClassVar[float]
+
+    def __init__(self, *, backend: Any = "dart", continuous: bool = False, **options: Any) -> None:
         """Create the environment.
 
         Args:
-            robot: The robot; it does not collide.
-            joint: The joint that the motor drives.
-            strength: Largest torque or force of the motor, in N m or N.
-            period: Duration of a physics step, in s.
-            step_dt: Duration of a step, in s.
             backend: Reference of the engine.
             continuous: Whether the action is a number instead of a choice.
-            options: Options of `RobotEnv`.
+            options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
-        self.continuous, self.strength = continuous, strength
-        world = World([Robot(robot, collisions="none")], period=period)
-        motors = [Motor(joint=joint, max_torque=strength)]
+        self.continuous = continuous
+        world = World([Robot(self.MODEL, collisions="none")], period=self.PERIOD)
+        motors = [Motor(joint=self.JOINT, max_torque=self.STRENGTH)]
         simulator = Simulator(world, backend=backend, motors=motors, sensors=())
-        super().__init__(simulator, step_dt, **options)
+        super().__init__(
+            simulator, self.STEP, **{"simulation_duration_max": self.DURATION, **options}
+        )
 
     def _initialize_action_space(self) -> None:
         self.action_space = spaces.Box(-1.0, 1.0, (1,)) if self.continuous else spaces.Discrete(3)
 
     def compute_command(self, action: Any, command: Vector) -> None:
         """Push."""
-        command[0] = self.strength * (action[0] if self.continuous else int(action) - 1)
+        command[0] = self.STRENGTH * (action[0] if self.continuous else int(action) - 1)
 
     def _key_to_action(
         self, key: str | None, obs: Any, reward: float | None, **kwargs: Any
