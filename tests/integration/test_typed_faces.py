@@ -23,7 +23,7 @@ CALLS = {
     'serve("script.py:Scene", "godot-gym").environment': "RLEnvironment",
     'serve("gym/CartPole-v1", "godot-rl")': "Service",
     'Dataset.open("folder")': "Dataset",
-    'Dataset.open("folder")["training"]["x"][0:2]': "ndarray[Any, dtype[Any]]",
+    'Dataset.open("folder")["training"]["x"][0:2]': "ndarray[tuple[Any, ...], dtype[Any]]",
     'plugins.resolve("backend", "dart")': "Backend",
     'plugins.resolve("backend", "dart").build(World())': "Simulation",
     'plugins.resolve("environment", "dart/arm")()': "Environment",

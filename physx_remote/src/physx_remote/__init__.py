@@ -1,4 +1,4 @@
-"""Environments in other processes: serving them, and driving those that others serve."""
+"""Environments as servers, and clients that drive them."""
 
 from __future__ import annotations
 

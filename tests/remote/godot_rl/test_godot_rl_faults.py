@@ -24,15 +24,15 @@ def framed(message):
 @pytest.mark.parametrize(
     ("body", "said"),
     [
-        (b"", "no JSON text"),
-        (b"{", "no JSON text"),
-        (b"\xff\xfe", "no JSON text"),
-        (b"[" * 100_000, "no JSON text"),
+        (b"", "not valid JSON"),
+        (b"{", "not valid JSON"),
+        (b"\xff\xfe", "not valid JSON"),
+        (b"[" * 100_000, "not valid JSON"),
         (b"[1]", "JSON object"),
         (b"null", "JSON object"),
         (b"{}", "JSON object"),
         (b'{"type": 3}', "JSON object"),
-        (b'{"type": "acton"}', 'no message of type "acton"'),
+        (b'{"type": "acton"}', 'Unknown message type "acton"'),
         (b'{"type": "action"}', "list of 1 actions"),
         (b'{"type": "action", "action": null}', "list of 1 actions"),
         (b'{"type": "action", "action": []}', "list of 1 actions"),
@@ -168,7 +168,7 @@ def test_without_a_trainer_the_error_says_what_to_do(cart):
 
 
 def test_an_address_that_does_not_exist(cart):
-    with pytest.raises(RemoteError, match="There is no address"):
+    with pytest.raises(RemoteError, match="is not a valid address"):
         GodotRL(timeout=5).service(Worlds([cart()]), address="no such host", port=3)
 
 

@@ -179,8 +179,8 @@ def test_flags_may_be_left_out_and_the_last_one_counts():
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["11008"], '"11008" is no flag'),
-        (["-p"], '"-p" is no flag'),
+        (["11008"], '"11008" is not a flag'),
+        (["-p"], '"-p" is not a flag'),
         (["--port=x"], '--port takes a number, not "x"'),
         (["--env_seed"], "--env_seed takes a number"),
         (["--fixed-fps"], "--fixed-fps takes a number"),

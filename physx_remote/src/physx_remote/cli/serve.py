@@ -1,4 +1,4 @@
-"""``physx serve``: serve an environment to other processes: Godot clients, trainers, physx."""
+"""``physx serve``: serve an environment to Godot clients, trainers, and physx."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ _WITH_LAUNCHER = "godot-rl"
 class Serve:
     """Let other processes drive an environment, until Ctrl-C.
 
-    The protocol physx asks clients for a token. It is the content of --token-file, which is made if
-    it does not exist; or in the environment variable PHYSX_TOKEN; or in a new file that is removed
-    in the end.
+    Clients of the protocol physx need a token. It is the content of --token-file, which is created
+    if it does not exist; or of the environment variable PHYSX_TOKEN; or of a new file that is
+    removed at the end.
     """
 
     environment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENVIRONMENT")]
@@ -42,27 +42,27 @@ class Serve:
     protocol: str = "physx"
     """godot-gym, godot-rl, physx, or "package.module:Class"."""
     address: str = "127.0.0.1"
-    """Where to listen; for godot-rl where the trainer listens."""
+    """Address to listen at; for godot-rl that of the trainer."""
     port: int | None = None
-    """Port; by default 9090 for godot-gym, the trainer's 11008 for godot-rl, and any free one."""
+    """Port; by default 9090 for godot-gym, the trainer's 11008 for godot-rl, or any free one."""
     num_worlds: int = 1
     """How many worlds to serve on one connection."""
     token_file: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File with the token of the protocol physx, readable by you alone."""
+    """File with the token of the protocol physx, readable by its owner alone."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Arguments of the environment."""
     options: dict[str, Any] = field(default_factory=dict)
     """The protocol's own options, for example clients=serve for godot-gym."""
     write_launcher: Annotated[Path | None, tyro.conf.arg(metavar="FILE.x86_64")] = None
-    """Only for godot-rl: write a file that a trainer starts as env_path, and end."""
+    """Only for godot-rl: write a file for the trainer's env_path, and exit."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Serve as the words say.
+    """Run the command.
 
     Raises:
-        PhysxError: The environment cannot be made or served there.
-        KeyboardInterrupt: The user ended it; all is closed.
+        PhysxError: If the environment cannot be created or served there.
+        KeyboardInterrupt: If the user ended it; everything is closed.
     """
     with argument_registry():
         chosen = tyro.cli(Serve, args=words, prog="physx serve")
@@ -70,7 +70,7 @@ def run(words: Sequence[str]) -> None:
         _write_launcher(chosen)
         return
     with contextlib.ExitStack() as stack:
-        stack.enter_context(_log_on_screen())
+        stack.enter_context(_printed_log())
         before = signal.signal(signal.SIGTERM, lambda *args: sys.exit(128 + signal.SIGTERM))
         stack.callback(signal.signal, signal.SIGTERM, before)
         options = dict(chosen.options)
@@ -90,14 +90,14 @@ def run(words: Sequence[str]) -> None:
                 **options,
             )
         )
-        _say(chosen, service, options.get("token_file"))
-        while service.poll(None):  # Ctrl-C passes: the command tells it by its status
+        _print_address(chosen, service, options.get("token_file"))
+        while service.poll(None):  # Ctrl-C passes through and determines the exit status
             continue
 
 
 @contextlib.contextmanager
-def _log_on_screen() -> Iterator[None]:
-    """Show what services say."""
+def _printed_log() -> Iterator[None]:
+    """Print the log of services."""
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("physx serve: %(message)s"))
     before = LOG.level
@@ -110,7 +110,7 @@ def _log_on_screen() -> Iterator[None]:
         LOG.setLevel(before)
 
 
-def _say(chosen: Serve, service: Service, token_file: str | None) -> None:
+def _print_address(chosen: Serve, service: Service, token_file: str | None) -> None:
     host, port = service.address
     verb = "connected to" if chosen.protocol == _WITH_LAUNCHER else "listening at"
     print(f"{chosen.environment} over {chosen.protocol}, {verb} {host}:{port}", flush=True)
@@ -124,10 +124,10 @@ def _say(chosen: Serve, service: Service, token_file: str | None) -> None:
 
 @contextlib.contextmanager
 def _token_file(given: Path | None) -> Iterator[str | None]:
-    """Yield the file with the token, None if it is in the environment; a made-up one goes again.
+    """Yield the file with the token, None if it is in the environment; remove a generated one.
 
     Raises:
-        ConfigError: The file cannot be made.
+        ConfigError: If the file cannot be created.
     """
     if given is None and TOKEN_VARIABLE in os.environ:
         yield None
@@ -148,7 +148,7 @@ def _token_file(given: Path | None) -> Iterator[str | None]:
 
 
 def _write_token(path: Path) -> None:
-    """Write a new token into a new file that nobody else may read."""
+    """Write a new token into a new file that only its owner may read."""
     opened = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(opened, "w", encoding="ascii") as file:
         file.write(secrets.token_hex(32) + "\n")

@@ -1,1 +1,1 @@
-"""The protocol of godot_gym_api."""
+"""The protocol of godot_gym_api: service and client."""

@@ -1,1 +1,1 @@
-"""The protocol of godot_rl_agents."""
+"""The protocol of godot_rl_agents: service and client."""

@@ -1,7 +1,7 @@
-"""What a trainer of godot-rl starts: the command ``physx-godot-rl`` and files that call it.
+"""The command ``physx-godot-rl``, and launcher files with which a trainer starts it.
 
-``GodotEnv(env_path=FILE)`` runs a file whose name ends with ``.x86_64`` and hands it the flags of a
-Godot application. `write_launcher` makes such a file for any environment.
+``GodotEnv(env_path=FILE)`` runs a file whose name ends with ``.x86_64`` and passes it the flags of
+a Godot application. `write_launcher` writes such a file for any environment.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from physx_remote.endpoints import serve
 from physx_remote.godot_rl.protocol import PORT, GodotRL
 
 SUFFIX = ".x86_64"
-"""How the name of an application ends that godot-rl starts on Linux."""
+"""Suffix of the applications that godot-rl starts on Linux."""
 
 COMMAND = "physx-godot-rl"
 
@@ -34,11 +34,11 @@ the trainer ends. ENVIRONMENT: "gym/CartPole-v1", "toy/spring", "script.py:Class
   --env_seed=N        seed of the first episodes
   --action_repeat=N   steps of the environment in one step of the trainer; 1 unless given
   --num_worlds=N      agents, each with a world of its own; 1 unless given
-  --timeout=S         how long to try to reach the trainer, in s; 60 unless given
+  --timeout=S         how long to keep trying to reach the trainer, in s; 60 unless given
   --NAME=VALUE        any other name: an argument of the environment
   --headless, --disable-render-loop, --fixed-fps N, --speedup=X
-                      taken, as godot-rl gives them, and without effect: no window is opened, and
-                      physics runs as fast as it can, in steps of the environment's own length
+                      accepted because godot-rl passes them, without effect: no window is opened,
+                      and physics runs as fast as possible, in the environment's own time steps
 """
 
 _WITHOUT_EFFECT = ("headless", "disable-render-loop", "fixed-fps", "speedup")
@@ -55,14 +55,14 @@ _NUMBERS = {
 
 @dataclass(frozen=True)
 class Launch:
-    """What the flags of a launch say.
+    """The flags of a launch.
 
     Attributes:
         port: Port where the trainer listens.
-        seed: Seed of the first episodes, None for none.
+        seed: Seed of the first episodes; None: unseeded.
         action_repeat: Steps of the environment in one step of the trainer.
-        num_worlds: How many agents there are.
-        timeout: How long to try to reach the trainer, in s.
+        num_worlds: Number of agents.
+        timeout: How long to keep trying to reach the trainer, in s.
         env_kwargs: Arguments of the environment.
     """
 
@@ -75,13 +75,13 @@ class Launch:
 
 
 def parse_flags(words: Sequence[str]) -> Launch:
-    """Return what the flags say that godot-rl gives an application; the last of a name counts.
+    """Parse the flags that godot-rl passes to an application; the last of each name counts.
 
     Args:
         words: ``--name=value``, ``--name value`` for a known name, or ``--name``.
 
     Raises:
-        UsageError: A word is no flag, or a flag's value is no number.
+        UsageError: If a word is not a flag, or the value of a number is not valid.
     """
     given: dict[str, Any] = {}
     env_kwargs: dict[str, Any] = {}
@@ -90,7 +90,9 @@ def parse_flags(words: Sequence[str]) -> Launch:
         word = rest.pop(0)
         name, equals, text = word.removeprefix("--").partition("=")
         if not word.startswith("--") or not name:
-            raise UsageError(f'"{word}" is no flag: flags are --name=value. See {COMMAND} --help.')
+            raise UsageError(
+                f'"{word}" is not a flag: flags are --name=value. See {COMMAND} --help.'
+            )
         if name in _NUMBERS:
             if not equals:
                 text = rest.pop(0) if rest else ""
@@ -110,7 +112,7 @@ def _number(name: str, text: str) -> Any:
 
 
 def _value(text: str) -> Any:
-    """Return a value that Python wrote as text: a TOML value, True, False, None, or the text."""
+    """Parse a value written by Python: a TOML value, True, False, None, or a string."""
     words = {"True": True, "False": False, "None": None}
     if text in words:
         return words[text]
@@ -128,27 +130,27 @@ def write_launcher(
     action_repeat: int = 1,
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write a file that godot-rl takes as ``env_path``; what it is started with comes on top.
+    """Write a file for godot-rl's ``env_path``; the flags it is started with take precedence.
 
     Args:
         path: Where to write it; the name must end with ``.x86_64``.
         environment: Reference of the environment, or its class.
-        num_worlds: How many agents there are.
+        num_worlds: Number of agents.
         action_repeat: Steps of the environment in one step of the trainer.
-        env_kwargs: Arguments of the environment: numbers, booleans and texts.
+        env_kwargs: Arguments of the environment: numbers, booleans and strings.
 
     Returns:
         The absolute path.
 
     Raises:
-        ConfigError: godot-rl could not start a file of this name.
-        UsageError: The class is one that no other process can find.
+        ConfigError: If godot-rl could not start a file of this name.
+        UsageError: If another process cannot import the class.
     """
     path = Path(path).absolute()
     if path.suffix != SUFFIX or " " in str(path):
         raise ConfigError(
-            f'godot-rl starts files whose name ends with "{SUFFIX}" and whose path has no space, '
-            f'and "{path}" is none.'
+            f'godot-rl only starts files whose name ends with "{SUFFIX}" and whose path has no '
+            f'space, unlike "{path}".'
         )
     reference = reference_of(environment)
     place, colon, name = reference.rpartition(":")

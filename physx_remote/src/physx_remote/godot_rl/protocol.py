@@ -1,7 +1,7 @@
-"""The protocol of godot_rl_agents: the service is the application that a trainer drives.
+"""GodotRL: the protocol of godot_rl_agents; the service is the application that a trainer drives.
 
-The trainer listens and the application connects to it. Each message is 4 bytes of length and a
-JSON object, whose ``type`` says what it is. One agent of the trainer is one world.
+The trainer listens and the application connects to it. Each message is a 4-byte length and a JSON
+object with a ``type``. Each agent of the trainer is one world.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from physx_remote.serving.socket_service import SocketService, Work
 from physx_remote.serving.worlds import Worlds
 
 PORT = 11008
-"""Port where a trainer listens unless told otherwise."""
+"""Default port of trainers."""
 
 MAJOR_VERSION = "0"
-"""Version of the protocol that is spoken here."""
+"""Major version of the implemented protocol."""
 
 _JSON = json.JSONEncoder(separators=(",", ":"), check_circular=False)
 
@@ -62,23 +62,25 @@ class GodotRL(Protocol):
                 and the end of an episode ends it.
             seed: Seed of the first episodes: world 0 gets the seed itself, the others get seeds
                 derived from it. None: no seed.
-            timeout: How long to try to reach the trainer, in s.
-            max_request: Longest message in bytes that is taken.
+            timeout: How long to keep trying to reach the trainer, in s.
+            max_request: Longest accepted message in bytes.
             options: Must be empty.
 
         Raises:
-            ConfigError: A number is out of its range.
-            UnknownOptionError: An option that the protocol does not have.
+            ConfigError: If a number is out of range.
+            UnknownOptionError: If the protocol does not have an option.
         """
         super().__init__(**options)
         sizes = {"action_repeat": action_repeat, "max_request": max_request}
         for option, value in sizes.items():
             if type(value) is not int or value < 1:
-                raise ConfigError(f"{option} is {value!r} but must be a whole number from 1.")
+                raise ConfigError(f"{option} is {value!r} but must be a positive integer.")
         if seed is not None and (type(seed) is not int or seed < 0):
-            raise ConfigError(f"seed is {seed!r} but must be a whole number from 0, or None.")
+            raise ConfigError(f"seed is {seed!r} but must be a non-negative integer or None.")
         if type(timeout) not in (int, float) or not timeout >= 0:
-            raise ConfigError(f"timeout is {timeout!r} but must be a number of seconds from 0.")
+            raise ConfigError(
+                f"timeout is {timeout!r} but must be a non-negative number of seconds."
+            )
         self.action_repeat, self.seed = action_repeat, seed
         self.timeout, self.max_request = timeout, max_request
 
@@ -89,25 +91,25 @@ class GodotRL(Protocol):
 
         Args:
             worlds: One world for each agent of the trainer.
-            address: Where the trainer listens.
-            port: Likewise; 0: 11008.
+            address: Address where the trainer listens.
+            port: Port where the trainer listens; 0: 11008.
 
         Raises:
-            RemoteError: Nothing listens there, or the worlds cannot be served so.
-            PhysxError: godot-rl has nothing for a space of the worlds.
+            RemoteError: If nothing listens there, or these worlds cannot be served.
+            PhysxError: If godot-rl has no format for a space of the worlds.
         """
         if not isinstance(worlds, Worlds):
             raise RemoteError(
                 f'The protocol "{self.name}" serves Gymnasium environments and environments of '
-                f"physx, which say what their spaces are; {type(worlds).__name__} does not."
+                f"physx, whose spaces are known; {type(worlds).__name__} is neither."
             )
         agents = Agents(worlds, self.action_repeat, self.seed)
-        trainer = _connected(address, port or PORT, self.timeout)
+        trainer = _connect_to_trainer(address, port or PORT, self.timeout)
         try:
             return _GodotRLService(worlds, agents, trainer, self.max_request)
-        except OSError as error:  # it has no other side any more
+        except OSError as error:  # the trainer is gone
             trainer.close()
-            raise RemoteError(f"The trainer at {address} left at once: {error}.") from error
+            raise RemoteError(f"The trainer at {address} disconnected at once: {error}.") from error
 
     @classmethod
     def connect(cls, host: str, port: int, **options: Any) -> GodotRLEnv:
@@ -122,15 +124,15 @@ class GodotRL(Protocol):
         return GodotRLVectorEnv((host, port or PORT), **options)
 
 
-def _connected(address: str, port: int, timeout: float) -> socket.socket:
-    """Return a socket that is connected to a trainer; it may begin to listen a little later."""
+def _connect_to_trainer(address: str, port: int, timeout: float) -> socket.socket:
+    """Return a socket connected to a trainer, which may begin to listen a little later."""
     deadline = time.monotonic() + timeout
     while True:
         left = max(deadline - time.monotonic(), _RETRY)
         try:
             trainer = socket.create_connection((address, port), timeout=left)
         except (socket.gaierror, OverflowError, UnicodeError) as error:
-            raise RemoteError(f"There is no address {address} port {port}: {error}.") from error
+            raise RemoteError(f"{address} port {port} is not a valid address: {error}.") from error
         except OSError as error:
             reason: OSError | None = error
         else:
@@ -140,28 +142,28 @@ def _connected(address: str, port: int, timeout: float) -> socket.socket:
             reason = None
         if time.monotonic() + _RETRY > deadline:
             raise RemoteError(
-                f"No trainer of godot-rl listens at {address} port {port}; it was tried for "
-                f"{timeout:g} s ({reason}). With godot-rl the trainer listens and the environment "
-                f"connects: start the trainer, for example GodotEnv(port={port}), and then this; "
-                "or let the trainer start it, with a launcher file as its env_path."
+                f"No trainer of godot-rl listens at {address} port {port} after {timeout:g} s of "
+                f"trying ({reason}). In godot-rl the trainer listens and the environment connects: "
+                f"start the trainer first, for example GodotEnv(port={port}), or let it start the "
+                "environment, with a launcher file as its env_path."
             ) from reason
         time.sleep(_RETRY)
 
 
 def _met_itself(connected: socket.socket) -> bool:
-    """Return whether the system gave a socket the very port that it was to reach."""
+    """Return whether a socket is connected to itself: the system chose the target as its port."""
     with contextlib.suppress(OSError):
         return bool(connected.getsockname() == connected.getpeername())
     return False
 
 
 class _GodotRLService(SocketService):
-    """Agents that a trainer drives; over when the trainer closes it or is gone."""
+    """Serves agents to a trainer; ends when the trainer closes it or is gone."""
 
     def __init__(
         self, worlds: Worlds, agents: Agents, trainer: socket.socket, max_request: int
     ) -> None:
-        """Take the trainer's connection."""
+        """Take the worlds and the trainer's connection."""
         super().__init__()
         self._worlds, self._agents = worlds, agents
         self._max_request = max_request
@@ -169,7 +171,7 @@ class _GodotRLService(SocketService):
         self.address = trainer.getpeername()[:2]
 
     def new_reader(self) -> PrefixReader:
-        """Return a reader with this protocol's limit."""
+        """Return a reader of messages."""
         return PrefixReader(self._max_request)
 
     def poll(self, timeout: float | None = 0.0) -> bool:
@@ -180,7 +182,7 @@ class _GodotRLService(SocketService):
         return goes_on
 
     def close(self) -> None:
-        """End the connection and close the worlds, after the request that is being handled."""
+        """End the connection and close the worlds, after the current request."""
         super().close()
         if self._released:
             self._worlds.close()
@@ -191,9 +193,9 @@ class _GodotRLService(SocketService):
         self.close()
 
     def received(self, connection: RequestConnection, body: bytes) -> Work | None:
-        """Answer one message."""
+        """Handle one message."""
         try:
-            message = _message(body)
+            message = _parse_message(body)
             if message["type"] == "close":
                 self.close()
                 return None
@@ -204,15 +206,15 @@ class _GodotRLService(SocketService):
             if request is None:
                 known = [*self._agents.requests, "close", "handshake"]
                 raise RequestError(
-                    f'There is no message of type "{message["type"]}"; there are: {listed(known)}.'
+                    f'Unknown message type "{message["type"]}". Known: {listed(known)}.'
                 )
         except RemoteError as error:
             self._refuse(connection, error)
             return None
-        return self._worked(connection, request(message))
+        return self._reply(connection, request(message))
 
-    def _worked(self, connection: RequestConnection, answer: Answer) -> Work:
-        """Send the answer to a request once it is there, or what went wrong."""
+    def _reply(self, connection: RequestConnection, answer: Answer) -> Work:
+        """Send the answer to a request, or its error."""
         try:
             told = yield from answer
         except Exception as error:  # the environment's own code may raise anything
@@ -221,7 +223,7 @@ class _GodotRLService(SocketService):
             self._send(connection, told)
 
     def _refuse(self, connection: RequestConnection, error: Exception) -> None:
-        """Say what went wrong, here and to the trainer, which knows no such answer and ends."""
+        """Report an error in the log and to the trainer, which ends at the unknown message."""
         text = "; ".join([str(error), *getattr(error, "__notes__", [])])
         is_foreign = not isinstance(error, (RemoteError, ActionError))
         LOG.error("The trainer's request failed: %s", text, exc_info=error if is_foreign else None)
@@ -232,16 +234,16 @@ class _GodotRLService(SocketService):
         self.send(connection, add_prefix(_JSON.encode(answer).encode("utf-8")))
 
 
-def _message(body: bytes) -> dict[str, Any]:
+def _parse_message(body: bytes) -> dict[str, Any]:
     try:
         message = json.loads(body)
     except (ValueError, RecursionError) as error:
         raise RemoteProtocolError(
-            f"A message is no JSON text: {str(error)[:200]}. It begins with {body[:80]!r}."
+            f"A message is not valid JSON: {str(error)[:200]}. It begins with {body[:80]!r}."
         ) from None
     if not isinstance(message, dict) or not isinstance(message.get("type"), str):
         raise RemoteProtocolError(
-            f'A message must be a JSON object with a text "type", not {body[:80]!r}.'
+            f'A message must be a JSON object with a string "type", not {body[:80]!r}.'
         )
     return message
 
@@ -250,7 +252,7 @@ def _check_version(message: dict[str, Any]) -> None:
     version = f"{message.get('major_version')}.{message.get('minor_version')}"
     if str(message.get("major_version")) != MAJOR_VERSION:
         LOG.warning(
-            "The trainer speaks version %s of godot-rl's protocol, and physx speaks %s.x",
+            "The trainer uses version %s of godot-rl's protocol; physx implements %s.x",
             version,
             MAJOR_VERSION,
         )

@@ -1,1 +1,1 @@
-"""The authenticated protocol of physx."""
+"""The authenticated protocol of physx: service and client."""

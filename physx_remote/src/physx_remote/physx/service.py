@@ -1,4 +1,4 @@
-"""The service of the protocol physx: who is connected, and what is sent to whom."""
+"""PhysxService: the connections of the protocol physx, their requests and answers."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ _MOST_PARTS = 512  # a system call takes no more than 1024
 
 
 class PhysxService(SocketService):
-    """Worlds at work for one client that acts; others look on. Closing it closes the worlds.
+    """Serves worlds to one acting client and to observers. Closing it closes the worlds.
 
     Attributes:
-        token: What clients must know.
+        token: The token that clients must know.
     """
 
     def __init__(
@@ -64,23 +64,23 @@ class PhysxService(SocketService):
         max_clients: int,
         max_snapshots: int,
     ) -> None:
-        """Keep what is served; see `Physx`.
+        """Take the worlds; the options are those of `Physx`.
 
         Raises:
-            UsageError: A space has no fixed layout.
+            UsageError: If a space has no fixed layout.
         """
         super().__init__(max_clients=max_clients)
         self.token = token
         self._worlds = worlds
         self._requests = WorldRequests(worlds, max_snapshots)
-        self._introduction = self._introduced()
+        self._introduction = self._introduce()
         self._max_request = max_request
         self._open()
         self._strangers: Strangers[RequestConnection] = Strangers(
             token, handshake_timeout, max_clients, self.drop, self._listener.timers
         )
         self._actor: RequestConnection | None = None
-        self._observers: dict[RequestConnection, bool] = {}  # whether something was not sent
+        self._observers: dict[RequestConnection, bool] = {}  # whether a change was skipped
         self._seen = 0
 
     def _release(self) -> None:
@@ -88,7 +88,7 @@ class PhysxService(SocketService):
         super()._release()
         self._worlds.close()
 
-    def _introduced(self) -> dict[str, Any]:
+    def _introduce(self) -> dict[str, Any]:
         worlds = self._worlds
         first = worlds.environments[0]
         modes = first.metadata.get("render_modes", [])
@@ -105,18 +105,18 @@ class PhysxService(SocketService):
             "render_fps": _number(first.metadata.get("render_fps")),
         }
 
-    # What the loop calls --------------------------------------------------------------------
+    # Events of the loop -----------------------------------------------------------------------
 
     def new_reader(self) -> Reader:
-        """Return what cuts frames out of a stream."""
+        """Return a reader of frames."""
         return FrameReader(HANDSHAKE_LIMIT)
 
     def opened(self, connection: RequestConnection) -> None:
-        """Give a stranger some time to prove that it knows the token."""
+        """Wait for a new client to prove that it knows the token."""
         self._strangers.add(connection)
 
     def closed(self, connection: RequestConnection) -> None:
-        """Forget a client; the worlds stay as they are."""
+        """Forget a client; the worlds keep their state."""
         self._strangers.forget(connection)
         self._observers.pop(connection, None)
         if connection is self._actor:
@@ -125,10 +125,10 @@ class PhysxService(SocketService):
             self._requests.forget_snapshots()
 
     def drained(self, connection: RequestConnection) -> None:
-        """Bring an observer to the present that could not follow."""
+        """Send the latest state to an observer that did not keep up."""
         if self._observers.get(connection):
             self._observers[connection] = False
-            self.send(connection, self._present(Kind.SEEN, self._seen))
+            self.send(connection, self._latest(Kind.SEEN, self._seen))
 
     def received(self, connection: RequestConnection, body: Frame) -> Work | None:
         """Handle one frame."""
@@ -139,10 +139,10 @@ class PhysxService(SocketService):
         try:
             if kind is Kind.ACTIONS and connection is self._actor:
                 steps = self._requests.steps(_arrays(decode(payload)))
-                return self._done(connection, number, steps)
+                return self._finish(connection, number, steps)
             if kind is not Kind.REQUEST:
                 raise RequestError("Only the client that acts may step.")
-            return self._asked(connection, number, decode(payload))
+            return self._carry_out(connection, number, decode(payload))
         except ConnectionRefusedByPeerError as error:
             self.drop(connection, str(error))
         except Exception as error:
@@ -152,7 +152,7 @@ class PhysxService(SocketService):
     # Handshake ------------------------------------------------------------------------------
 
     def _greet(self, connection: RequestConnection, frame: Frame) -> None:
-        """Go on with the handshake."""
+        """Continue the handshake."""
         try:
             answer, role = self._strangers.greet(connection, frame)
         except ConnectionRefusedByPeerError as error:
@@ -172,7 +172,7 @@ class PhysxService(SocketService):
         self.send(connection, pack_value(Kind.SETUP, self._introduction, "introduction"))
 
     def _admit(self, connection: RequestConnection, role: int) -> None:
-        """Give a client its place.
+        """Assign a client its role.
 
         Raises:
             RemoteError: Another one acts, or it wants what there is not.
@@ -190,7 +190,7 @@ class PhysxService(SocketService):
         actor = self._actor
         if actor is not None and not actor.ended:
             raise RemoteError(
-                f"{actor.name} acts here already, and one client at a time does. Try again when "
+                f"{actor.name} acts here already; only one client at a time may. Try again when "
                 "it has left, or look on with physx_remote.PhysxObserver."
             )
         if actor is not None:
@@ -200,8 +200,8 @@ class PhysxService(SocketService):
 
     # Requests -------------------------------------------------------------------------------
 
-    def _asked(self, connection: RequestConnection, number: int, request: Any) -> Work | None:
-        """Do what is asked for; return the rest of the work if it is not done at once.
+    def _carry_out(self, connection: RequestConnection, number: int, request: Any) -> Work | None:
+        """Carry out a request; return the remaining work if it is not done at once.
 
         Raises:
             Exception: It cannot be done.
@@ -210,34 +210,34 @@ class PhysxService(SocketService):
             raise RequestError("A request is a dictionary.")
         what = request.get("do")
         if what == "last":
-            self.send(connection, self._present(Kind.ANSWER, number))
+            self.send(connection, self._latest(Kind.ANSWER, number))
             return None
         if connection is not self._actor:
-            raise RequestError(f'Who looks on may ask for what was "last", not for "{what}".')
+            raise RequestError(f'An observer may only request "last", not "{what}".')
         if what == "reset":
-            return self._done(connection, number, self._requests.resets(request))
+            return self._finish(connection, number, self._requests.resets(request))
         if what == "restore":
             world = self._requests.restore(request)
-            self._tell(connection, number, Change([world], is_reset=True))
+            self._publish(connection, number, Change([world], is_reset=True))
             return None
         answer = self._requests.answer(what, request)
         self.send(connection, pack_value(Kind.ANSWER, answer, f'The answer to "{what}"', number))
         return None
 
-    def _done(self, connection: RequestConnection, number: int, change: Change) -> Work:
-        """Carry out what changes worlds, and answer."""
+    def _finish(self, connection: RequestConnection, number: int, change: Change) -> Work:
+        """Make a change of worlds, and answer."""
         try:
             for wait in change.work:
                 yield wait
                 if connection.closed:
                     LOG.info("%s left in the middle of a request", connection.name)
                     return
-            self._tell(connection, number, change)
+            self._publish(connection, number, change)
         except Exception as error:
             self._refuse(connection, number, error)
 
     def _refuse(self, connection: RequestConnection, number: int, error: Exception) -> None:
-        """Say what went wrong, here and to the client."""
+        """Report an error in the log and to the client."""
         told = error if isinstance(error, PhysxError) else wrap_error(error)
         is_own_fault = not isinstance(error, RequestError)
         LOG.error(
@@ -248,8 +248,8 @@ class PhysxService(SocketService):
 
     # Answers --------------------------------------------------------------------------------
 
-    def _tell(self, connection: RequestConnection, number: int, change: Change) -> None:
-        """Answer with what became of worlds, and show it to those who look on."""
+    def _publish(self, connection: RequestConnection, number: int, change: Change) -> None:
+        """Answer with the change of worlds, and send it to the observers."""
         latest = self._requests.latest
         rows = latest.rows(change.worlds)
         infos = [latest.infos[world] for world in change.worlds]
@@ -271,8 +271,8 @@ class PhysxService(SocketService):
             else:
                 self.send(observer, message)
 
-    def _present(self, kind: Kind, number: int) -> bytes:
-        """Return a message with what is known of all worlds."""
+    def _latest(self, kind: Kind, number: int) -> bytes:
+        """Return a message with the latest state of all worlds."""
         latest = self._requests.latest
         worlds = np.flatnonzero(latest.known)
         rows = latest.rows(worlds.tolist())
@@ -290,7 +290,7 @@ class PhysxService(SocketService):
 def _message(
     kind: Kind, number: int, notes: bytes, arrays: Mapping[str, Array | np.generic]
 ) -> Sequence[bytes | memoryview]:
-    """Return a message as the parts to send; long arrays are not copied."""
+    """Return a message in parts; long arrays are not copied."""
     first = pack(Kind.NOTES, notes, number) if notes else b""
     whole = dict(arrays)
     prefix, length = flat_prefix(whole)
