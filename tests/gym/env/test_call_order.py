@@ -1,4 +1,4 @@
-"""What is called when in an episode."""
+"""The order of the calls in an episode."""
 
 import numpy as np
 import pytest
@@ -177,7 +177,7 @@ def test_commands_that_are_held_are_computed_once(backend):
         assert found[0]["measurements"][kind].tobytes() == found[1]["measurements"][kind].tobytes()
 
 
-def test_spaces_are_made_again_when_options_changed():
+def test_spaces_are_recreated_when_options_change():
     class Weaker(RobotEnv):
         most = 20.0
         made = 0

@@ -1,4 +1,4 @@
-"""Environments derived from RobotEnv, and layers on them, change what they override only."""
+"""Subclasses of RobotEnv, and layers on them, change only what they override."""
 
 import warnings
 
@@ -66,7 +66,7 @@ class Falling(Cart):
         return np.array([0.0, 0.1]), np.zeros(2)
 
 
-def test_falling_terminates_and_is_no_truncation(backend):
+def test_falling_terminates_and_does_not_truncate(backend):
     env = Falling(backend=backend)
     env.reset()
     for _ in range(100):
@@ -76,7 +76,7 @@ def test_falling_terminates_and_is_no_truncation(backend):
     assert ends == [True, False] and reward == -1.0 and info["angle"] > 0.2
 
 
-def test_actions_are_cut_before_anything_sees_them():
+def test_actions_are_clipped_before_anything_sees_them():
     class Seen(Cart):
         def compute_reward(self, terminated, info):
             return float(self.action[0])
@@ -91,7 +91,7 @@ def test_actions_are_cut_before_anything_sees_them():
     assert env.step(env.action)[1] == 0.25
 
 
-def test_what_is_no_number_is_an_error_that_says_where():
+def test_nan_is_an_error_that_says_where():
     class Broken(RobotEnv):
         def refresh_observation(self, measurement):
             super().refresh_observation(measurement)
@@ -308,7 +308,7 @@ def test_layers_go_on_pipelines_only():
 # Gymnasium ----------------------------------------------------------------------------------------
 
 
-def test_gymnasiums_checker_has_nothing_to_say(backend):
+def test_gymnasiums_checker_does_not_complain(backend):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(Cart(backend=backend), skip_render_check=True)

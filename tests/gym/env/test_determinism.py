@@ -1,4 +1,4 @@
-"""The same to the last bit: seeds, instances, processes, snapshots, pickles and copies."""
+"""Bit-for-bit repeatability: seeds, instances, processes, snapshots, pickles and copies."""
 
 import copy
 import pickle

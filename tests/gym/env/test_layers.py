@@ -123,7 +123,7 @@ def test_check_env():
     check_env(pipeline(), skip_render_check=True)
 
 
-def test_an_observation_that_is_no_dictionary_moves():
+def test_an_observation_that_is_not_a_dictionary_moves():
     class Flat(RobotEnv):
         def _initialize_observation_space(self):
             self.observation_space = spaces.Box(-np.inf, np.inf, (15,), np.float64)
@@ -224,7 +224,7 @@ def test_names_are_unique():
             Passing(name, env)
 
 
-def test_a_block_is_of_one_environment():
+def test_a_block_belongs_to_one_environment():
     first, second = base(), base()
     block = Passing("pass", first)
     with pytest.raises(ConfigError, match="was created for"):
@@ -235,7 +235,7 @@ def test_a_block_is_of_one_environment():
         ObservedEnv(first, block)
 
 
-def test_other_layers_go_between():
+def test_other_layers_fit_in_between():
     class Doubled(Layer):
         def compute_command(self, action, command):
             np.multiply(action, 2.0, self.env.action)

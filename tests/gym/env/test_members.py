@@ -1,4 +1,4 @@
-"""Members of the environment, each by what its documentation says and by its place in the order."""
+"""Members of the environment behave as documented, and in the documented order."""
 
 import copy
 import gc
@@ -95,7 +95,7 @@ def test_a_seed_reaches_states_sensors_and_spaces():
     assert drawn() == first
 
 
-def test_samples_repeat_where_spaces_are_made_anew():
+def test_samples_repeat_when_spaces_are_recreated():
     class Varied(RobotEnv):
         def _setup(self):
             torque = float(self.np_random.uniform(1.0, 20.0))

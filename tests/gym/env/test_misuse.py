@@ -1,4 +1,4 @@
-"""Misuse is an error that says what to do, and leaves an environment that can be used."""
+"""Misuse raises an error that says what to do, and leaves a usable environment."""
 
 import numpy as np
 import pytest
@@ -155,7 +155,7 @@ def test_periods_that_do_not_fit(options, message):
         (([0.0, np.nan], [0.0, 0.0]), "finite"),
     ],
 )
-def test_first_states_that_make_no_sense(state, message):
+def test_invalid_first_states(state, message):
     class Wrong(RobotEnv):
         def _sample_state(self):
             return tuple(np.array(each) for each in state)
@@ -167,7 +167,7 @@ def test_first_states_that_make_no_sense(state, message):
 
 
 @pytest.mark.parametrize("broken", ["shape", "type", "missing"])
-def test_observations_of_another_form(broken):
+def test_observations_of_the_wrong_form(broken):
     class Wrong(RobotEnv):
         def refresh_observation(self, measurement):
             super().refresh_observation(measurement)
@@ -182,7 +182,7 @@ def test_observations_of_another_form(broken):
         Wrong("cartpole", 0.02).reset()
 
 
-def test_a_command_that_is_no_number():
+def test_a_command_that_is_not_a_number():
     class Wrong(RobotEnv):
         def compute_command(self, action, command):
             command[:] = np.nan
@@ -193,7 +193,7 @@ def test_a_command_that_is_no_number():
         env.step(np.zeros(2))
 
 
-def test_snapshots_of_something_else():
+def test_snapshots_of_other_environments():
     env = cart()
     env.reset()
     for wrong in (None, {}, {"layers": ["RobotEnv"]}, env.simulator.snapshot()):

@@ -1,6 +1,6 @@
 """Every member of RobotEnv does what it says.
 
-What derived environments change is in `test_robot_env_derived`.
+What subclasses change is in `test_derived_environments`.
 """
 
 import numpy as np
@@ -94,7 +94,7 @@ def test_periods():
     assert cart().control_dt == cart().observe_dt == 0.02
 
 
-def test_quantities_are_made_once():
+def test_quantities_are_created_once():
     env = cart()
     assert env.quantities is env.quantities
 
@@ -141,7 +141,7 @@ def test_the_longest_duration_truncates():
     assert [env.step([0.0])[3] for _ in range(3)] == [False, False, True]
 
 
-def test_has_terminated_is_of_a_running_episode():
+def test_has_terminated_needs_a_running_episode():
     with pytest.raises(EpisodeError, match="call reset"):
         cart().has_terminated({})
 

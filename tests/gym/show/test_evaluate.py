@@ -61,7 +61,7 @@ def test_rewards_and_information_of_all_steps(env, backend):
     assert abs(infos[-1]["angle"]) > 0.5 >= abs(infos[-2]["angle"])
 
 
-def test_the_policy_is_asked_with_what_there_was_before(env):
+def test_the_policy_gets_the_previous_step(env):
     policy = Policy(env)
     rewards, _ = env.evaluate(policy, seed=1)
     first, second, *_, last = policy.asked
@@ -81,12 +81,12 @@ def test_a_horizon_ends_it(env, horizon, steps):
     assert policy.asked[-1][3:5] == (False, False)
 
 
-def test_a_horizon_that_makes_no_sense(env):
+def test_an_invalid_horizon(env):
     with pytest.raises(ConfigError, match="horizon"):
         env.evaluate(Policy(env), horizon=0.0)
 
 
-def test_it_is_recorded_and_the_mode_is_as_before(env):
+def test_it_is_recorded_and_the_mode_is_restored(env):
     env.reset(seed=0)
     _, infos = env.evaluate(lambda *_: env.action, seed=2, horizon=0.1)
     assert env.training
@@ -113,7 +113,7 @@ def test_ctrl_c_ends_it_early(env):
     assert len(env.log_data["variables"]["time"]) == 4
 
 
-def test_an_error_of_the_policy_goes_on_and_the_mode_is_as_before(env):
+def test_an_error_in_the_policy_propagates_and_the_mode_is_restored(env):
     def fail():
         raise SimulationError("no idea")
 
@@ -123,14 +123,14 @@ def test_an_error_of_the_policy_goes_on_and_the_mode_is_as_before(env):
     assert not env.is_simulation_running
 
 
-def test_statistics_are_printed_if_wanted(env, capsys):
+def test_statistics_are_printed_on_request(env, capsys):
     env.evaluate(Policy(env), seed=0, horizon=0.1)
     assert capsys.readouterr().out == "steps: 5 (0.1 s), total reward: 5\n"
     env.evaluate(Policy(env), seed=0, horizon=0.1, enable_stats=False)
     assert capsys.readouterr().out == ""
 
 
-def test_a_replay_if_wanted(env, tmp_path):
+def test_a_replay_on_request(env, tmp_path):
     path = tmp_path / "a.rrd"
     env.evaluate(Policy(env), horizon=0.1, enable_replay=True, path=path, frame_rate=50)
     assert path.read_bytes()[:3] == b"RRF"

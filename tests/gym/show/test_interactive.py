@@ -89,7 +89,7 @@ def test_without_a_pause_it_runs_at_once_until_the_episode_ends(env, capsys):
     assert capsys.readouterr().out.splitlines() == ["keys: k quits, p pauses", "terminated"]
 
 
-def test_the_next_episode_begins_if_wanted(env, capsys):
+def test_the_next_episode_begins_on_request(env, capsys):
     env.script = {8: b"k"}
     env.play_interactive(start_paused=False, enable_is_done=False, verbose=False)
     assert [float(call[1]["t"]) for call in env.calls][6:] == pytest.approx([0.0, 0.002])
@@ -107,7 +107,7 @@ def test_a_pause_stops_time_and_keys(env):
     assert env.calls == []
 
 
-def test_the_terminal_is_as_before(env):
+def test_the_terminal_is_restored(env):
     before = termios.tcgetattr(sys.stdin.fileno())
     env.script = {1: b"k"}
     env.play_interactive(start_paused=False)
@@ -122,7 +122,7 @@ def test_the_terminal_is_as_before(env):
     assert termios.tcgetattr(sys.stdin.fileno()) == before
 
 
-def test_keys_are_put_together_of_bytes(terminal):
+def test_keys_are_assembled_from_bytes(terminal):
     with Keyboard() as keyboard:
         os.write(terminal, UP + DOWN + b"a" + "é€".encode() + b"\x1bOC" + b"\x1b[15~" + b"\x1bz")
         assert keyboard.read() == ["Up", "Down", "a", "é", "€", "Right", "z"]

@@ -70,7 +70,7 @@ def test_columns_are_grouped_and_named():
     np.testing.assert_array_equal(joints.lines[0].get_ydata(), np.arange(5) * 11.0)
 
 
-def test_states_of_blocks_are_shown_if_wanted():
+def test_states_of_blocks_are_shown_on_request():
     log = log_of("pd.state.0", "pd.action.0", "state.q.robot.hinge")
     assert titles(plot(log)) == ["state.q.robot", "pd.action"]
     assert titles(plot(log, enable_block_states=True)) == ["state.q.robot", "pd.state", "pd.action"]
@@ -113,13 +113,13 @@ def test_an_environment_plots_its_episode(tmp_path):
     assert (tmp_path / "a.pdf").read_bytes()[:4] == b"%PDF"
 
 
-def test_without_matplotlib_the_remedy_is_named(monkeypatch):
+def test_the_error_of_missing_matplotlib_names_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(MissingLibraryError, match=r'pip install "physx-gym\[plot\]"'):
         plot(log_of("a"))
 
 
-def test_what_is_no_log():
+def test_sources_that_are_not_logs():
     with pytest.raises(LogError, match="is neither a log"):
         plot(3)
     with pytest.raises(LogError, match="There is no log"):

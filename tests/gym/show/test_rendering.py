@@ -113,7 +113,7 @@ def test_a_film(pictures, tmp_path):
         assert film.info["duration"] == 100
 
 
-def test_without_the_viewer_the_remedy_is_named():
+def test_the_error_of_a_missing_viewer_names_the_remedy():
     env = RobotEnv("cartpole", 0.02, render_mode="rgb_array")
     env.viewer_kwargs["visualizer"] = "rerunn"
     env.reset(seed=0)
@@ -130,7 +130,7 @@ def test_without_a_display_there_is_no_window():
         env.render()
 
 
-def test_unknown_options_are_refused():
+def test_unknown_options_are_rejected():
     with pytest.raises(UnknownOptionError, match="render_mode"):
         RobotEnv("cartpole", 0.02, render_mode="movie")
     env = RobotEnv("cartpole", 0.02, render_mode="rgb_array")
@@ -162,7 +162,7 @@ def test_several_logs_side_by_side(tmp_path):
     assert sorted(transforms(tmp_path / "a.rrd", 3)) == list(range(11))
 
 
-def test_replays_that_make_no_sense(tmp_path):
+def test_invalid_replays(tmp_path):
     env = RobotEnv("cartpole", 0.02)
     env.reset(seed=0)
     with pytest.raises(LogError, match="Nothing was recorded"):
@@ -272,7 +272,7 @@ def test_a_camera_stays_where_the_base_is_fixed():
     assert "follow" not in drawn(World([Robot("cartpole")]))["view"]
 
 
-def test_films_of_other_formats_are_refused(tmp_path):
+def test_films_in_other_formats_are_rejected(tmp_path):
     with pytest.raises(ConfigError, match=r"\.gif, \.webp, \.png, not a\.mp4"):
         write_film([np.zeros((4, 4, 3), np.uint8)], tmp_path / "a.mp4", 30)
 
@@ -324,7 +324,7 @@ def test_a_viewer_for_humans_follows_each_step():
     assert not viewer.is_open
 
 
-def test_a_simulator_with_other_options_is_drawn_anew():
+def test_a_simulator_with_changed_options_is_redrawn():
     Fake.opened.clear()
     env = RobotEnv(Simulator(World([Robot("cartpole")])), 0.02, render_mode="human")
     env.viewer_kwargs["visualizer"] = Fake
@@ -337,7 +337,7 @@ def test_a_simulator_with_other_options_is_drawn_anew():
     assert [viewer.is_open for viewer in Fake.opened] == [False, True]
 
 
-def test_a_viewer_without_pictures_is_refused():
+def test_a_viewer_without_pictures_is_rejected():
     env = RobotEnv("cartpole", 0.02, render_mode="rgb_array")
     env.viewer_kwargs["visualizer"] = Fake
     env.reset(seed=0)

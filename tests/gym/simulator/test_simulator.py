@@ -155,7 +155,7 @@ def test_all_kinds_of_sensors(backend):
     assert [sensor.name for sensor in simulator.sensors[1:3]] == ["angle", "place"]
 
 
-def test_sensors_with_a_past_measure_between_the_steps(backend):
+def test_sensors_with_memory_measure_between_the_steps(backend):
     """The same as sensors that are hooks of a bare simulation."""
     options = {"noise": 0.01, "random_walk": 0.1, "delay": 0.003, "interpolation": 1}
     sensors = [Encoder(name="a", joint="slider", **options), Encoder(name="b", joint="hinge")]
@@ -194,7 +194,7 @@ def test_motors_are_those_of_a_bare_simulation(backend):
             assert np.array_equal(simulator.robot_state.torques, direct.torques)
 
 
-def test_the_highest_commands():
+def test_the_maximum_commands():
     motors = [Motor(joint="hinge", max_torque=4.0), Motor(joint="slider", reduction=10.0)]
     simulator = Simulator.build("cartpole", motors=motors)
     assert simulator.max_commands().tolist() == [4.0, 3.0]

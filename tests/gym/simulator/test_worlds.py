@@ -1,4 +1,4 @@
-"""Observations of all kinds, worlds of several things, and mistakes."""
+"""Observations of all kinds, worlds with several robots and objects, and mistakes."""
 
 import copy
 import itertools
@@ -129,7 +129,7 @@ def test_two_robots_and_an_object_of_which_one_acts(backend, tmp_path):
     env.close()
 
 
-def test_own_constructors_are_copied_and_restored():
+def test_environments_with_their_own_constructor_are_copied_and_restored():
     class Own(RobotEnv):
         def __init__(self, strength, *, backend="dart"):
             self.strength = strength
@@ -197,7 +197,7 @@ def test_wrong_options_are_named(options, error, message):
         cart(**options)
 
 
-def test_options_of_an_environment_of_ones_own_are_listed():
+def test_options_of_a_user_defined_environment_are_listed():
     with pytest.raises(
         UnknownOptionError, match=r'Did you mean "backend"\? Options: backend, cont'
     ):
@@ -287,7 +287,7 @@ def test_lists_of_a_file_are_weights_and_names():
     assert reward == pytest.approx(1.0 + 1.0 + 3 * info["reward"]["place"])
 
 
-def test_the_own_action_is_cut_and_checked_too():
+def test_the_environments_own_action_is_clipped_and_checked_too():
     env = cart()
     env.reset()
     env.action[:] = 1e9

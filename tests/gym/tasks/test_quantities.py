@@ -1,4 +1,4 @@
-"""Quantities against values that are computed another way, on both engines."""
+"""Quantities agree with independently computed values, on both engines."""
 
 import pickle
 
@@ -208,7 +208,7 @@ def test_equal_quantities_are_computed_once_a_state(env):
     assert len(calls) == 2
 
 
-def test_memories_count_steps_and_begin_with_the_episode():
+def test_memories_count_steps_and_start_with_the_episode():
     env = ant()
     height = BaseHeight()
     env.quantities.add("rise", Delta(height))

@@ -1,4 +1,4 @@
-"""Log files: what is cut, damaged or made by somebody else is refused, and nothing of it is run."""
+"""Truncated, damaged and foreign log files are rejected, and nothing in them is executed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from physx_gym import Log, RobotEnv, read_log, replay
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.6, 0.9, 0.999])
-def test_a_cut_file_is_refused(log, tmp_path, share):
+def test_a_truncated_file_is_rejected(log, tmp_path, share):
     path = tmp_path / "a.h5"
     log.write(path)
     content = path.read_bytes()
@@ -121,7 +121,7 @@ def constants(text):
         lambda file: file.__delitem__("constants"),
     ],
 )
-def test_what_is_no_log_is_refused(log, tmp_path, change):
+def test_files_that_are_not_logs_are_rejected(log, tmp_path, change):
     path = tmp_path / "a.h5"
     log.write(path)
     with h5py.File(path, "a") as file:
@@ -130,7 +130,7 @@ def test_what_is_no_log_is_refused(log, tmp_path, change):
         read_log(path)
 
 
-def test_a_log_that_is_missing_or_no_hdf5(tmp_path):
+def test_a_log_that_is_missing_or_not_hdf5(tmp_path):
     with pytest.raises(LogError, match=r"There is no log .*a\.h5"):
         read_log(tmp_path / "a.h5")
     (tmp_path / "a.h5").write_text("text")
@@ -151,12 +151,12 @@ def test_a_log_that_is_missing_or_no_hdf5(tmp_path):
         [[]] * 3,
     ],
 )
-def test_a_world_that_makes_no_sense_is_refused(world):
+def test_an_invalid_world_is_rejected(world):
     with pytest.raises(LogError, match="of this episode"):
         Log({"world": world}, {"time": np.zeros(1)}).world()
 
 
-def test_no_code_of_a_file_is_run(tmp_path):
+def test_no_code_in_a_file_is_executed(tmp_path):
     script = tmp_path / "evil.py"
     script.write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\nBackend = object\n")
     env = RobotEnv("cartpole", 0.02)

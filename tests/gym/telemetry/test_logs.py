@@ -1,4 +1,4 @@
-"""Log files: what was recorded comes back as it was. Damaged ones are in `test_logs_damage`."""
+"""Log files are read back exactly as recorded; damaged ones are in `test_damaged_logs`."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_the_world_comes_back(tmp_path):
 # Where logs lie -----------------------------------------------------------------------------
 
 
-def test_logs_go_with_their_environment():
+def test_logs_are_deleted_with_their_environment():
     env = RobotEnv("cartpole", 0.02)
     env.eval()
     path = run(env, 1)["log_path"]

@@ -1,4 +1,4 @@
-"""What is recorded of an episode: registered by reference, row by row."""
+"""Telemetry: variables are registered by reference and recorded row by row."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def recorded(telemetry, *times):
     return telemetry.log.variables
 
 
-def test_names_are_made_of_the_keys():
+def test_names_are_derived_from_the_keys():
     telemetry = Telemetry()
     value = {"arm": np.zeros(2), "hands": [np.zeros((1, 2)), np.zeros((), np.int64)]}
     telemetry.register("robot", value)
@@ -118,7 +118,7 @@ def test_any_arrangement_of_memory_is_recorded_in_order(data):
         ("text", "a str"),
     ],
 )
-def test_what_is_no_array_is_refused(value, message):
+def test_values_that_are_not_arrays_are_rejected(value, message):
     with pytest.raises(ConfigError, match=message):
         Telemetry().register("v", value)
 
@@ -135,12 +135,12 @@ def test_what_is_no_array_is_refused(value, message):
         (np.zeros(2), ["a", "a"], r'a number "v\.a", but that is the name of a number of "v" too'),
     ],
 )
-def test_names_that_do_not_fit_are_refused(value, fieldnames, message):
+def test_names_that_do_not_fit_are_rejected(value, fieldnames, message):
     with pytest.raises(ConfigError, match=message):
         Telemetry().register("v", value, fieldnames)
 
 
-def test_names_are_taken_once():
+def test_names_are_unique():
     telemetry = Telemetry()
     kept = np.zeros(2)
     telemetry.register("v", kept)
@@ -171,7 +171,7 @@ def test_a_variable_of_an_earlier_episode_is_replaced():
     assert not telemetry.is_recording
 
 
-def test_nothing_is_registered_while_it_records():
+def test_nothing_is_registered_during_an_episode():
     telemetry = Telemetry()
     telemetry.register("v", np.zeros(2))
     telemetry.begin()
@@ -180,7 +180,7 @@ def test_nothing_is_registered_while_it_records():
             change()
 
 
-def test_in_training_only_what_was_asked_for():
+def test_in_training_only_chosen_variables_are_recorded():
     telemetry = Telemetry()
     telemetry.register("v", np.zeros(2))
     telemetry.begin(training=True)
