@@ -19,19 +19,19 @@ def test_plain_types_survive_the_trip_through_plain_data(dtype):
 
 
 @pytest.mark.parametrize("name", ["", "a b", "1x", "a/b", 3])
-def test_names_that_are_no_identifiers_are_refused(name):
+def test_names_that_are_not_identifiers_are_rejected(name):
     with pytest.raises(ConfigError, match="identifier"):
         Field(name)
 
 
 @pytest.mark.parametrize("dtype", [object, str, "U5", "datetime64[s]", "nonsense"])
-def test_types_without_a_fixed_plain_layout_are_refused(dtype):
+def test_types_without_a_fixed_plain_layout_are_rejected(dtype):
     with pytest.raises(ConfigError):
         Field("x", (1,), dtype)
 
 
 @pytest.mark.parametrize("shape", [(-1,), (1.5,), ("a",)])
-def test_shapes_that_are_none_are_refused(shape):
+def test_malformed_shapes_are_rejected(shape):
     with pytest.raises(ConfigError, match="shape"):
         Field("x", shape)
 
@@ -43,7 +43,7 @@ def test_as_fields_takes_all_forms_and_sets_the_role():
     assert as_fields(("a", np.ndarray), "training") == [Field("a")]
 
 
-def test_reserved_and_malformed_fields_are_refused():
+def test_reserved_and_malformed_fields_are_rejected():
     with pytest.raises(ConfigError, match="reserved"):
         as_fields("env_id", "training")
     with pytest.raises(ConfigError, match="not a field"):

@@ -59,7 +59,7 @@ def test_defining_again_completes_or_does_nothing(dataset):
     assert dataset.fields("training")["q"].shape == (3,)
 
 
-def test_other_fields_are_refused_one_by_one(dataset):
+def test_each_different_field_is_reported(dataset):
     dataset.append("training", {"x": np.zeros((1, 3)), "y": np.zeros(1), "z": np.zeros(1)})
     other = [Field("x", (4,), unit="m"), Field("y", (), "int32", role="additional"), Field("w")]
     with pytest.raises(FieldsMismatchError) as caught:

@@ -284,7 +284,7 @@ def test_what_an_environment_must_have_is_named(method):
 
 
 def test_a_class_that_is_no_environment_is_refused():
-    with pytest.raises(UsageError, match="which is no Environment"):
+    with pytest.raises(UsageError, match="which is not an Environment"):
         DataGeneration(
             EnvironmentConfig("collections:Counter", as_tcp_ip_client=False),
             batch_nb=1,

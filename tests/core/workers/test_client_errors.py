@@ -71,7 +71,7 @@ def test_an_error_of_physx_comes_back_as_itself(errors_of, method):
         (1.0, "velocity", UnknownFieldError),
     ],
 )
-def test_data_that_cannot_be_stored_is_refused_as_in_process(errors_of, value, field, expected):
+def test_invalid_data_is_rejected_as_in_process(errors_of, value, field, expected):
     kwargs = {"value": value, "field": field, "at": 7, "who": 2}
     (local, rows), (error, client_rows) = errors_of(
         "Bad", [5, 5, 5, 5], num_clients=2, env_kwargs=kwargs

@@ -1,4 +1,4 @@
-"""Instance: one environment brought to life and stepped, in this process or in a client."""
+"""Instance: creates one environment and steps it, in this process or in a client."""
 
 from __future__ import annotations
 
@@ -35,13 +35,12 @@ def instance_arguments(
 
 
 class Instance:
-    """Calls an environment's methods in their order and names the instance in every error.
+    """Calls an environment's methods in order, and names the instance in every error.
 
     Attributes:
         instance_id: Number of the instance, counted from 1.
         environment: The environment; None before `open` and after `close`.
-        fields: The environment's fields; shapes that it leaves open become known with the first
-            sample.
+        fields: The environment's fields; shapes that it leaves open are None.
         last_step: Number of the step that made the last sample, counted from 0.
         last_episode: Number of the trajectory that the last sample belongs to, counted from 0.
         rejected: The samples that `check_sample` rejected, if they are recorded; else None.
@@ -60,7 +59,7 @@ class Instance:
         record_wrong: bool = False,
         accept_all: bool = False,
     ) -> None:
-        """Keep what the environment is made from.
+        """Store the arguments of the environment.
 
         Args:
             environment: Reference of the environment.
@@ -69,9 +68,9 @@ class Instance:
             instance_nb: How many instances run together.
             seed: Seed of the whole run.
             simulations_per_step: Calls of `step` for one sample.
-            max_wrong_samples: How many samples in a row `check_sample` may reject.
-            record_wrong: Whether the samples that it rejects are kept in `rejected`.
-            accept_all: Whether a sample counts whatever `check_sample` says, as in a replay.
+            max_wrong_samples: How many consecutive samples `check_sample` may reject.
+            record_wrong: Whether to keep the samples that it rejects in `rejected`.
+            accept_all: Whether to ignore the verdict of `check_sample`, as in a replay.
         """
         self.instance_id = instance_id
         self.environment: Environment | None = None
@@ -92,20 +91,22 @@ class Instance:
         self._runner: Any = None
 
     def open(self, services: Services, draw: bool) -> None:
-        """Make the environment and call `create`, `init`, `init_database`, `init_visualization`.
+        """Create the environment: `create`, `init`, `init_database`, `init_visualization`.
 
         Args:
-            services: What the environment may ask of the run.
-            draw: Whether a visualizer looks on.
+            services: What the environment may request from the run.
+            draw: Whether there is a visualizer.
 
         Raises:
-            EnvironmentFailedError: The environment does not import, or one of its methods raised.
-            PhysxError: What the environment raised, if it is an error of physx.
+            EnvironmentFailedError: If the environment cannot be imported or a method of it raises.
+            PhysxError: If the environment raises such an error; it is passed on.
         """
         make = self._call("import", resolve, "environment", self._reference)
         environment = self._call("__init__", make, **self._arguments)
         if not isinstance(environment, Environment):
-            raise UsageError(f"{self._reference!r} made {environment!r}, which is no Environment.")
+            raise UsageError(
+                f"{self._reference!r} made {environment!r}, which is not an Environment."
+            )
         self.environment = environment
         environment._services = services
         self._call("create", environment.create)
@@ -123,16 +124,16 @@ class Instance:
             environment.update_visualization()
 
     def step(self, stored: Sample | None = None) -> dict[str, Any]:
-        """Simulate until `check_sample` accepts a sample, and return it, not yet checked.
+        """Simulate until `check_sample` accepts a sample; return it without further checks.
 
         Args:
-            stored: A stored row that the environment shall replay, or None. It is the same one for
-                all sub-steps, and again after a sample that was rejected.
+            stored: A stored row for the environment to replay, or None. It stays the same for all
+                sub-steps, and after a sample that is rejected.
 
         Raises:
-            WrongSamplesError: `check_sample` rejected too many samples in a row.
-            UnknownFieldError: The step gave no data.
-            EnvironmentFailedError: The environment raised.
+            WrongSamplesError: If `check_sample` rejects too many consecutive samples.
+            UnknownFieldError: If the step sets no data.
+            EnvironmentFailedError: If the environment raises.
         """
         environment = self._alive()
         environment.sample = stored
@@ -156,19 +157,19 @@ class Instance:
                 )
 
     def apply(self, prediction: Sample) -> None:
-        """Give a prediction in physical units to the environment.
+        """Pass a prediction in physical units to the environment.
 
         Raises:
-            EnvironmentFailedError: The environment raised.
+            EnvironmentFailedError: If the environment raises.
         """
         environment = self._alive()
         self._call("apply_prediction", environment.apply_prediction, prediction)
 
     def close(self) -> None:
-        """Close the environment; calling it again does nothing.
+        """Close the environment; further calls do nothing.
 
         Raises:
-            EnvironmentFailedError: The environment raised.
+            EnvironmentFailedError: If the environment raises.
         """
         environment, self.environment = self.environment, None
         try:
@@ -198,7 +199,7 @@ class Instance:
             raise self._failure(method, error) from error
 
     def _finish(self, result: Any) -> None:
-        """Run a coroutine that `step` returned to its end."""
+        """Run the coroutine that `step` returned, if it is one."""
         if inspect.iscoroutine(result):
             if self._runner is None:
                 import asyncio
@@ -213,7 +214,7 @@ class Instance:
             raise self._failure(method, error) from error
 
     def _failure(self, method: str, error: Exception) -> Exception:
-        """Return the error to raise: that of physx with its place noted, or one that wraps it."""
+        """Return the error to raise: one of physx with a note of its place, else one around it."""
         step = self.environment.step_index if self.environment is not None else -1
         if method not in ("step", "check_sample", "apply_prediction", "close"):
             step = -1

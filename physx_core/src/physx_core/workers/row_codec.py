@@ -1,4 +1,4 @@
-"""Rows on the wire: each field's values of a block of rows, one after the other, little-endian."""
+"""Encoding of rows: field by field, all values of a block of rows, little-endian; their queues."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from physx_core.net.frames import Kind, header
 from physx_core.typing import Array, Batch
 
 _SMALL = 1 << 14
-"""Bytes of rows that are quicker copied than sent in parts."""
+"""Bytes up to which rows are copied into one message, which is faster than sending parts."""
 
 
 def row_bytes(fields: Sequence[Field]) -> int:
-    """Return the bytes of one row; all shapes are known."""
+    """Return the bytes of one row of fields with known shapes."""
     return sum(field.nbytes for field in fields)
 
 
 def pack_rows(block: Batch, count: int, kind: Kind = Kind.ROWS) -> list[bytes | memoryview]:
-    """Return the message that carries a block of rows, in parts: many rows are not copied.
+    """Return the message for a block of rows, in parts, so that large blocks are not copied.
 
     Args:
         block: Field name to contiguous array of shape (count, *field shape).
         count: How many rows.
-        kind: What rows they are.
+        kind: Kind of the message.
 
     Raises:
-        UsageError: The block is longer than a message may be.
+        UsageError: If the block is longer than a message may be.
     """
     arrays = list(block.values())
     length = sum(array.nbytes for array in arrays)
@@ -41,15 +41,15 @@ def pack_rows(block: Batch, count: int, kind: Kind = Kind.ROWS) -> list[bytes | 
 
 
 def unpack_rows(payload: bytearray, fields: Sequence[Field], count: int) -> Batch:
-    """Return the rows of a message as views of it.
+    """Return the rows of a message as views of its payload.
 
     Args:
         payload: Payload of the message.
         fields: Fields of the rows, all shapes known.
-        count: How many rows it says to hold.
+        count: Number of rows according to the header.
 
     Raises:
-        ConnectionRefusedByPeerError: It has another length than that many rows.
+        ConnectionRefusedByPeerError: If the payload has a different length.
     """
     sizes = [field.nbytes for field in fields]
     if len(payload) != count * sum(sizes):
@@ -66,10 +66,10 @@ def unpack_rows(payload: bytearray, fields: Sequence[Field], count: int) -> Batc
 
 
 class RowQueue:
-    """Rows of one client that arrived and were not taken yet.
+    """Queue of rows received from one client.
 
     Attributes:
-        count: How many rows wait.
+        count: Number of rows in the queue.
     """
 
     def __init__(self) -> None:
@@ -78,7 +78,7 @@ class RowQueue:
         self._taken = 0
 
     def append(self, block: Batch, count: int) -> None:
-        """Add a block of rows behind the others."""
+        """Append a block of rows."""
         self._blocks.append(block)
         self.count += count
 
@@ -86,13 +86,13 @@ class RowQueue:
         """Move rows into every `stride`-th row of a batch.
 
         Args:
-            limit: How many rows at most.
-            out: Where they go.
+            limit: Maximum number of rows.
+            out: The batch.
             first: Row of `out` for the first one.
-            stride: Distance in rows of `out` from one to the next.
+            stride: Distance between rows of `out`.
 
         Returns:
-            How many rows were moved.
+            Number of rows moved.
         """
         moved = 0
         while moved < limit and self.count:
@@ -115,10 +115,10 @@ class RowQueue:
 
 
 class RejectedRows:
-    """Rows of one client that `check_sample` rejected, in the order of their steps.
+    """Rows received from one client that `check_sample` rejected, ordered by step.
 
     Attributes:
-        count: How many arrived in all.
+        count: Number of rows received in total.
     """
 
     def __init__(self) -> None:
@@ -126,12 +126,12 @@ class RejectedRows:
         self._blocks: deque[Batch] = deque()
 
     def append(self, block: Batch, count: int) -> None:
-        """Add a block of rows behind the others."""
+        """Append a block of rows."""
         self._blocks.append(block)
         self.count += count
 
     def take(self, end: int | None) -> list[Batch]:
-        """Return the rows of steps below `end`, or all if it is None, and forget them."""
+        """Remove and return the rows of steps below `end`, or all rows if it is None."""
         taken = []
         while self._blocks:
             block = self._blocks[0]

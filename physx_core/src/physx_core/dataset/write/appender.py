@@ -1,4 +1,4 @@
-"""Rows and single samples on their way into a dataset: defined, checked, buffered, stored."""
+"""Checks, buffers and stores rows and single samples."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from physx_core.rows import RowBuffer, infer_shapes
 
 
 class Appender:
-    """Brings what users give into the form that the writer stores; see `Dataset` for the calls.
+    """Converts users' rows to the form that the writer stores: see `Dataset` for the methods.
 
     Attributes:
         writer: Stores the rows.
@@ -34,11 +34,11 @@ class Appender:
             names = sorted(given) or "no fields"
             raise ConfigError(f"A mode needs an identifier and fields, not {mode!r} with {names}.")
         known = self._manifest.modes.get(mode)
-        if known is not None and _completed(mode, known, given) == known.fields:
+        if known is not None and _complete(mode, known, given) == known.fields:
             return
         with files.storing(f"The fields of mode {mode!r}"), self._store.change() as manifest:
             known = manifest.modes.setdefault(mode, Mode(given))
-            known.fields = _completed(mode, known, given)
+            known.fields = _complete(mode, known, given)
 
     def append(self, mode: str, rows: Mapping[str, Any], *, checked: bool = False) -> None:
         """Store and commit rows: see `Dataset.append`."""
@@ -51,7 +51,7 @@ class Appender:
         self.writer.append(mode, block, count)
 
     def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
-        """Store one sample, soon: see `Dataset.append_sample`."""
+        """Buffer one sample: see `Dataset.append_sample`."""
         buffer = self._buffers.get(mode)
         if buffer is None:
             buffer = self._begin(mode, sample)
@@ -61,7 +61,7 @@ class Appender:
             self._flush(mode)
 
     def flush(self) -> None:
-        """Commit the samples that wait: see `Dataset.flush`."""
+        """Commit all buffered samples: see `Dataset.flush`."""
         for mode in self._buffers:
             self._flush(mode)
 
@@ -89,6 +89,6 @@ class Appender:
         return known is not None and all(f.shape is not None for f in known.fields.values())
 
 
-def _completed(mode: str, known: Mode, given: Mapping[str, Field]) -> dict[str, Field]:
+def _complete(mode: str, known: Mode, given: Mapping[str, Field]) -> dict[str, Field]:
     compare_fields(f'Mode "{mode}" of the dataset', known.fields, given)
     return complete_shapes(known.fields, given)

@@ -1,4 +1,4 @@
-"""Comparing the fields of a mode with those that are given, and completing their shapes."""
+"""Compares the fields of a mode with given fields, and completes their shapes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ def compare_fields(what: str, known: Mapping[str, Field], given: Mapping[str, Fi
     """Check that two sets of fields are the same; a shape of None fits any.
 
     Args:
-        what: What has the known fields, for the error's text.
-        known: Fields that are there.
-        given: Fields that are to be there.
+        what: Owner of the known fields, for the error message.
+        known: Fields that are defined.
+        given: Fields to compare with them.
 
     Raises:
-        FieldsMismatchError: They differ; names each difference.
+        FieldsMismatchError: If they differ; lists each difference.
     """
     differences = dict.fromkeys(given.keys() - known.keys(), "is not one of its fields")
     differences |= dict.fromkeys(known.keys() - given.keys(), "is missing")
@@ -33,7 +33,7 @@ def compare_fields(what: str, known: Mapping[str, Field], given: Mapping[str, Fi
 
 
 def complete_shapes(known: Mapping[str, Field], given: Mapping[str, Field]) -> dict[str, Field]:
-    """Return the known fields, with shapes that are not known yet taken from those given."""
+    """Return the known fields, with open shapes taken from the given ones."""
     return {
         name: replace(field, shape=given[name].shape) if field.shape is None else field
         for name, field in known.items()

@@ -1,4 +1,4 @@
-"""Producer: makes rows within the credit that the server grants, and sends them in blocks."""
+"""Producer: generates rows within the server's credit, and sends them in blocks."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ _BLOCK_TIME = 20e-3
 
 
 class Producer:
-    """Steps one instance.
+    """Steps one instance and sends its rows.
 
     Attributes:
-        made: How many rows were made, and so the number of the row in the making, counted from 0.
-        failure: Why rows that were made cannot be sent.
+        made: Number of generated rows, which is the number of the next one, counted from 0.
+        failure: Why generated rows cannot be sent; None while they can.
     """
 
     def __init__(self, link: Link, instance: Instance, skip: int = 0, rejected: int = 0) -> None:
-        """Keep what rows are made with.
+        """Store what generates and sends the rows.
 
         Args:
-            link: Where they go.
-            instance: What makes them; open.
-            skip: How many rows the server has from a client before this one. They are made again,
-                but not sent.
-            rejected: How many rejected rows it has.
+            link: The connection to the server.
+            instance: Generates the rows; open.
+            skip: How many rows the server has from an earlier client. They are generated again, but
+                not sent.
+            rejected: How many rejected rows it has from an earlier client.
         """
         self.made = 0
         self.failure: PhysxError | None = None
@@ -46,11 +46,11 @@ class Producer:
         self._sent_at = 0.0
 
     def run(self) -> None:
-        """Make rows until the server ends the run.
+        """Generate rows until the server ends the run.
 
         Raises:
-            RunEnded: The server ended the run or is gone, or there is a `failure`.
-            PhysxError: A row could not be made; all rows before it were sent.
+            RunEnded: If the server ended the run or is gone, or there is a `failure`.
+            PhysxError: If a row cannot be generated; all rows before it were sent.
         """
         while True:
             if self.made >= self._credit:
@@ -72,10 +72,10 @@ class Producer:
     def flush(self) -> None:
         """Send the rows that were not sent yet.
 
-        Rows up to one that holds NaN or an infinite number are sent, and `failure` names that one.
+        If one holds NaN or an infinite number, those before it are sent, and `failure` names it.
 
         Raises:
-            RunEnded: There is a `failure`, or the server is gone. No environment can catch it.
+            RunEnded: If there is a `failure`, or the server is gone. No environment can catch it.
         """
         self._send_rejected()
         buffer = self._buffer
@@ -105,7 +105,7 @@ class Producer:
         self.made += 1
 
     def _announce(self, buffer: RowBuffer) -> None:
-        """Tell the fields of the rows, once."""
+        """Send the fields of the rows, once."""
         if not self._announced:
             self._announced = True
             table = [field.to_dict() for field in buffer.fields]
@@ -143,9 +143,9 @@ class Producer:
         )
 
     def _listen(self) -> None:
-        """Obey what the server says, up to what is meant for after the rows that it asked for.
+        """Handle the server's messages, up to the first one for after the rows that it requested.
 
-        A client that goes on in the place of another is told at once what that one was told.
+        A client that replaces another receives at once everything that the other one was sent.
         """
         while self._link.has_message():
             frame = self._link.receive()
