@@ -27,7 +27,7 @@ from physx_gym import RobotEnv, Simulator
 def test_one_line_from_a_robots_name(backend):
     simulator = Simulator.build("cartpole", backend=backend)
     assert simulator.builds == 0
-    assert simulator.engine == backend and simulator.builds == 1
+    assert simulator.simulation.engine == backend and simulator.builds == 1
     assert [motor.joint for motor in simulator.motors] == ["slider", "hinge"]
     assert [sensor.name for sensor in simulator.sensors] == ["slider", "hinge"]
     assert simulator.world.ground is None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -55,17 +54,8 @@ def kind_of(sensor: Sensor) -> str:
     return _KINDS.get(name, name)
 
 
-@dataclass(frozen=True)
-class EquipmentState:
-    """A snapshot of motors and sensors; plain and picklable.
-
-    Attributes:
-        motors: State of the motors; None: there are none.
-        sensors: State of the sensors; None: there are none.
-    """
-
-    motors: MotorState | None
-    sensors: SensorState | None
+EquipmentState = tuple[MotorState | None, SensorState | None]
+"""A snapshot of motors and sensors; None: there are none."""
 
 
 class Equipment:
@@ -182,20 +172,19 @@ class Equipment:
 
     def snapshot(self) -> EquipmentState:
         """Return everything that `restore` needs to continue exactly from here."""
-        return EquipmentState(
-            None if self.motors is None else self.motors.snapshot(),
-            None if self.sensors is None else self.sensors.snapshot(),
-        )
+        motors = None if self.motors is None else self.motors.snapshot()
+        return motors, None if self.sensors is None else self.sensors.snapshot()
 
     def restore(
         self, state: EquipmentState, random: np.random.Generator, reading_period: int
     ) -> None:
         """Return to a snapshot, with a generator that is in its state of then; see `begin`."""
-        if self.motors is not None and state.motors is not None:
-            self.motors.restore(state.motors)
-        if self.sensors is not None and state.sensors is not None and self._lookup is None:
+        motors, sensors = state
+        if self.motors is not None and motors is not None:
+            self.motors.restore(motors)
+        if self.sensors is not None and sensors is not None and self._lookup is None:
             self.sensors.reset(random)
-            self.sensors.restore(state.sensors)
+            self.sensors.restore(sensors)
             self._hook(reading_period)
 
 

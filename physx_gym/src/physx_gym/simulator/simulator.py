@@ -265,11 +265,6 @@ class Simulator(SharedArrays):
         return self._built().part
 
     @property
-    def engine(self) -> str:
-        """Name of the engine."""
-        return self._built().simulation.engine
-
-    @property
     def period(self) -> float:
         """Time of a physics step, in s."""
         return self.world.period

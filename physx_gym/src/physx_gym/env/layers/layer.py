@@ -5,12 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from physx_core.errors import ConfigError
 from physx_core.typing import Vector
 from physx_gym.env.pipeline_env import Info, PipelineEnv, Step
 from physx_gym.env.robot_env import RobotEnv
+
+
+def _property_of_base(name: str) -> property:
+    """Return a property that is an attribute of the base environment."""
+
+    def get(layer: Layer) -> Any:
+        return getattr(layer._base, name)
+
+    def change(layer: Layer, value: Any) -> None:
+        setattr(layer._base, name, value)
+
+    return property(get, change, doc=f"The base environment's `{name}`.")
 
 
 class Layer(PipelineEnv):
@@ -73,6 +83,13 @@ class Layer(PipelineEnv):
 
     # The pipeline is run by its base -----------------------------------------------------------
 
+    training: Any = _property_of_base("training")
+    np_random: Any = _property_of_base("np_random")
+    np_random_seed: Any = _property_of_base("np_random_seed")
+    render_mode: Any = _property_of_base("render_mode")
+    metadata: Any = _property_of_base("metadata")
+    spec: Any = _property_of_base("spec")
+
     @property
     def unwrapped(self) -> RobotEnv:
         """The base environment of the pipeline."""
@@ -114,47 +131,9 @@ class Layer(PipelineEnv):
         """Return a picture; see `RobotEnv.render`."""
         return self.env.render()
 
-    @property
-    def training(self) -> bool:
-        """Whether this is for training; see `PipelineEnv.training`."""
-        return self._base.training
-
     def train(self, mode: bool = True) -> None:
         """Switch between training and evaluation; see `PipelineEnv.train`."""
         self._base.train(mode)
-
-    @property
-    def np_random(self) -> np.random.Generator:
-        """The random generator of the environment."""
-        return self._base.np_random
-
-    @np_random.setter
-    def np_random(self, value: np.random.Generator) -> None:
-        self._base.np_random = value
-
-    @property
-    def np_random_seed(self) -> int:
-        """Seed of `np_random`."""
-        return self._base.np_random_seed
-
-    @property
-    def render_mode(self) -> str | None:  # type: ignore[override]
-        """How `render` shows the world."""
-        return self._base.render_mode
-
-    @property
-    def metadata(self) -> dict[str, Any]:  # type: ignore[override]
-        """Gymnasium's metadata of the environment."""
-        return self._base.metadata
-
-    @property
-    def spec(self) -> Any:
-        """The environment's specification in gymnasium's registry, if it has one."""
-        return self._base.spec
-
-    @spec.setter
-    def spec(self, value: Any) -> None:
-        self._base.spec = value
 
     # Pickling ----------------------------------------------------------------------------------
 
