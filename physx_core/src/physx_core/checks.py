@@ -1,4 +1,4 @@
-"""Checks of the numbers in a description; each error names the option."""
+"""Validation of the options of a description; each error names the option."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def finite(option: str, value: Any) -> float:
     """Return a value as a finite float.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: If it is not a finite number.
     """
     try:
         number = float(value)
@@ -28,7 +28,7 @@ def positive(option: str, value: Any) -> float:
     """Return a value as a finite float above 0.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: If it is not a finite number above 0.
     """
     number = finite(option, value)
     if not number > 0:
@@ -37,14 +37,14 @@ def positive(option: str, value: Any) -> float:
 
 
 def not_negative(option: str, value: Any) -> float:
-    """Return a value as a finite float that is not below 0.
+    """Return a value as a finite float of at least 0.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: If it is not a finite number of at least 0.
     """
     number = finite(option, value)
     if number < 0:
-        raise ConfigError(f"{option} is {value!r} but cannot be negative.")
+        raise ConfigError(f"{option} is {value!r} but must not be negative.")
     return number
 
 
@@ -52,23 +52,23 @@ def options(check: Callable[[str, Any], float], where: str, description: Any, *n
     """Check options of a description.
 
     Args:
-        check: One of the checks above.
-        where: What stands before the options' names in an error.
-        description: What has them.
-        names: Their names.
+        check: One of the functions above.
+        where: Prefix of the options' names in an error.
+        description: The object with the options.
+        names: Names of the options.
 
     Raises:
-        ConfigError: One does not pass.
+        ConfigError: If an option is out of range.
     """
     for name in names:
         check(where + name, getattr(description, name))
 
 
 def vector(option: str, values: Any, length: int) -> tuple[float, ...]:
-    """Return values as a tuple of so many finite floats.
+    """Return values as a tuple of `length` finite floats.
 
     Raises:
-        ConfigError: They are none, or there are more or less of them.
+        ConfigError: If they are not `length` finite numbers.
     """
     try:
         numbers = tuple(values)
@@ -83,7 +83,7 @@ def unit_quaternion(option: str, values: Sequence[float]) -> tuple[float, ...]:
     """Return a quaternion x, y, z, w, scaled to length 1.
 
     Raises:
-        ConfigError: It does not have four finite numbers, or its length is not 1 within 0.001.
+        ConfigError: If it does not have four finite numbers, or its length is not 1 within 0.001.
     """
     quaternion = vector(option, values, 4)
     length = math.sqrt(sum(part * part for part in quaternion))
@@ -95,11 +95,13 @@ def unit_quaternion(option: str, values: Sequence[float]) -> tuple[float, ...]:
 
 
 def name(kind: str, value: Any) -> str:
-    """Return a name: a text that is not empty and has no ``/``, which joins names in a state.
+    """Return a name: a nonempty string without ``/``, which separates names in a state.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: If it is not such a string.
     """
     if not isinstance(value, str) or not value or "/" in value:
-        raise ConfigError(f"The name of a {kind} is {value!r}; it must be a text without '/'.")
+        raise ConfigError(
+            f"The name of a {kind} is {value!r} but must be a nonempty string without '/'."
+        )
     return value

@@ -128,7 +128,7 @@ def test_noise_and_bias_have_their_statistics():
     np.testing.assert_allclose(found.mean(0), [1.5, -0.5], atol=1e-2)
     np.testing.assert_allclose(found.std(0), [0.3, 0.2], atol=1e-2)
     assert abs(np.corrcoef(found.T)[0, 1]) < 0.04
-    assert not sensors.truth.any()
+    assert not sensors.ideal.any()
 
 
 def test_drawn_biases_stay_until_the_reset_and_walks_grow_with_the_root_of_time():
@@ -237,5 +237,5 @@ def test_descriptions_are_checked(options, error, words):
 def test_a_contact_has_no_errors_and_the_base_is_no_sensor():
     with pytest.raises(UnknownOptionError, match="touching"):
         ContactSensor(name="x", body="b", noise={"touching": 0.1})
-    with pytest.raises(ConfigError, match="no kind of sensor"):
+    with pytest.raises(ConfigError, match="not a kind of sensor"):
         Sensor(name="x")

@@ -73,9 +73,9 @@ def test_the_iterated_solutions_are_those_of_newton():
         problem = ContactProblem(*random_problem(rng, 2, 3, 2, spare=20))
         best, error = problem.newton(np.zeros(11), 50)
         assert error < problem.accuracy
-        iterated = solver.iterated(problem, name)
-        np.testing.assert_allclose(iterated, best, atol=1e-6)
-        assert problem.error(iterated) < 1e-6
+        iterate = solver.iterate(problem, name)
+        np.testing.assert_allclose(iterate, best, atol=1e-6)
+        assert problem.error(iterate) < 1e-6
 
 
 def test_what_is_no_number_is_an_error():

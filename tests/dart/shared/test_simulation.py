@@ -281,7 +281,7 @@ def test_out_is_filled(backend):
     [
         (lambda s: s.set_torques([1.0]), r"torques have the shape \(1,\) but need \(2,\)"),
         (lambda s: s.set_torques([1.0, np.nan]), "torques must be finite"),
-        (lambda s: s.set_torques(["a", "b"]), "torques are no numbers"),
+        (lambda s: s.set_torques(["a", "b"]), "torques are not numbers"),
         (lambda s: s.set_state([0.0], [0.0, 0.0]), "positions have the shape"),
         (lambda s: s.set_state([0.0, 0.0], [0.0, np.inf]), "velocities must be finite"),
         (lambda s: s.forward_dynamics(np.zeros(2), np.zeros(2), np.zeros(3)), "torques have"),

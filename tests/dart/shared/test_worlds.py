@@ -186,7 +186,7 @@ def test_two_bodies_of_one_name_are_refused(backend, bar):
         (lambda: World(), "needs a robot, or an object"),
         (lambda: World(objects=[Sphere(name="s", radius=1, static=True)]), "needs a robot"),
         (lambda: World(objects=[Sphere(name="ground", radius=1)]), '"ground" is taken'),
-        (lambda: World(["robot.urdf"]), "is no Robot"),
+        (lambda: World(["robot.urdf"]), "is not a Robot"),
         (lambda: World(objects=[Sphere(name="s", radius=1)], period=0), "period"),
         (lambda: World(objects=[Sphere(name="s", radius=1)], gravity=(0, 1)), "gravity"),
         (lambda: World(objects=[Sphere(name="s", radius=1)], contacts="some"), "contacts"),

@@ -45,7 +45,7 @@ from .urdf import mesh_path as mesh_path
 from .urdf import numbers_of as numbers_of
 from .urdf import origin_of as origin_of
 from .urdf import parse_urdf as parse_urdf
+from .vectors import copy_to as copy_to
 from .vectors import finite_rows as finite_rows
 from .vectors import finite_vector as finite_vector
 from .vectors import overwrite as overwrite
-from .vectors import written as written

@@ -1,6 +1,6 @@
-"""Backend and Simulation: a physics engine, and one running world of it.
+"""Backend, a physics engine, and Simulation, a running world in it.
 
-The convention of all states is that of `physx_core.simulation.layout`.
+States follow the convention of `physx_core.simulation.layout`.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ class Backend(ABC):
 
     @abstractmethod
     def build(self, world: World, seed: int | None = None) -> Simulation:
-        """Build a simulation of the world, at rest in its neutral configuration.
+        """Build a simulation of a world, at rest in its neutral configuration.
 
         Args:
-            world: What to simulate.
-            seed: Seed of what the engine draws at random, if it does.
+            world: The world to simulate.
+            seed: Seed of the engine's random numbers, if it draws any.
 
         Raises:
-            ModelError: A robot or mesh cannot be loaded; the message says why.
-            FeatureNotSupportedError: The world asks for what the engine does not have.
+            ModelError: If a robot or mesh cannot be loaded; the message says why.
+            FeatureNotSupportedError: If the world needs a feature that the engine does not have.
         """
 
     def robots(self) -> Sequence[RobotInfo]:
@@ -57,7 +57,7 @@ class Backend(ABC):
 
 
 class Simulation(Dynamics, Closeable):
-    """One running world. A context manager; after `close` every call raises `SimulationError`.
+    """A running world. A context manager; after `close` every call raises `SimulationError`.
 
     A method whose feature is not in `features` raises `FeatureNotSupportedError`.
 
@@ -65,7 +65,7 @@ class Simulation(Dynamics, Closeable):
         engine: Name of the engine.
         period: Length of one physics step, in s.
         layout: Names and places in the state.
-        features: What this simulation can do: names of `FEATURES`.
+        features: Features of this simulation: names of `FEATURES`.
     """
 
     period: float
@@ -84,30 +84,30 @@ class Simulation(Dynamics, Closeable):
 
     @abstractmethod
     def set_torques(self, torques: Vector) -> None:
-        """Hold these torques until they are changed; the joints' limits cut them.
+        """Hold these torques until they are changed; they are clipped at the joints' limits.
 
         Args:
             torques: Shape (joints,), in N m or N.
 
         Raises:
-            SimulationError: The shape is wrong, a value is not finite, or a joint's mode is not
+            SimulationError: If the shape is wrong, a value is not finite, or a joint's mode is not
                 ``"force"``.
         """
 
     @abstractmethod
     def set_commands(self, commands: Vector) -> None:
-        """Hold these commands until they are changed; the joints' limits cut them.
+        """Hold these commands until they are changed; they are clipped at the joints' limits.
 
         Args:
-            commands: Shape (joints,): torque, velocity or position, as each joint's mode says; it
-                is copied.
+            commands: Shape (joints,): torque, velocity, or position, according to each joint's
+                mode; copied.
 
         Raises:
-            SimulationError: The shape is wrong or a value is not finite.
+            SimulationError: If the shape is wrong or a value is not finite.
         """
 
     def commands(self) -> Vector:
-        """Return the held commands as the joints' limits cut them, shape (joints,)."""
+        """Return the held commands, clipped at the joints' limits, shape (joints,)."""
         return self.snapshot().commands
 
     @abstractmethod
@@ -115,39 +115,38 @@ class Simulation(Dynamics, Closeable):
         """Simulate n physics steps under the held commands.
 
         Raises:
-            SimulationError: The state is no longer finite, or a hook calls `step`.
+            SimulationError: If the state is no longer finite, or a hook calls `step`.
         """
 
     def add_hook(self, hook: Hook, every: int = 1) -> None:
         """Call a function before the physics steps whose frame is a multiple of `every`.
 
         It may read everything and set commands and wrenches. Hooks are called in the order in which
-        they were added. They cost their time at every step; without any `step` costs nothing more.
-        Snapshots do not hold them.
+        they were added. Without hooks `step` has no additional cost. Snapshots do not contain them.
         """
         raise self._lacks("hooks")
 
     def remove_hook(self, hook: Hook) -> None:
-        """Call a function no longer.
+        """Remove a hook.
 
         Raises:
-            SimulationError: It is not called.
+            SimulationError: If the function is not a hook of this simulation.
         """
         raise self._lacks("hooks")
 
     def apply_wrench(self, wrench: Wrench) -> int:
-        """Let a force act on a body from now on; return its number for `remove_wrench`.
+        """Apply a wrench to a body from now on; return its number for `remove_wrench`.
 
         Raises:
-            SimulationError: There is no body of that name, or it cannot move.
+            SimulationError: If there is no body of that name, or it cannot move.
         """
         raise self._lacks("wrenches")
 
     def remove_wrench(self, number: int) -> None:
-        """End a wrench.
+        """Remove a wrench.
 
         Raises:
-            SimulationError: None of that number acts.
+            SimulationError: If no wrench with that number acts.
         """
         raise self._lacks("wrenches")
 
@@ -155,43 +154,43 @@ class Simulation(Dynamics, Closeable):
 
     @abstractmethod
     def positions(self, out: Vector | None = None) -> Vector:
-        """Return the positions, shape (nq,), written into `out` if it is given."""
+        """Return the positions, shape (nq,), copied to `out` if it is given."""
 
     @abstractmethod
     def velocities(self, out: Vector | None = None) -> Vector:
-        """Return the velocities, shape (nv,), written into `out` if it is given."""
+        """Return the velocities, shape (nv,), copied to `out` if it is given."""
 
     @abstractmethod
     def set_state(self, positions: Vector, velocities: Vector) -> None:
-        """Put the world into a state; time goes on. There are no contacts until the next step.
+        """Set the state; time goes on. There are no contacts until the next step.
 
         Args:
             positions: Shape (nq,).
             velocities: Shape (nv,).
 
         Raises:
-            SimulationError: A shape is wrong or a value is not finite.
+            SimulationError: If a shape is wrong or a value is not finite.
         """
 
     @abstractmethod
     def snapshot(self) -> State:
-        """Return everything that `restore` needs to go on exactly from here."""
+        """Return everything that `restore` needs to continue exactly from here."""
 
     @abstractmethod
     def restore(self, state: State) -> None:
-        """Go back to a snapshot.
+        """Return to a snapshot.
 
         Raises:
-            SimulationError: It is of a world with another layout.
+            SimulationError: If the snapshot is of a world with another layout.
         """
 
-    # What can be measured -------------------------------------------------------------------
+    # Measurements ---------------------------------------------------------------------------
 
     def accelerations(self) -> Vector:
-        """Return the change of the velocities in the last step by the period, shape (nv,).
+        """Return the change of the velocities in the last step over the period, shape (nv,).
 
-        In the convention of the velocities; constraints are part of it. 0 before the first step,
-        and after `set_state` and `restore`.
+        In the convention of the velocities, effects of constraints included. 0 before the first
+        step and after `set_state` and `restore`.
         """
         raise self._lacks("accelerations")
 
@@ -200,15 +199,15 @@ class Simulation(Dynamics, Closeable):
         raise self._lacks("contacts")
 
     def joint_wrenches(self) -> Vector:
-        """Return what the joints carried last, shape (joints, 6): force in N, torque in N m."""
+        """Return the reactions of joints in the last step, shape (joints, 6): N, then N m."""
         raise self._lacks("joint_wrenches")
 
     def raycast(self, begins: Vector, ends: Vector) -> Records:
-        """Return what rays meet first: an array of `RAY_HIT` records.
+        """Return the first hit of each ray: an array of `RAY_HIT` records.
 
         Args:
-            begins: Where the rays begin, shape (n, 3), in m, in the world frame.
-            ends: Where they end, likewise.
+            begins: Start points of the rays, shape (n, 3), in m, in the world frame.
+            ends: End points, likewise.
         """
         raise self._lacks("raycast")
 
@@ -219,14 +218,14 @@ class Simulation(Dynamics, Closeable):
         """Return the poses of links and objects in the world frame, shape (names, 7).
 
         Args:
-            names: Their names, static ones too; None: all of `layout.bodies`.
-            positions: State to compute them for, shape (nq,); None: the present one.
+            names: Names, which may be static; None: all of `layout.bodies`.
+            positions: Shape (nq,); None: the present ones.
 
         Returns:
             In each row x, y, z in m and quaternion x, y, z, w, with w not negative.
 
         Raises:
-            SimulationError: There is no body of that name.
+            SimulationError: If there is no body of that name.
         """
 
     @abstractmethod
@@ -239,41 +238,41 @@ class Simulation(Dynamics, Closeable):
         """Return the velocities of links' and objects' origins, shape (names, 6).
 
         Args:
-            names: Their names, static ones too; None: all of `layout.bodies`.
-            positions: State to compute them for, shape (nq,); None: the present one.
-            velocities: Likewise, shape (nv,).
+            names: Names, which may be static; None: all of `layout.bodies`.
+            positions: Shape (nq,); None: the present ones.
+            velocities: Shape (nv,); None: the present ones.
 
         Returns:
-            In each row the linear velocity in m/s, then the angular one in rad/s, both along the
-            world's axes.
+            In each row the linear velocity in m/s, then the angular velocity in rad/s, both along
+            the world's axes.
 
         Raises:
-            SimulationError: There is no body of that name.
+            SimulationError: If there is no body of that name.
         """
 
     def body_accelerations(self, names: Sequence[str] | None = None) -> Vector:
         """Return the accelerations of links' and objects' origins, shape (names, 6).
 
-        Those of `accelerations`, in the present state: 0 before the first step, but for what the
-        motion itself makes of them.
+        They follow from `accelerations` and the present state; before the first step they have only
+        centripetal and Coriolis terms.
 
         Args:
-            names: Their names, static ones too; None: all of `layout.bodies`.
+            names: Names, which may be static; None: all of `layout.bodies`.
 
         Returns:
-            In each row the linear acceleration in m/s², then the angular one in rad/s², both along
-            the world's axes.
+            In each row the linear acceleration in m/s², then the angular acceleration in rad/s²,
+            both along the world's axes.
 
         Raises:
-            SimulationError: There is no body of that name.
+            SimulationError: If there is no body of that name.
         """
         raise self._lacks("accelerations")
 
     def body_motions(self, names: Sequence[str] | None = None) -> Vector:
-        """Return all of how links and objects move at present, shape (names, 19).
+        """Return poses, velocities, and accelerations of links and objects, shape (names, 19).
 
-        One call costs less than the three whose results it joins: a pose (7) as `body_poses` has
-        it, a velocity (6) as `body_velocities`, an acceleration (6) as `body_accelerations`.
+        In each row a pose (7) as from `body_poses`, a velocity (6) as from `body_velocities`, and
+        an acceleration (6) as from `body_accelerations`; faster than the three calls.
         """
         found = self.body_poses(names), self.body_velocities(names), self.body_accelerations(names)
         return np.concatenate(found, axis=1)
@@ -284,14 +283,14 @@ class Simulation(Dynamics, Closeable):
         Args:
             name: Of the robot or object, as in `layout.parts`.
             direction: Shape (3,), of length 1, in the world frame.
-            positions: State to compute it for, shape (nq,); None: the present one.
+            positions: Shape (nq,); None: the present ones.
 
         Returns:
-            The largest product of the direction with a point of the shapes, in m; -inf where
-            nothing of it can be touched.
+            The largest product of the direction with a point of the shapes, in m; -inf if it has no
+            collision shapes.
 
         Raises:
-            SimulationError: There is nothing of that name that moves.
+            SimulationError: If nothing of that name moves.
         """
         raise self._lacks("contacts")
 
@@ -299,8 +298,8 @@ class Simulation(Dynamics, Closeable):
 
     @abstractmethod
     def close(self) -> None:
-        """Free the world; calling it again does nothing."""
+        """Free the world; further calls do nothing."""
 
 
 Hook = Callable[[Simulation], None]
-"""Function that is called with the simulation, before a physics step."""
+"""Function that is called with the simulation before a physics step."""

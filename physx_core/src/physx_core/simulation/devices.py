@@ -1,4 +1,4 @@
-"""What motors and sensors have in common: their periods, and the names that they stand on."""
+"""Periods of motors and sensors, and look-up of the joints and bodies that they sit on."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from physx_core.errors import ComponentNotFoundError, ConfigError
 
 
 def steps_of(option: str, period: float | None, physics: float) -> int:
-    """Return how many physics steps a period has; None: one.
+    """Return the number of physics steps in a period; None: one.
 
     Args:
-        option: What to call the period in an error.
+        option: Name of the period in an error.
         period: In s.
         physics: The physics' period, in s.
 
     Raises:
-        ConfigError: It is no multiple of the physics' period.
+        ConfigError: If it is not a multiple of the physics' period.
     """
     if period is None:
         return 1
@@ -38,10 +38,10 @@ def places_of(kind: str, names: Iterable[str], known: Mapping[str, int] | Sequen
     Args:
         kind: ``"joint"`` or ``"body"``.
         names: Names to look up.
-        known: All there are: places by name, or names in order.
+        known: Places by name, or names in order.
 
     Raises:
-        ComponentNotFoundError: One is not there.
+        ComponentNotFoundError: If a name is unknown.
     """
     places = known if isinstance(known, Mapping) else {name: i for i, name in enumerate(known)}
     found = []
@@ -53,7 +53,7 @@ def places_of(kind: str, names: Iterable[str], known: Mapping[str, int] | Sequen
 
 
 def as_slice(places: Any) -> Any:
-    """Return places as a slice if they follow each other, which is quicker to use."""
+    """Return consecutive places as a slice, which is faster to index with."""
     first = int(places[0])
     if (places == np.arange(first, first + len(places))).all():
         return slice(first, first + len(places))
@@ -61,13 +61,13 @@ def as_slice(places: Any) -> Any:
 
 
 def check_unique(kind: str, names: Sequence[str]) -> None:
-    """Check that names differ.
+    """Check that there are names and no two are equal.
 
     Raises:
-        ConfigError: Two are the same, or there are none.
+        ConfigError: If two names are equal, or there are none.
     """
     if not names:
-        raise ConfigError(f"There is no {kind}.")
+        raise ConfigError(f"There must be at least one {kind}.")
     for name in names:
         if names.count(name) > 1:
-            raise ConfigError(f'There are {names.count(name)} of {kind} "{name}".')
+            raise ConfigError(f'{names.count(name)} of the {kind}s have the name "{name}".')

@@ -1,6 +1,6 @@
-"""Dynamics: what is computed for any state of a world, whatever its present one is.
+"""Dynamics of a world, computed for any state, independent of the present one.
 
-The convention of all states is that of `physx_core.simulation.layout`.
+States follow the convention of `physx_core.simulation.layout`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Dynamics(ABC):
     Attributes:
         engine: Name of the engine.
         layout: Names and places in the state.
-        features: What it can do: names of `physx_core.simulation.features.FEATURES`.
+        features: Its features: names of `physx_core.simulation.FEATURES`.
     """
 
     engine: str = ""
@@ -32,9 +32,9 @@ class Dynamics(ABC):
     def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
         """Return the accelerations, shape (nv,), that torques (nv,) cause in a state.
 
-        Damping, springs and Coulomb friction of the joints act; contacts and limits do not. All
-        joints are driven by torques here, whatever their mode. Accelerations are derivatives of
-        the velocities, so a base's are in its own frame.
+        Damping, springs, and Coulomb friction of the joints act; contacts and limits do not. All
+        joints are driven by torques here, whatever their mode. Accelerations are the derivatives of
+        the velocities, so those of a base are in its own frame.
         """
 
     @abstractmethod
@@ -52,8 +52,8 @@ class Dynamics(ABC):
     ) -> Vector:
         """Return the Jacobian, shape (6, nv), of a point of a link or object.
 
-        Times the velocities it gives the point's linear velocity, then the body's angular velocity,
-        both along the world's axes.
+        It maps the velocities to the point's linear and the body's angular velocity, both along the
+        world's axes.
 
         Args:
             body: Name of the link or object.
@@ -65,12 +65,12 @@ class Dynamics(ABC):
     def forward_dynamics_derivatives(
         self, positions: Vector, velocities: Vector, torques: Vector
     ) -> tuple[Vector, Vector, Vector]:
-        """Return the derivatives of `forward_dynamics` by positions, velocities and torques.
+        """Return the derivatives of `forward_dynamics` by positions, velocities, and torques.
 
         Returns:
-            Three arrays of shape (nv, nv), rows are accelerations. Those by the positions are by a
-            small motion along each velocity, so a base has six columns, not seven. Coulomb friction
-            counts as constant.
+            Three arrays of shape (nv, nv), whose rows are accelerations. Derivatives by the
+            positions are by small motions along the velocities, so a base has six columns, not
+            seven. Coulomb friction is treated as constant.
         """
         raise self._lacks("derivatives")
 
@@ -83,12 +83,12 @@ class Dynamics(ABC):
             positions: Shape (n, nq).
             velocities: Shape (n, nv).
             torques: Shape (n, nv).
-            processes: How many processes share the rows at most, this one among them. The others
-                start when they are first needed and end with the simulation. An engine that
-                cannot share rows computes all of them in this process, with the same results.
+            processes: Largest number of processes that share the rows, including this one. The
+                others start when they are first needed and end with the simulation. An engine
+                without them computes all rows in this process, with the same results.
 
         Raises:
-            SimulationError: An array does not fit; or one of the processes ended.
+            SimulationError: If an array has the wrong shape, or one of the processes ended.
         """
         states = zip(positions, velocities, torques, strict=True)
         found = [self.forward_dynamics(*state) for state in states]
@@ -105,8 +105,8 @@ class Dynamics(ABC):
     ) -> Vector:
         """Return gradients of weighted sums of `forward_dynamics` of many states.
 
-        Row i is of ``weights[i] @ forward_dynamics(...)`` in a state where the torques, whatever
-        they are, cause ``accelerations[i]``.
+        Row i belongs to ``weights[i] @ forward_dynamics(...)`` in the state whose torques cause
+        ``accelerations[i]``.
 
         Args:
             positions: Shape (n, nq); each row is a state.
@@ -116,11 +116,11 @@ class Dynamics(ABC):
             processes: As in `forward_dynamics_batch`.
 
         Returns:
-            Gradients by positions, velocities and torques, shape (3, n, nv); those by the positions
-            are by small motions, as in `forward_dynamics_derivatives`.
+            Gradients by positions, velocities, and torques, shape (3, n, nv); those by the
+            positions are by small motions, as in `forward_dynamics_derivatives`.
 
         Raises:
-            SimulationError: An array does not fit; or one of the processes ended.
+            SimulationError: If an array has the wrong shape, or one of the processes ended.
         """
         found = np.empty((3, len(weights), self.layout.nv))
         rows = zip(positions, velocities, accelerations, weights, strict=True)

@@ -1,6 +1,6 @@
-"""Where everything is in a simulation's state, and the plain arrays that it returns.
+"""Layout of a simulation's state, and the records that simulations return.
 
-The state has one convention for every engine, that of Pinocchio: first the robots in the world's
+Every engine follows one convention, that of Pinocchio: first the robots in the world's
 order, then the objects that move. In each robot a floating base comes first (position x, y, z in m
 and quaternion x, y, z, w; velocity as the base's twist in its own frame: linear in m/s, then
 angular in rad/s), then the joints in the order of the model file's tree. Every joint of one degree
@@ -27,10 +27,9 @@ CONTACT = np.dtype(
         ("depth", np.float64),
     ]
 )
-"""A contact: which bodies (places in `Layout.names`, `body_a` before `body_b`, so that what never
-moves is `body_b`); the point, in m; the force on `body_a`, in N (on `body_b` it is the opposite);
-the normal, of length 1, from `body_b` to `body_a`; how deep they are in each other, in m. All in
-the world frame."""
+"""A contact: the bodies (places in `Layout.names`, `body_a` before `body_b`, so a static one is
+`body_b`); the point, in m; the force on `body_a`, in N (that on `body_b` is opposite); the normal,
+of length 1, from `body_b` to `body_a`; the penetration depth, in m. All in the world frame."""
 
 RAY_HIT = np.dtype(
     [
@@ -41,17 +40,17 @@ RAY_HIT = np.dtype(
         ("fraction", np.float64),
     ]
 )
-"""What a ray meets first: whether anything; the body (place in `Layout.names`, -1: none), the point
-in m and the surface's normal there, in the world frame; where along the ray, in [0, 1]."""
+"""The first hit of a ray: whether there is one; the body (place in `Layout.names`, -1: none); the
+point in m and the surface normal, in the world frame; the place along the ray, in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Place of one robot, or of one object that moves, in the state.
+    """Place of one robot or moving object in the state.
 
     Attributes:
         name: Name of the robot or object.
-        floating: Whether it begins with a floating base.
+        floating: Whether it has a floating base.
         positions: Its part of the positions.
         velocities: Its part of the velocities.
         joints: Its part of the joints, and so of the commands.
@@ -68,12 +67,12 @@ class Part:
 
 @dataclass(frozen=True)
 class Layout:
-    """Names and places of everything in the state; fixed when the simulation is built.
+    """Names and places of everything in a state; fixed when the simulation is built.
 
     Attributes:
-        joints: Names of the joints of one degree of freedom, in the state's order. With several
+        joints: Names of the joints with one degree of freedom, in the state's order. With several
             robots each name begins with the robot's name and ``/``.
-        bodies: Names of the links, likewise, and of the objects that move.
+        bodies: Names of the links, likewise, and of the moving objects.
         position_index: Place of each joint in the positions, by joint name.
         velocity_index: Place of each joint in velocities and torques, by joint name.
         nq: Length of the positions: 7 for each floating base and object, 1 for each joint.
@@ -83,8 +82,8 @@ class Layout:
         max_velocity: Limits of the joints' velocities, shape (joints,), in rad/s or m/s.
         max_torque: Limits of the joints' torques, shape (joints,), in N m or N.
         parts: Place of each robot and moving object, by name.
-        statics: Names of what never moves: ``"ground"``, then the static objects.
-        modes: What a command to each joint means, as in `JointSettings`.
+        statics: Names of everything static: ``"ground"``, then the static objects.
+        modes: Command mode of each joint, as in `JointSettings`.
     """
 
     joints: tuple[str, ...]
@@ -103,16 +102,16 @@ class Layout:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all that can be touched: the bodies, then what never moves."""
+        """Names of everything that can be touched: the bodies, then the statics."""
         return (*self.bodies, *self.statics)
 
 
 @dataclass(frozen=True)
 class AppliedWrench:
-    """A wrench that acts on the world.
+    """A wrench that acts on a world.
 
     Attributes:
-        number: What `Simulation.remove_wrench` takes.
+        number: Its number for `Simulation.remove_wrench`.
         begin: Frame in which it was applied.
         wrench: The wrench.
     """
@@ -131,9 +130,9 @@ class State:
         velocities: Shape (nv,).
         commands: The held commands, shape (joints,).
         frame: Number of physics steps since the simulation was built.
-        wrenches: Those that act.
-        engine: Name of the engine that it is from.
-        native: What the engine carries over besides, or in other numbers.
+        wrenches: Active wrenches.
+        engine: Name of the engine that it comes from.
+        native: The engine's own representation of its state.
     """
 
     positions: Vector

@@ -1,4 +1,4 @@
-"""What a backend says of the robots that it knows by name."""
+"""Description of a robot that a backend knows by name."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ class RobotInfo:
         path: Its model file.
         joints: Number of its joints' degrees of freedom; a floating base has 6 more.
         mass: Of all its links, in kg.
-        collisions: What touches other things: ``"primitives"``, ``"meshes"``, ``"both"`` or
+        collisions: Kind of its collision shapes: ``"primitives"``, ``"meshes"``, ``"both"`` or
             ``"none"``.
-        warning: What to know before using it; empty if there is nothing.
-        error: Why it cannot be loaded; empty if it can. The other values are then 0 and ``"none"``.
+        warning: Caveat about using it; empty: none.
+        error: Reason why it cannot be loaded, empty if it can. The other values are then 0 and
+            ``"none"``.
     """
 
     name: str

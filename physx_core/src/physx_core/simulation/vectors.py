@@ -1,4 +1,4 @@
-"""Checks of the arrays that callers give to a simulation; each error names the array."""
+"""Validation of arrays that callers give to a simulation; each error names the array."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from physx_core.errors import SimulationError
 from physx_core.typing import Vector
 
 LARGEST = 1e100
-"""Length of vectors from which their products overflow."""
+"""Length from which products of vectors overflow."""
 _LARGEST_SQUARE = LARGEST**2
 _FLOAT = np.dtype(np.float64)
 
@@ -20,7 +20,7 @@ def finite_vector(name: str, given: Any, length: int) -> Vector:
     """Return finite numbers as a new vector of a length.
 
     Raises:
-        SimulationError: They are none.
+        SimulationError: If they are not `length` finite numbers.
     """
     plain = type(given) is np.ndarray and given.dtype is _FLOAT
     numbers = given.copy() if plain else _numbers(name, given)
@@ -35,7 +35,7 @@ def finite_rows(name: str, given: ArrayLike, width: int) -> Vector:
     """Return finite numbers as a new array of shape (any, width).
 
     Raises:
-        SimulationError: They are none.
+        SimulationError: If they are not finite numbers of that shape.
     """
     numbers = _numbers(name, given)
     fits = numbers.ndim == 2 and numbers.shape[1] == width
@@ -50,14 +50,14 @@ def _numbers(name: str, given: ArrayLike) -> Vector:
     try:
         return np.array(given, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise SimulationError(f"{name} are no numbers: {error}.") from error
+        raise SimulationError(f"{name} are not numbers: {error}.") from error
 
 
 def overwrite(name: str, target: Vector, given: Any) -> None:
-    """Write finite numbers into a vector, which stays as it is where they are none.
+    """Write finite numbers into a vector; on an error it stays as it is.
 
     Raises:
-        SimulationError: They are none, or not as many as the vector has.
+        SimulationError: If they are not as many finite numbers as the vector has.
     """
     fits = type(given) is np.ndarray and given.dtype is _FLOAT and given.shape == target.shape
     if fits and given.dot(given) < _LARGEST_SQUARE:
@@ -66,18 +66,18 @@ def overwrite(name: str, target: Vector, given: Any) -> None:
         target[:] = finite_vector(name, given, len(target))
 
 
-def written(whole: Vector, out: Vector) -> Vector:
-    """Return `out` with a vector written into it.
+def copy_to(whole: Vector, out: Vector) -> Vector:
+    """Copy a vector to `out` and return `out`.
 
     Raises:
-        SimulationError: `out` does not fit.
+        SimulationError: If `out` does not fit.
     """
     if not isinstance(out, np.ndarray):
         raise SimulationError(f"out is {type(out).__name__} but must be a NumPy array.")
     if out.shape != whole.shape or out.dtype != _FLOAT or not out.flags.writeable:
         raise SimulationError(
             f"out has the shape {out.shape} and type {out.dtype} but needs {whole.shape} and "
-            "float64, writeable."
+            "float64, writable."
         )
     out[:] = whole
     return out

@@ -1,4 +1,4 @@
-"""Forward dynamics of many states at once, with gradients."""
+"""Forward dynamics of many states at once, and its gradients."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from physx_core.typing import Vector
 from physx_dart.shared.resistance import Resistance
 
 
-class MoverBatches:
-    """Forward dynamics of many states of one robot or object; each row is a state.
+class MoverBatchDynamics:
+    """Forward dynamics of many states of a robot or object; each row is a state.
 
     Attributes:
         model: Pinocchio's model, with gravity and the rotors' inertia.
-        resistance: What resists its joints' motion.
+        resistance: Resistance of its joints.
     """
 
     def __init__(self, model: Any, resistance: Resistance) -> None:
@@ -25,7 +25,7 @@ class MoverBatches:
         self._data, self._pool = model.createData(), pinocchio.ModelPool(model, 1)
 
     def forward(self, q: Vector, v: Vector, tau: Vector) -> Vector:
-        """Return the accelerations, shape (n, nv), resistance included."""
+        """Return the accelerations, shape (n, nv), with joint resistance."""
         out = np.zeros((self.model.nv, len(q)), order="F")
         if out.size:
             resisted = tau - self.resistance.torques(q, v)
@@ -39,7 +39,7 @@ class MoverBatches:
         With r(q, v, a) the torques of the inverse dynamics and M its derivative by a, they are
         x = weights / M by the torques, -x dr/dq by the positions and -x dr/dv by the velocities.
         The derivatives of the inverse dynamics take two thirds of the time of those of the forward
-        dynamics, and leave M behind.
+        dynamics, and yield M as well.
         """
         model, data, resistance = self.model, self._data, self.resistance
         derive, dot = pinocchio.computeRNEADerivatives, np.dot
@@ -60,16 +60,16 @@ class MoverBatches:
         return found
 
 
-class Batches:
-    """Forward dynamics of many states of a world; each row is a state. Nothing is checked here.
+class BatchDynamics:
+    """Forward dynamics of many states of a world; each row is a state. Arrays are not validated.
 
     Attributes:
-        movers: One for each robot, then each object that moves.
+        movers: One for each robot, then for each moving object.
         nq: Length of the positions.
         nv: Length of the velocities.
     """
 
-    def __init__(self, movers: Sequence[MoverBatches]) -> None:
+    def __init__(self, movers: Sequence[MoverBatchDynamics]) -> None:
         self.movers = movers
         self.nq = sum(each.model.nq for each in movers)
         self.nv = sum(each.model.nv for each in movers)
@@ -86,7 +86,7 @@ class Batches:
             found[:, :, j] = each.gradients(q[:, i], v[:, j], a[:, j], weights[:, j])
         return found
 
-    def _slices(self) -> Iterator[tuple[MoverBatches, slice, slice]]:
+    def _slices(self) -> Iterator[tuple[MoverBatchDynamics, slice, slice]]:
         nq = nv = 0
         for each in self.movers:
             model = each.model

@@ -1,6 +1,6 @@
-"""Batches whose rows several processes share.
+"""Batches of forward dynamics that several processes compute in parallel.
 
-Pinocchio's derivatives hold Python's global lock, so that only processes compute them side by side.
+Pinocchio's derivatives hold Python's global lock, so threads cannot compute them in parallel.
 """
 
 from __future__ import annotations
@@ -20,46 +20,46 @@ import numpy as np
 from physx_core import Closeable
 from physx_core.errors import SimulationError
 from physx_core.typing import Vector
-from physx_dart.batch.batches import Batches
+from physx_dart.batch.batches import BatchDynamics
 from physx_dart.batch.worker import (
     DONE,
     FORWARD,
     GRADIENTS,
     REQUEST,
     SharedRows,
-    computed,
-    described,
+    compute,
+    describe_models,
 )
 
 _LEAST_ROWS = 16
-"""Rows of a batch for which a process is worth waking."""
+"""Least number of rows for which using a process pays off."""
 _PATIENCE = 5.0
-"""Time in s for which a process that closed its connection may take to end."""
+"""Time in s that a process which closed its connection may take to exit."""
 
 
-class SharedBatches(Closeable):
-    """Batches of which this process computes some rows, and others the rest at the same time.
+class ParallelBatchDynamics(Closeable):
+    """Batches of which this process computes some rows and other processes the rest.
 
-    The other processes start when they are first needed. They end when this is closed or no longer
-    used, and when this process ends, whatever ends it. A process forked from this one computes all
-    rows itself.
+    The other processes start when they are first needed. They end when this is closed or garbage
+    collected, and when this process ends, even if it is killed. A process forked from this one
+    computes all rows itself.
     """
 
-    def __init__(self, batches: Batches) -> None:
+    def __init__(self, batches: BatchDynamics) -> None:
         self._batches = batches
         self._owner = os.getpid()
         self._workers: list[_Worker] = []
         self._memory: SharedRows | None = None
         self._held = contextlib.ExitStack()
-        weakref.finalize(self, _let_go, self._held, self._owner)
+        weakref.finalize(self, _end_processes, self._held, self._owner)
 
     def forward(self, q: Vector, v: Vector, tau: Vector, *, processes: int) -> Vector:
         """Return the accelerations, shape (n, nv).
 
         Raises:
-            SimulationError: One of the processes ended.
+            SimulationError: If one of the processes ended.
         """
-        return self._computed(FORWARD, (q, v, tau), processes)
+        return self._compute(FORWARD, (q, v, tau), processes)
 
     def gradients(
         self, q: Vector, v: Vector, a: Vector, weights: Vector, *, processes: int
@@ -67,72 +67,72 @@ class SharedBatches(Closeable):
         """Return the gradients of weighted sums of the accelerations, shape (3, n, nv).
 
         Raises:
-            SimulationError: One of the processes ended.
+            SimulationError: If one of the processes ended.
         """
-        return self._computed(GRADIENTS, (q, v, a, weights), processes)
+        return self._compute(GRADIENTS, (q, v, a, weights), processes)
 
     def close(self) -> None:
-        """End the other processes; a batch that needs them starts new ones."""
+        """End the other processes; the next batch that needs them starts new ones."""
         self._workers, self._memory = [], None
-        _let_go(self._held, self._owner)
+        _end_processes(self._held, self._owner)
 
-    def _computed(self, kind: int, states: tuple[Vector, ...], processes: int) -> Vector:
+    def _compute(self, kind: int, states: tuple[Vector, ...], processes: int) -> Vector:
         shares = min(processes, len(states[0]) // _LEAST_ROWS)
         if shares < 2 or os.getpid() != self._owner:
-            return computed(self._batches, kind, states)
+            return compute(self._batches, kind, states)
         try:
-            return self._shared(kind, states, shares)
-        except BaseException:  # answers may be on their way that nobody waits for
+            return self._compute_shared(kind, states, shares)
+        except BaseException:  # there may be pending replies that nobody waits for
             self.close()
             raise
 
-    def _shared(self, kind: int, states: tuple[Vector, ...], shares: int) -> Vector:
-        """Return the results of all rows; each process computes one share, this one the first."""
+    def _compute_shared(self, kind: int, states: tuple[Vector, ...], shares: int) -> Vector:
+        """Return the results of all rows; each process computes a share, this one the first."""
         rows = len(states[0])
         ends = [rows * share // shares for share in range(1, shares + 1)]
         mine = ends[0]
-        workers, memory = self._started(shares - 1)
+        workers, memory = self._start_workers(shares - 1)
         given, results = memory.arrays(kind, rows)
         for target, each in zip(given, states, strict=True):
             target[mine:] = each[mine:]
         for worker, begin, end in zip(workers, ends[:-1], ends[1:], strict=True):
             worker.ask(REQUEST.pack(kind, rows, begin, end))
         found = np.empty(results.shape)
-        found[..., :mine, :] = computed(self._batches, kind, tuple(x[:mine] for x in states))
+        found[..., :mine, :] = compute(self._batches, kind, tuple(x[:mine] for x in states))
         for worker in workers:
             worker.wait()
         found[..., mine:, :] = results[..., mine:, :]
         return found
 
-    def _started(self, count: int) -> tuple[list[_Worker], SharedRows]:
-        """Return so many of the other processes, and what they share."""
+    def _start_workers(self, count: int) -> tuple[list[_Worker], SharedRows]:
+        """Return `count` other processes, and the memory that they share."""
         if self._memory is None:
             file = self._held.enter_context(_anonymous_file())
             self._memory = SharedRows(file.fileno(), self._batches.nq, self._batches.nv)
         new = [_Worker(self._memory.file, self._held) for _ in range(count - len(self._workers))]
         for worker in new:
-            worker.ask(described(self._batches))
+            worker.ask(describe_models(self._batches))
         self._workers += new
         return self._workers[:count], self._memory
 
 
 class _Worker:
-    """One of the other processes."""
+    """A process that computes rows."""
 
     def __init__(self, file: int, held: contextlib.ExitStack) -> None:
         """Start it.
 
         Args:
-            file: Descriptor of the memory that it shares.
-            held: Ends it when it is closed.
+            file: Descriptor of the shared memory.
+            held: Ends the process when it is closed.
 
         Raises:
-            SimulationError: The operating system refused.
+            SimulationError: If the operating system cannot start it.
         """
         self._link, theirs = socket.socketpair()
         held.enter_context(self._link)
         command = [sys.executable, "-P", "-m", "physx_dart.batch.worker", str(file)]
-        # The processes share the cores: a numerical library must not take all for each.
+        # The processes share the cores: numerical libraries must not use all of them in each.
         environment = {"OMP_NUM_THREADS": "1", **os.environ}
         with theirs:
             try:
@@ -144,7 +144,9 @@ class _Worker:
                     start_new_session=True,
                 )
             except OSError as error:
-                raise SimulationError(f"A process for batches cannot start: {error}.") from error
+                raise SimulationError(
+                    f"A process for batches cannot be started: {error}."
+                ) from error
         held.callback(self._process.wait)
         held.callback(self._process.kill)
 
@@ -152,7 +154,7 @@ class _Worker:
         """Send a message.
 
         Raises:
-            SimulationError: The process ended.
+            SimulationError: If the process ended.
         """
         try:
             self._link.sendall(message)
@@ -160,10 +162,10 @@ class _Worker:
             raise self._lost() from None
 
     def wait(self) -> None:
-        """Wait until it has done what it was asked.
+        """Wait until it has finished its request.
 
         Raises:
-            SimulationError: The process ended.
+            SimulationError: If the process ended.
         """
         with contextlib.suppress(ConnectionError):
             if self._link.recv(len(DONE)) == DONE:
@@ -184,14 +186,14 @@ class _Worker:
         )
 
 
-def _let_go(held: contextlib.ExitStack, owner: int) -> None:
-    """End processes and free what they share; a forked process leaves this to its parent."""
+def _end_processes(held: contextlib.ExitStack, owner: int) -> None:
+    """End processes and free their memory; a forked process leaves this to its parent."""
     if os.getpid() == owner:
         held.close()
 
 
 def _anonymous_file() -> IO[bytes]:
-    """Return a file without a name, in memory where the system has such."""
+    """Return a file without a name, in memory if the system supports that."""
     if hasattr(os, "memfd_create"):
         return os.fdopen(os.memfd_create("physx_batches"), "r+b", buffering=0)
     return tempfile.TemporaryFile(buffering=0)

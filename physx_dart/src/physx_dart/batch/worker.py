@@ -1,7 +1,7 @@
-"""A process that computes rows of batches for another one: ``python -m physx_dart.batch.worker``.
+"""Process that computes rows of batches for another one: ``python -m physx_dart.batch.worker``.
 
-It is told the models once, then which rows to compute. The rows lie in memory that both processes
-map, and so do the results. It ends when the other process closes the connection or is gone.
+It receives the models once, then requests for rows. The rows and the results are in memory that
+both processes map. It exits when the other process closes the connection or ends.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import numpy as np
 import pinocchio
 
 from physx_core.typing import Vector
-from physx_dart.batch.batches import Batches, MoverBatches
+from physx_dart.batch.batches import BatchDynamics, MoverBatchDynamics
 from physx_dart.shared.resistance import Resistance
 
 FORWARD, GRADIENTS = range(2)
 REQUEST = struct.Struct("<4q")
 """`FORWARD` or `GRADIENTS`; rows of the batch; the first to compute, and the first after those."""
 DONE = b"."
-"""Answer to each request."""
+"""Reply to each request."""
 
 
 class SharedRows:
@@ -36,7 +36,7 @@ class SharedRows:
     """
 
     def __init__(self, file: int, nq: int, nv: int) -> None:
-        """Keep what is mapped.
+        """Map nothing yet.
 
         Args:
             file: Descriptor of the file; it must stay open.
@@ -47,7 +47,7 @@ class SharedRows:
         self._numbers = np.empty(0)
 
     def arrays(self, kind: int, rows: int) -> tuple[tuple[Vector, ...], Vector]:
-        """Return what `computed` takes and returns for a batch, as parts of the file."""
+        """Return the arguments and the result of `compute` for a batch, as views of the file."""
         begin = rows * self._nq
         size = begin + 6 * rows * self._nv
         if size > len(self._numbers):
@@ -61,35 +61,35 @@ class SharedRows:
         return (positions, *others[:3]), others[3:]
 
 
-def computed(batches: Batches, kind: int, states: tuple[Vector, ...]) -> Vector:
+def compute(batches: BatchDynamics, kind: int, states: tuple[Vector, ...]) -> Vector:
     """Return the accelerations, shape (n, nv), or the gradients, shape (3, n, nv), of states."""
     return (batches.forward if kind == FORWARD else batches.gradients)(*states)
 
 
-def described(batches: Batches) -> bytes:
-    """Return a line of text that `batches_of` makes the same batches from; it holds no code."""
+def describe_models(batches: BatchDynamics) -> bytes:
+    """Return a line of text from which `batches_of` rebuilds the batches; it contains no code."""
     movers = [
         (each.model.saveToString(), each.resistance.table.tolist()) for each in batches.movers
     ]
     return json.dumps(movers).encode("ascii") + b"\n"
 
 
-def batches_of(line: bytes) -> Batches:
-    """Return the batches that a line of `described` says."""
+def batches_of(line: bytes) -> BatchDynamics:
+    """Return the batches that a line of `describe_models` describes."""
     movers = []
     for text, table in json.loads(line):
         model = pinocchio.Model()
         model.loadFromString(text)
-        movers.append(MoverBatches(model, Resistance(np.array(table).reshape(5, model.nv))))
-    return Batches(movers)
+        movers.append(MoverBatchDynamics(model, Resistance(np.array(table).reshape(5, model.nv))))
+    return BatchDynamics(movers)
 
 
 def serve(link: socket.socket, file: int) -> None:
     """Compute rows until the other process closes the connection.
 
     Args:
-        link: Connection to the process that has the batches.
-        file: Descriptor of the memory in which they lie.
+        link: Connection to the process with the batches.
+        file: Descriptor of the shared memory.
     """
     with link, link.makefile("rb") as requests:
         line = requests.readline()
@@ -101,7 +101,7 @@ def serve(link: socket.socket, file: int) -> None:
             kind, rows, begin, end = REQUEST.unpack(request)
             states, found = memory.arrays(kind, rows)
             mine = tuple(each[begin:end] for each in states)
-            found[..., begin:end, :] = computed(batches, kind, mine)
+            found[..., begin:end, :] = compute(batches, kind, mine)
             link.sendall(DONE)
 
 

@@ -19,7 +19,7 @@ def run(words: Sequence[str]) -> None:
     """Print each robot that an installed backend knows by name.
 
     Raises:
-        UsageError: There are words after the command.
+        UsageError: If there are words after the command.
     """
     if words and words[0] in ("-h", "--help"):
         print(_HELP)

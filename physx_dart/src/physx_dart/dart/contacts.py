@@ -1,4 +1,4 @@
-"""Reading DART's contacts and rays into arrays at once; DART's own objects never leave here."""
+"""Contacts and ray hits of DART, copied to arrays; DART's own objects never leave this module."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from physx_core.typing import Records, Vector
 
 
 class ContactReader:
-    """What touches in a world of DART.
+    """Reads the contacts of a world in DART.
 
     Args:
         world: The world; it must live as long as this reader.
@@ -22,7 +22,7 @@ class ContactReader:
 
     def __init__(self, world: Any, bodies: list[Any], period: float) -> None:
         self._world = world
-        # As long as Python's objects for them are kept, DART gives the same ones again.
+        # As long as these Python objects are kept, DART returns the same ones again.
         self._bodies = {body: place for place, body in enumerate(bodies)}
         self._places: dict[Any, int] = {}
 
@@ -46,7 +46,7 @@ class ContactReader:
         return records
 
     def raycast(self, begins: Vector, ends: Vector) -> Records:
-        """Return what rays meet first: an array of `RAY_HIT` records."""
+        """Return the first hit of each ray: an array of `RAY_HIT` records."""
         records = np.zeros(len(begins), RAY_HIT)
         records["body"] = -1
         group = self._world.getConstraintSolver().getCollisionGroup()

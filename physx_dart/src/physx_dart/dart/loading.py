@@ -1,4 +1,4 @@
-"""Making DART's skeletons: of robots, objects and the ground, with their collision shapes."""
+"""Creation of DART's skeletons for robots, objects, and the ground, with their shapes."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from physx_dart.shared.shapes import CollisionShape
 
 WORLD = "world"
 ROOT = "physx root"
-"""Name that DART gets for a root link `world`, which it would leave out."""
+"""Name that stands for a root link `world` in DART, which would drop it."""
 GROUND_SIZE = (1000.0, 1000.0, 10.0)
-"""Of the box that stands for an endless plane, in m. DART finds one point only where a box touches
-a plane, but the corners where it touches a box."""
+"""Size of the box that stands for an infinite plane, in m. For a box on a plane DART finds a single
+contact point, for a box on a box all corners."""
 
 _MESH = (
     '<robot name="mesh"><link name="mesh"><collision><geometry><mesh filename="{}"/>'
@@ -37,13 +37,13 @@ def load_skeleton(mover: Mover) -> dynamics.Skeleton:
     """Return the skeleton of a robot or object, without shapes.
 
     Raises:
-        ModelError: DART cannot load it; the error holds what DART says.
+        ModelError: If DART cannot load it; the message quotes DART.
     """
     model, text = mover.model, mover.model.text
     if model.links[0] == WORLD:
         text = text.replace(f'link="{WORLD}"', f'link="{ROOT}"')
         text = text.replace(f'<link name="{WORLD}">', f'<link name="{ROOT}">')
-    skeleton = _parsed(text, mover.fixed_base, str(model.path))
+    skeleton = _parse(text, mover.fixed_base, str(model.path))
     if mover.fixed_base:
         place = _transform(mover.position, to_matrix(mover.orientation))
         skeleton.getRootJoint().setTransformFromParentBodyNode(place)
@@ -52,28 +52,28 @@ def load_skeleton(mover: Mover) -> dynamics.Skeleton:
 
 
 def link_name(link: str) -> str:
-    """Return the name that a link has in DART."""
+    """Return the name of a link in DART."""
     return ROOT if link == WORLD else link
 
 
 def attach_shapes(skeleton: dynamics.Skeleton, shapes: Sequence[CollisionShape]) -> None:
-    """Give a skeleton's bodies the shapes that touch things.
+    """Attach collision shapes to a skeleton's bodies.
 
     Raises:
-        ModelError: A mesh cannot be loaded.
+        ModelError: If a mesh cannot be loaded.
     """
     for shape in shapes:
         body = skeleton.getBodyNode(link_name(shape.body))
-        if body is None:  # an object has one body only
+        if body is None:  # an object has a single body
             body = skeleton.getBodyNode(0)
         _attach(body, _dart_shape(shape), shape, _transform(shape.position, shape.rotation))
 
 
 def static_skeleton(static: Static) -> dynamics.Skeleton:
-    """Return a skeleton that never moves, of a shape or of the ground.
+    """Return the immobile skeleton of a shape or of the ground.
 
     Raises:
-        ModelError: A mesh cannot be loaded.
+        ModelError: If a mesh cannot be loaded.
     """
     skeleton = dynamics.Skeleton(static.name)
     joint, body = skeleton.createWeldJointAndBodyNodePair()
@@ -129,7 +129,7 @@ def _attach(
 def _dart_shape(shape: CollisionShape) -> Any:
     size = list(shape.size)
     if shape.mesh is not None:
-        loaded = _loaded_mesh(shape.mesh)
+        loaded = _load_mesh(shape.mesh)
         loaded.setScale(size)
         return loaded
     if shape.kind == "box":
@@ -141,16 +141,16 @@ def _dart_shape(shape: CollisionShape) -> Any:
     return dynamics.CylinderShape(*size)
 
 
-def _loaded_mesh(path: Path) -> Any:
+def _load_mesh(path: Path) -> Any:
     text = _MESH.format(str(path).replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;"))
-    skeleton = _parsed(text, True, str(path))
+    skeleton = _parse(text, True, str(path))
     for node in skeleton.getBodyNode(0).getShapeNodes():
         return node.getShape()
-    raise ModelError(f"DART finds no mesh in {path}.")
+    raise ModelError(f"DART does not find a mesh in {path}.")
 
 
 def _height_shape(field: HeightField) -> Any:
-    """Return a mesh of a height field, by way of a file, since DART takes none otherwise."""
+    """Return a mesh of a height field, by way of a file, as DART loads meshes from files only."""
     nx, ny = field.heights.shape
     x0, y0 = field.corner()
     lines = [
@@ -164,7 +164,7 @@ def _height_shape(field: HeightField) -> Any:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "heights.obj"
         path.write_text("\n".join(lines) + "\n", encoding="ascii")
-        return _loaded_mesh(path)
+        return _load_mesh(path)
 
 
 def _transform(position: Sequence[float] | Vector, rotation: Vector) -> Vector:
@@ -173,13 +173,13 @@ def _transform(position: Sequence[float] | Vector, rotation: Vector) -> Vector:
     return transform
 
 
-def _parsed(text: str, fixed_base: bool, origin: str) -> dynamics.Skeleton:
+def _parse(text: str, fixed_base: bool, origin: str) -> dynamics.Skeleton:
     options = utils.DartLoaderOptions()
     kind = utils.DartLoaderRootJointType
     options.mDefaultRootJointType = kind.FIXED if fixed_base else kind.FLOATING
     loader = utils.DartLoader()
     loader.setOptions(options)
-    with _captured_messages() as messages:
+    with _capture_messages() as messages:
         skeleton = loader.parseSkeletonString(text, "")
     if skeleton is None:
         raise ModelError(f"DART cannot load {origin}.{''.join(messages)}")
@@ -187,8 +187,8 @@ def _parsed(text: str, fixed_base: bool, origin: str) -> dynamics.Skeleton:
 
 
 @contextmanager
-def _captured_messages() -> Iterator[list[str]]:
-    """Collect what native code of this process writes to standard error meanwhile."""
+def _capture_messages() -> Iterator[list[str]]:
+    """Collect what native code of this process writes to standard error."""
     messages: list[str] = []
     sys.stderr.flush()
     saved = os.dup(2)

@@ -1,4 +1,4 @@
-"""Entry point `dart`: what the plugin brings; nothing of it is imported yet."""
+"""Entry point `dart`: references to the plugin's components, which are imported when used."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from physx_core.plugins import hookimpl
 
 @hookimpl
 def physx_backends() -> dict[str, str]:
-    """Return the engine DART."""
+    """Return the DART backend."""
     return {"dart": "physx_dart.dart.simulation:DartBackend"}
 
 
 @hookimpl
 def physx_environments() -> dict[str, str]:
-    """Return the environments that DART simulates."""
+    """Return the environments simulated with DART."""
     return {
         "arm": "physx_dart.environments.arm:DartArm",
         "double-pendulum": "physx_dart.environments.double_pendulum:DartDoublePendulum",

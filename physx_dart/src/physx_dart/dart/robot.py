@@ -1,4 +1,4 @@
-"""One robot or object in DART."""
+"""A robot or object in DART."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ _ACTUATORS = {
 
 
 class DartRobot(RobotEngine):
-    """A skeleton of DART, and a second one on which states are computed without moving the first.
+    """A simulated skeleton, and a second one for the dynamics of other states.
 
     Attributes:
-        skeleton: The skeleton that is simulated.
-        bodies: Its body of each link.
+        skeleton: The simulated skeleton.
+        bodies: Its body for each link.
     """
 
     def __init__(self, mover: Mover, gravity: tuple[float, ...]) -> None:
@@ -63,28 +63,28 @@ class DartRobot(RobotEngine):
             self.skeleton.setCommands(commands)
 
     def _read(self) -> None:
-        """Take the state from DART; to be called after each change of it."""
+        """Read the state from DART; to be called after each change of it."""
         self._q, self._v = self.skeleton.getPositions(), self.skeleton.getVelocities()
         self._quaternion: tuple[float, ...] | None = None
         self._twist: Vector | None = None
 
-    def _attitude(self) -> tuple[float, ...]:
+    def _orientation(self) -> tuple[float, ...]:
         """Return the base's quaternion x, y, z, w."""
         if self._quaternion is None:
             self._quaternion = from_rotation_vector(*self._q[:3].tolist())
         return self._quaternion
 
     def positions(self) -> Vector:
-        """Return the present positions, shape (nq,), in a vector of its own."""
+        """Return the present positions, shape (nq,), as a new vector."""
         q = self._q if self._sorted else self._q[self._native]
         if not self.base:
             return q.copy()
         found = np.empty(self.nq)
-        found[:7], found[7:] = (*q[3:6].tolist(), *self._attitude()), q[6:]
+        found[:7], found[7:] = (*q[3:6].tolist(), *self._orientation()), q[6:]
         return found
 
     def velocities(self) -> Vector:
-        """Return the present velocities, shape (nv,), in a vector of its own."""
+        """Return the present velocities, shape (nv,), as a new vector."""
         if self._twist is None:
             v = self._v if self._sorted else self._v[self._native]
             self._twist = self._in_base(v.copy()) if self.base else v
@@ -92,20 +92,20 @@ class DartRobot(RobotEngine):
 
     def accelerations(self) -> Vector:
         """Return the accelerations of the last step, shape (nv,)."""
-        a = self._ordered(self.skeleton.getAccelerations())
+        a = self._to_layout(self.skeleton.getAccelerations())
         if not self.base:
             return a
         x, y, z, *linear = a[:6].tolist()
-        attitude = self._attitude()
-        change = base_accelerations(attitude, linear, self.velocities())
-        a[:6] = (*change, *rotate_back(attitude, x, y, z))
+        orientation = self._orientation()
+        change = base_accelerations(orientation, linear, self.velocities())
+        a[:6] = (*change, *rotate_back(orientation, x, y, z))
         return a
 
     def _in_base(self, v: Vector) -> Vector:
-        """Turn a base's angular and linear motion in the world into linear, angular in its own."""
+        """Convert a base's twist from DART's: angular, linear, in the world frame."""
         x, y, z, a, b, c = v[:6].tolist()
-        attitude = self._attitude()
-        v[:6] = (*rotate_back(attitude, a, b, c), *rotate_back(attitude, x, y, z))
+        orientation = self._orientation()
+        v[:6] = (*rotate_back(orientation, a, b, c), *rotate_back(orientation, x, y, z))
         return v
 
     def write(self, positions: Vector, velocities: Vector) -> None:
@@ -114,17 +114,17 @@ class DartRobot(RobotEngine):
         self._read()
 
     def native(self) -> tuple[Vector, Vector]:
-        """Return the state exactly as DART has it, copied."""
+        """Return a copy of DART's own state."""
         return self._q.copy(), self._v.copy()
 
     def set_native(self, positions: Vector, velocities: Vector) -> None:
-        """Set the state to what `native` returned."""
+        """Set the state that `native` returned."""
         self.skeleton.setPositions(positions)
         self.skeleton.setVelocities(velocities)
         self._read()
 
     def speed(self) -> float:
-        """Return the length of the velocities; NaN or inf where the state is broken."""
+        """Return the norm of the velocities; NaN or inf if the state is not finite."""
         self._read()
         q, v = self._q, self._v
         return math.sqrt(v.dot(v)) if math.isfinite(q.dot(q)) else math.nan
@@ -134,13 +134,13 @@ class DartRobot(RobotEngine):
         return self.bodies[link].getNumDependentGenCoords() > 0
 
     def push(self, link: int, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
-        """Add a wrench for the next steps until `release`."""
+        """Apply a wrench until `release`."""
         body = self.bodies[link]
         body.addExtForce(force, point, local, True)
         body.addExtTorque(torque, local)
 
     def release(self) -> None:
-        """End all wrenches."""
+        """Remove all wrenches."""
         self.skeleton.clearExternalForces()
 
     @property
@@ -151,35 +151,35 @@ class DartRobot(RobotEngine):
         return self._made_shadow
 
     def forward(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
-        """Return the accelerations that torques cause, resistance included."""
+        """Return the accelerations that torques cause, with joint resistance."""
         rotation = self._place(self._shadow, positions, velocities)
         forces = torques - self.resistance.torques(positions, velocities)
         if rotation is not None:
             forces = np.concatenate([rotation @ forces[3:6], rotation @ forces[:3], forces[6:]])
-        self._shadow.setForces(self._reordered(forces))
+        self._shadow.setForces(self._to_native(forces))
         self._shadow.computeForwardDynamics()
-        a = self._ordered(self._shadow.getAccelerations())
+        a = self._to_layout(self._shadow.getAccelerations())
         if rotation is not None:
             linear = a[3:6] @ rotation - np.cross(velocities[3:6], velocities[:3])
             a = np.concatenate([linear, a[:3] @ rotation, a[6:]])
         return a
 
     def inverse(self, positions: Vector, velocities: Vector, accelerations: Vector) -> Vector:
-        """Return the torques that cause accelerations, resistance included."""
+        """Return the torques that cause accelerations, with joint resistance."""
         rotation = self._place(self._shadow, positions, velocities)
         a = accelerations
         if rotation is not None:
             linear = rotation @ (a[:3] + np.cross(velocities[3:6], velocities[:3]))
             a = np.concatenate([rotation @ a[3:6], linear, a[6:]])
-        self._shadow.setAccelerations(self._reordered(a))
+        self._shadow.setAccelerations(self._to_native(a))
         self._shadow.computeInverseDynamics(False, False, False)
-        forces = self._ordered(self._shadow.getForces())
+        forces = self._to_layout(self._shadow.getForces())
         if rotation is not None:
             forces = np.concatenate([forces[3:6] @ rotation, forces[:3] @ rotation, forces[6:]])
         return forces + self.resistance.torques(positions, velocities)
 
     def _place(self, skeleton: Any, positions: Vector, velocities: Vector) -> Vector | None:
-        """Set a skeleton's state; return the base's rotation matrix, None for a fixed base."""
+        """Set a skeleton's state; return the rotation matrix of a floating base, else None."""
         rotation = None
         if not self.fixed_base:
             quaternion = positions[3:7] / np.linalg.norm(positions[3:7])
@@ -188,14 +188,14 @@ class DartRobot(RobotEngine):
             positions = np.concatenate([vector, positions[:3], positions[7:]])
             twist = velocities
             velocities = np.concatenate([rotation @ twist[3:6], rotation @ twist[:3], twist[6:]])
-        skeleton.setPositions(self._reordered(positions))
-        skeleton.setVelocities(self._reordered(velocities))
+        skeleton.setPositions(self._to_native(positions))
+        skeleton.setVelocities(self._to_native(velocities))
         return rotation
 
-    def _ordered(self, native: Vector) -> Vector:
+    def _to_layout(self, native: Vector) -> Vector:
         return native if self._sorted else native[self._native]
 
-    def _reordered(self, vector: Vector) -> Vector:
+    def _to_native(self, vector: Vector) -> Vector:
         if self._sorted:
             return vector
         native = np.empty(self.nv)
@@ -204,7 +204,7 @@ class DartRobot(RobotEngine):
 
 
 def _configure(joint: Joint, native: Any) -> None:
-    """Give a joint of DART its limits, resistance and actuator."""
+    """Set the limits, resistance, and actuator of a joint in DART."""
     settings = joint.settings
     native.setPositionLowerLimit(0, joint.lower)
     native.setPositionUpperLimit(0, joint.upper)

@@ -1,7 +1,7 @@
-"""The engine DART. All calls of dartpy are in the modules whose names begin with `dart_`.
+"""The engine DART. All calls of dartpy are in `physx_dart.dart`.
 
 DART integrates with semi-implicit Euler: velocities first, then positions with the new velocities.
-Damping and springs are implicit; contacts, position and velocity limits, servos and Coulomb
+Damping and springs are implicit; contacts, position and velocity limits, servos, and Coulomb
 friction are constraints of its solver.
 """
 
@@ -35,25 +35,25 @@ _DETECTORS = {
 _SOLVERS = ("dantzig", "pgs", "nsgs", "fbf")
 _ISOTROPIC = ("nsgs", "fbf")
 _EXACT = ("dart", "dantzig")
-"""The detector and the solver that carry nothing over from one step to the next."""
+"""The detector and the solver that keep no state between steps."""
 _RAYS = ("dart", "bullet")
 
 
 class DartBackend(Backend):
     """DART, a simulator of articulated bodies.
 
-    Detectors: ``dart`` (the usual one), ``bullet``, ``ode``, ``fcl`` (without capsules). Contact
-    solvers: ``dantzig`` (the usual one), ``pgs``, both with a friction pyramid, and ``nsgs``,
-    ``fbf`` with a cone, which is the same in all directions.
+    Detectors: ``dart`` (default), ``bullet``, ``ode``, ``fcl`` (without capsules). Contact solvers:
+    ``dantzig`` (default) and ``pgs`` with a friction pyramid, ``nsgs`` and ``fbf`` with a friction
+    cone, which is the same in all directions.
     """
 
     def build(self, world: World, seed: int | None = None) -> Simulation:
-        """Build a simulation; DART draws nothing at random, the seed has no effect.
+        """Build a simulation; DART is deterministic, so the seed has no effect.
 
         Raises:
-            ModelError: A robot or mesh cannot be loaded; the message says why.
-            FeatureNotSupportedError: The world asks for what DART does not have.
-            UnknownOptionError: There is no detector or solver of that name.
+            ModelError: If a robot or mesh cannot be loaded; the message says why.
+            FeatureNotSupportedError: If the world needs a feature that DART does not have.
+            UnknownOptionError: If there is no detector or solver of that name.
         """
         return DartSimulation(world)
 
@@ -72,9 +72,9 @@ class DartSimulation(RobotSimulation[DartRobot]):
         """Build the world.
 
         Raises:
-            ModelError: A robot or mesh cannot be loaded; the message says why.
-            FeatureNotSupportedError: The world asks for what DART does not have.
-            UnknownOptionError: There is no detector or solver of that name.
+            ModelError: If a robot or mesh cannot be loaded; the message says why.
+            FeatureNotSupportedError: If the world needs a feature that DART does not have.
+            UnknownOptionError: If there is no detector or solver of that name.
         """
         detector, solver = world.detector or "dart", world.solver or "dantzig"
         for option, name, known in (
@@ -93,9 +93,9 @@ class DartSimulation(RobotSimulation[DartRobot]):
             self._world.addSkeleton(skeleton)
         bodies = [body for robot in robots for body in robot.bodies]
         bodies += [skeleton.getBodyNode(0) for skeleton in self._statics]
-        _let_pass(self._world, [[each.getBodyNode(0)] for each in self._statics])
+        _disable_contacts(self._world, [[each.getBodyNode(0)] for each in self._statics])
         if world.contacts == "static":
-            _let_pass(self._world, [robot.bodies for robot in robots])
+            _disable_contacts(self._world, [robot.bodies for robot in robots])
         self._reader = ContactReader(self._world, bodies, world.period)
         self._step_world = self._world.step
         lacks = [] if (detector, solver) == _EXACT else ["exact_restore"]
@@ -136,13 +136,15 @@ class DartSimulation(RobotSimulation[DartRobot]):
         return self._reader.contacts()
 
     def raycast(self, begins: Vector, ends: Vector) -> Records:
-        """Return what rays, shape (n, 3) each, meet first."""
+        """Return the first hit of each ray: an array of `RAY_HIT` records."""
         self._check_open()
         if "raycast" not in self.features:
             raise self._lacks("raycast")
         first, last = finite_rows("begins", begins, 3), finite_rows("ends", ends, 3)
         if len(first) != len(last):
-            raise SimulationError(f"There are {len(first)} begins of rays but {len(last)} ends.")
+            raise SimulationError(
+                f"There are {len(first)} start points of rays but {len(last)} end points."
+            )
         return self._reader.raycast(first, last)
 
     def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
@@ -158,7 +160,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         return np.concatenate([x.inverse(q[i], v[j], a[j]) for x, i, j in self._slices])
 
     def close(self) -> None:
-        """Free the world; calling it again does nothing."""
+        """Free the world; further calls do nothing."""
         if not self._closed:
             super().close()
             del self._step_world, self._reader, self._statics, self._world
@@ -174,7 +176,7 @@ def _new_world(world: World, detector: str, solver: str) -> Any:
     made.setDeactivationOptions(sleeping)
     contacts = made.getConstraintSolver()
     second = contacts.getSecondaryBoxedLcpSolver()
-    if solver == "pgs":  # it has no constructor: the second solver becomes the first
+    if solver == "pgs":  # it has no constructor: the secondary solver becomes the primary
         contacts.setSecondaryBoxedLcpSolver(None)
         contacts.setBoxedLcpSolver(second)
     elif solver == "nsgs":
@@ -184,12 +186,12 @@ def _new_world(world: World, detector: str, solver: str) -> Any:
     return made
 
 
-def _let_pass(world: Any, groups: list[list[Any]]) -> None:
-    """Let the bodies of different groups pass through each other."""
+def _disable_contacts(world: Any, groups: list[list[Any]]) -> None:
+    """Disable contacts between bodies of different groups."""
     collisions = world.getConstraintSolver().getCollisionOption().collisionFilter
-    touching = [[body for body in bodies if body.getNumShapeNodes()] for bodies in groups]
-    for place, bodies in enumerate(touching):
-        for others in touching[place + 1 :]:
+    solid = [[body for body in bodies if body.getNumShapeNodes()] for bodies in groups]
+    for place, bodies in enumerate(solid):
+        for others in solid[place + 1 :]:
             for body in bodies:
                 for other in others:
                     collisions.addBodyNodePairToBlackList(body, other)

@@ -1,8 +1,8 @@
-"""A robot arm whose inverse dynamics a network learns, and that then follows trajectories with it.
+"""A robot arm that follows trajectories with inverse dynamics learned by a network.
 
 The arm is the Franka Emika Panda of the package ``example-robot-data``: seven joints in rad and
 N m, then two fingers in m and N. A joint controller (proportional and derivative) runs at every
-physics step; what the environment adds to it changes with every sample.
+physics step; the environment adds torques to it.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _ARM = "panda_description/urdf/panda.urdf"
 _JOINTS = 7
 """Joints of the arm itself, without the fingers."""
 _MARGIN = {"excite": 0.25, "track": 0.3}
-"""Share of a joint's range, at either end, that motions keep out of: what is tracked lies well
-within what was learned."""
+"""Share of a joint's range, at either end, that motions avoid: tracked motions lie well within the
+learned range."""
 _SPEED = 0.7
-"""Share of a joint's velocity limit that trajectories use at most."""
+"""Largest share of a joint's velocity limit that trajectories use."""
 _FADE = 2.0
-"""Time, in s, in which a trajectory to follow fades in."""
+"""Fade-in time of trajectories to follow, in s."""
 _SETTLING = 0.2
 """Time, in s, for which each new motion runs before it is sampled."""
 
@@ -39,34 +39,34 @@ Reference = tuple[Vector, Vector, Vector]
 class ArmEnvironment(Environment):
     """A seven-joint arm with two fingers, in one of two tasks.
 
-    ``task="excite"`` makes training data. In each episode the arm moves about at random; each
-    sample is the state (q, v, a) of one instant and the torque that acts then, so that the state
-    determines the torque: that is the arm's inverse dynamics.
+    ``task="excite"`` generates training data. In each episode the arm moves at random; each sample
+    is the state (q, v, a) at one instant and the torque that acts then, so the state determines the
+    torque by the arm's inverse dynamics.
 
-    ``task="track"`` is for prediction. The arm follows a trajectory that the number `trajectory`
-    determines. Each step gives the reference (q, v, a) in the middle of the next control period as
-    ``state``; the torque that the network predicts for it acts during that period in addition to
-    the controller. The first step only gives the first reference; nothing moves in it. Use
+    ``task="track"`` is for prediction. The arm follows the trajectory with the number `trajectory`.
+    Each step gives the reference (q, v, a) in the middle of the next control period as ``state``;
+    the torque that the network predicts for it acts during that period in addition to the
+    controller. The first step only gives the first reference; nothing moves in it. Use
     ``simulations_per_step=1``.
 
     Args:
         task: ``"excite"`` or ``"track"``.
-        feedforward: What is added to the controller in the task ``"track"``: ``"network"``,
+        feedforward: The torque added to the controller in the task ``"track"``: ``"network"``,
             ``"none"``, ``"model"`` (the engine's inverse dynamics of the reference: what a
             perfect network would give) or ``"gravity"`` (the same at rest).
         trajectory: Number of the trajectory to track; the same number is the same trajectory
             for any seed, instance and feed-forward.
         period: Length of a physics step, in s.
-        steps_per_sample: Physics steps in each step: one control period.
-        episode_steps: Steps after which the task ``"excite"`` draws a new motion.
+        steps_per_sample: Physics steps in each step, which is one control period.
+        episode_steps: Number of steps after which the task ``"excite"`` draws a new motion.
         amplitude: Largest distance of a motion from its center, in rad.
         frequencies: Lowest and highest frequency of the motions, in Hz.
         excitation: Factor of the random torques in the task ``"excite"``.
-        stiffness: Controller's torque for each unit of position error, shape (9,).
-        damping: Controller's torque for each unit of velocity error, shape (9,).
-        prediction_field: Name of the network's field that holds the torque; a prediction with
-            one field only is taken whatever its name is.
-        draw_every: A viewer gets every such step.
+        stiffness: Proportional gains of the controller, shape (9,).
+        damping: Derivative gains of the controller, shape (9,).
+        prediction_field: Name of the network's field with the torque; a prediction with a single
+            field may have any name.
+        draw_every: Number of steps between two updates of the viewer.
     """
 
     backend: ClassVar[str] = "dart"
@@ -92,7 +92,7 @@ class ArmEnvironment(Environment):
         """Keep the options.
 
         Raises:
-            ConfigError: An option has a value that it cannot have.
+            ConfigError: If an option is out of range.
         """
         super().__init__(**kwargs)
         _check_choice("task", task, ("excite", "track"))
@@ -105,7 +105,9 @@ class ArmEnvironment(Environment):
             if count < 1:
                 raise ConfigError(f"{name} is {count} but must be at least 1.")
         if len(frequencies) != 2 or not 0 <= frequencies[0] <= frequencies[1]:
-            raise ConfigError(f"frequencies are {frequencies} but must be the lowest, the highest.")
+            raise ConfigError(
+                f"frequencies are {frequencies} but must be the lowest and the highest."
+            )
         self.task, self.feedforward, self.trajectory = task, feedforward, trajectory
         self.period, self.steps_per_sample = period, steps_per_sample
         self.episode_steps, self.draw_every = episode_steps, draw_every
@@ -120,14 +122,14 @@ class ArmEnvironment(Environment):
         """Build the simulation.
 
         Raises:
-            ModelError: The package ``example-robot-data`` is not installed.
+            ModelError: If the package ``example-robot-data`` is not installed.
         """
         self._robot = Robot(example_robot(_ARM), "arm", package_dirs=_package_dirs())
         world = World([self._robot], period=self.period)
         self.simulation: Simulation = plugins.resolve("backend", self.backend).build(world)
 
     def init(self) -> None:
-        """Draw the first motion; in the task ``"track"`` put the arm at its beginning."""
+        """Draw the first motion; in the task ``"track"`` move the arm to its start."""
         if self.task == "track":
             self._motion = self._draw(np.random.default_rng(self.trajectory), _FADE)
             position, velocity, _ = self._motion.at(0.0)
@@ -150,7 +152,7 @@ class ArmEnvironment(Environment):
             )
 
     def step(self) -> None:
-        """Simulate one control period, or show the stored sample that is to be replayed."""
+        """Simulate one control period, or replay a stored sample."""
         if self.sample is not None:
             self._replay(self.sample)
         elif self.task == "excite":
@@ -166,10 +168,10 @@ class ArmEnvironment(Environment):
         """Add a predicted torque to the controller during the next control period.
 
         Args:
-            prediction: The network's fields; one of them is the torque, shape (9,), in N m or N.
+            prediction: The network's fields, among them the torque, shape (9,), in N m or N.
 
         Raises:
-            ConfigError: No field has the name `prediction_field`, and there are several; or its
+            ConfigError: If no field has the name `prediction_field`, and there are several; or its
                 shape is another.
         """
         if self.task != "track" or self.feedforward != "network":
@@ -241,7 +243,7 @@ class ArmEnvironment(Environment):
             self.simulation.set_state(sample["position"], v)
 
     def _advance(self, steps: int) -> Vector:
-        """Simulate physics steps under the controller; return the torques of the last one."""
+        """Simulate physics steps with the controller; return the torques of the last one."""
         simulation, limit = self.simulation, self.simulation.layout.max_torque
         times = self._time() + self.period * np.arange(steps, dtype=np.float64)
         positions, velocities, _ = self._motion.along(times)
@@ -258,7 +260,7 @@ class ArmEnvironment(Environment):
         return torque
 
     def _draw(self, rng: np.random.Generator, fade_time: float) -> SmoothTrajectory:
-        """Draw a motion inside the limits of position and velocity."""
+        """Draw a motion within the position and velocity limits."""
         layout = self.simulation.layout
         span = layout.upper - layout.lower
         margin = _MARGIN[self.task] * span
@@ -276,7 +278,7 @@ class ArmEnvironment(Environment):
     # Drawing --------------------------------------------------------------------------------
 
     def init_visualization(self) -> None:
-        """Add the arm; in the task ``"track"`` also its reference, translucent, and the error."""
+        """Add the arm; in the task ``"track"`` also its translucent reference and the error."""
         factory = self.factory
         if factory is None:
             return
@@ -329,5 +331,5 @@ def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
 def _gains(name: str, given: Sequence[float]) -> Vector:
     gains = np.array(given, np.float64)
     if gains.shape != (_JOINTS + 2,) or not (gains >= 0).all():
-        raise ConfigError(f"{name} needs {_JOINTS + 2} numbers that are not negative, not {given}.")
+        raise ConfigError(f"{name} needs {_JOINTS + 2} numbers of at least 0, not {given}.")
     return gains

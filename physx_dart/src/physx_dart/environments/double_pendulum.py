@@ -14,20 +14,20 @@ from physx_core.simulation import Robot, Simulation, World
 from physx_dart.environments.trajectories import SmoothTrajectory
 
 URDF = Path(__file__).parents[1] / "robots" / "double_pendulum.urdf"
-"""Two links of 1 kg and 0.5 m that hang down at zero."""
+"""Two links of 1 kg and 0.5 m, which hang down at zero."""
 
 
 class DoublePendulumEnvironment(Environment):
     """A double pendulum from random initial states.
 
-    Fields: ``state``, the angles and angular velocities of both joints; ``torque``, what acts at
-    that instant; ``acceleration``, what follows from both. Without torques (``torque_amplitude=0``)
-    the state alone determines the acceleration.
+    Fields: ``state``, the angles and angular velocities of both joints; ``torque``, the torques at
+    that instant; ``acceleration``, which follows from both. Without torques
+    (``torque_amplitude=0``) the state alone determines the acceleration.
 
     Args:
         period: Length of a physics step, in s.
         steps_per_sample: Physics steps in each step, under a constant torque.
-        episode_steps: Steps after which the pendulum starts anew.
+        episode_steps: Number of steps after which the pendulum is reset.
         torque_amplitude: Largest torque, in N m.
     """
 
@@ -45,7 +45,7 @@ class DoublePendulumEnvironment(Environment):
         """Keep the options.
 
         Raises:
-            ConfigError: A number of steps is less than 1.
+            ConfigError: If a number of steps is less than 1.
         """
         super().__init__(**kwargs)
         if steps_per_sample < 1 or episode_steps < 1:
@@ -76,7 +76,7 @@ class DoublePendulumEnvironment(Environment):
             self.factory.add_robot("pendulum", str(URDF), bodies, poses=poses)
 
     def step(self) -> None:
-        """Simulate a sample's physics steps, or show the stored sample that is to be replayed."""
+        """Simulate the physics steps of a sample, or replay a stored sample."""
         if self.sample is not None:
             self.simulation.set_state(self.sample["state"][:2], self.sample["state"][2:])
             names = ("state", "torque", "acceleration")

@@ -14,15 +14,15 @@ from physx_core.typing import Vector
 class SmoothTrajectory:
     """A motion ``center + fade(t) * (sum over k of amplitude_k * sin(rate_k * t + phase_k))``.
 
-    `fade` rises from 0 to 1 with the polynomial 10 s³ - 15 s⁴ + 6 s⁵, so that the motion begins at
-    rest, at the center and without acceleration.
+    `fade` rises from 0 to 1 with the polynomial 10 s³ - 15 s⁴ + 6 s⁵, so the motion starts at the
+    center, at rest and without acceleration.
 
     Attributes:
         center: Shape (n,), in the joints' units.
-        amplitudes: Of each sine, shape (terms, n), likewise.
+        amplitudes: Amplitude of each sine, shape (terms, n), likewise.
         rates: Angular frequencies, shape (terms, n), in rad/s.
         phases: Shape (terms, n), in rad.
-        fade_time: How long the fade-in takes, in s; 0: the motion is there from the beginning.
+        fade_time: Duration of the fade-in, in s; 0: none.
     """
 
     center: Vector
@@ -45,12 +45,12 @@ class SmoothTrajectory:
         """Draw a motion that stays within `amplitude` of the center.
 
         Args:
-            rng: Where the random numbers come from.
+            rng: Source of random numbers.
             center: Shape (n,).
             amplitude: Sum of the sines' amplitudes, shape (n,).
             frequencies: Lowest and highest frequency, in Hz.
             terms: Number of sines.
-            fade_time: How long the fade-in takes, in s.
+            fade_time: Duration of the fade-in, in s.
         """
         shape = (terms, len(center))
         shares = rng.uniform(0.2, 1.0, shape)
@@ -59,12 +59,12 @@ class SmoothTrajectory:
         return cls(center, amplitude * shares / shares.sum(axis=0), rates, phases, fade_time)
 
     def at(self, time: float) -> tuple[Vector, Vector, Vector]:
-        """Return position, velocity and acceleration at a time in s, each of shape (n,)."""
+        """Return position, velocity, and acceleration at a time in s, each of shape (n,)."""
         q, v, a = self.along(np.array([time]))
         return q[0], v[0], a[0]
 
     def along(self, times: Vector) -> tuple[Vector, Vector, Vector]:
-        """Return positions, velocities and accelerations at times (m,), each of shape (m, n)."""
+        """Return positions, velocities, and accelerations at times (m,), each of shape (m, n)."""
         angle = self.rates * times[:, None, None] + self.phases
         sine, cosine = self.amplitudes * np.sin(angle), self.amplitudes * np.cos(angle)
         q, v = sine.sum(axis=1), (self.rates * cosine).sum(axis=1)

@@ -1,4 +1,4 @@
-"""Impulses of points with friction cones and of rows with bounds, by Newton's method."""
+"""Newton's method for impulses of points with friction cones and of rows with bounds."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ import numpy as np
 from physx_core.typing import Vector
 
 _REGULARIZATION = 1e-9
-"""Share that is added to the diagonal, as DART's solver does."""
+"""Relative addition to the diagonal, as in DART's solver."""
 _STUCK = 1e-14
-"""Share of the largest response below which a direction counts as one that nothing can move in."""
+"""Response, relative to the largest, below which nothing can move in a direction."""
 _ACCURACY = 1e-11
 """Of velocities, in m/s, for free velocities of 1 m/s or less."""
 
 
 class ContactProblem:
-    """Which impulses keep points from going through what they touch, and rows in their bounds.
+    """The problem of finding the impulses that prevent penetration and keep rows in their bounds.
 
-    A point's impulse is within its friction cone, and opposes sliding (Coulomb's law); a row's
-    impulse is within its bounds, and the velocity of a row that is at none of them is 0. Impulses
-    that do so are those that do not change when they take a step against the velocities and are
-    brought back into cones and bounds. That is an equation with corners: Newton's method solves it
-    exactly once it has found which points stick, slide or part (P. Alart and A. Curnier, A mixed
+    A point's impulse is within its friction cone and opposes sliding (Coulomb's law); a row's
+    impulse is within its bounds, and the velocity of a row that is at none of them is 0. Such
+    impulses are fixed points of a step against the velocities followed by a projection onto cones
+    and bounds. This equation is piecewise smooth: Newton's method solves it exactly once it has
+    found which points stick, slide, or separate (P. Alart and A. Curnier, A mixed
     formulation for frictional contact problems prone to Newton like solution methods, Computer
     Methods in Applied Mechanics and Engineering 92, 1991).
 
     Attributes:
         matrix: Velocities for unit impulses, shape (3 k + m, 3 k + m).
-        free: Velocities without impulses, less what is wanted, shape (3 k + m,): of k points along
+        free: Velocities without impulses minus the wanted ones, shape (3 k + m,): of k points along
             two tangents and the normal, then of m rows.
         friction: Coefficients of the points, shape (k,).
         least: Smallest impulses of the rows, shape (m,).
@@ -40,9 +40,9 @@ class ContactProblem:
     def __init__(
         self, response: Vector, free: Vector, friction: Vector, least: Vector, most: Vector
     ) -> None:
-        """Keep the problem, with a diagonal that is a little larger than that of `response`.
+        """Set up the problem, with a diagonal that is slightly larger than that of `response`.
 
-        A direction in which nothing can move, as across a rail, gets no impulse: any would do.
+        A direction in which nothing can move, as across a rail, gets no impulse, as any would do.
         """
         diagonal = (1 + _REGULARIZATION) * response.diagonal()
         largest = float(diagonal.max(initial=0.0)) or 1.0
@@ -61,16 +61,16 @@ class ContactProblem:
         self.accuracy = _ACCURACY * max(1.0, float(np.abs(free).max()))
 
     def error(self, impulses: Vector) -> float:
-        """Return how far impulses are from a solution, as a velocity."""
+        """Return the distance of impulses from a solution, as a velocity."""
         moved = impulses - self._steps * (self.matrix @ impulses + self.free)
-        return self._error(impulses - self._within(moved))
+        return self._error(impulses - self._project(moved))
 
     def newton(self, impulses: Vector, most: int) -> tuple[Vector, float]:
-        """Go on from impulses for at most so many steps; return the best ones and their error."""
+        """Return the best impulses of at most `most` steps from given ones, and their error."""
         best, least_error = impulses, math.inf
         for _ in range(most):
             moved = impulses - self._steps * (self.matrix @ impulses + self.free)
-            change = self._within(moved)
+            change = self._project(moved)
             change -= impulses
             error = self._error(change)
             if error < least_error:
@@ -86,8 +86,8 @@ class ContactProblem:
     def _error(self, change: Vector) -> float:
         return float(np.abs(change / self._steps).max())
 
-    def _within(self, moved: Vector) -> Vector:
-        """Return impulses, shape (3 k + m,), brought back into cones and bounds."""
+    def _project(self, moved: Vector) -> Vector:
+        """Return impulses, shape (3 k + m,), projected onto cones and bounds."""
         found = moved.copy()
         values = moved[: self._size].tolist()
         for place, friction in zip(range(0, self._size, 3), self._coefficients, strict=True):
@@ -103,7 +103,7 @@ class ContactProblem:
         return found
 
     def _slope(self, moved: Vector) -> Vector:
-        """Return the derivative of an impulse less what `_within` makes of it, shape (n, n)."""
+        """Return the derivative of impulses minus their projections `_project`, shape (n, n)."""
         slope, unit = self._scaled.copy(), np.eye(len(moved))
         values = moved[: self._size].tolist()
         for place, friction in zip(range(0, self._size, 3), self._coefficients, strict=True):

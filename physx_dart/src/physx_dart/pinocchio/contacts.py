@@ -1,7 +1,7 @@
-"""Contacts of one robot or object with what never moves, for Pinocchio.
+"""Contacts of a robot or object with static things, for Pinocchio.
 
-A box touches with its corners, a capsule with the spheres at its ends, a cylinder with three points
-of each rim, one of them the deepest; a shape's edges and faces do not touch corners of others.
+A box collides with its corners, a capsule with the spheres at its ends, a cylinder with three
+points of each rim, one of them the deepest; edges and faces do not collide with corners of others.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from physx_dart.shared.parts import Mover, Static
 from physx_dart.shared.shapes import CollisionShape
 
 _MARGIN = 1e-4
-"""Distance, in m, at which a point counts as touching."""
+"""Distance, in m, below which a point counts as touching."""
 _RETURN = 0.1
-"""Share of a point's depth that it comes back in each step."""
+"""Share of a point's penetration that is corrected in each step."""
 _FASTEST_RETURN = 1.0
-"""Speed at which it comes back at most, in m/s."""
+"""Largest speed of this correction, in m/s."""
 _BOUNCE = 0.1
-"""Speed of approach, in m/s, from which things bounce."""
+"""Approach speed, in m/s, above which things bounce."""
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _THIRDS = np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
 """Cosines and sines of three directions around a rim."""
 _CROSS = np.zeros((3, 9))
 _CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = 1.0, -1.0, 1.0, -1.0, 1.0, -1.0
-"""Makes a vector the matrix, row by row, whose product with another is their cross product."""
+"""Maps a vector to its cross-product matrix, flattened by rows."""
 
 
-Places = NDArray[np.intp]
+Indices = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class Touching:
-    """Points that touch, or may within the next step.
+class ContactPoints:
+    """Points that touch, or may touch within the next step.
 
     Attributes:
-        links: Place of each point's link in the robot, shape (k,).
-        statics: Place of what it touches among the statics, shape (k,).
+        links: Index of each point's link in the robot, shape (k,).
+        statics: Index of the static thing that it touches, shape (k,).
         points: In the world frame, in m, shape (k, 3).
         axes: Two tangents and the outward normal of each, as rows, shape (k, 3, 3).
         gaps: Distances, negative inside, in m, shape (k,).
@@ -55,8 +55,8 @@ class Touching:
         jacobian: Of the points along their axes, shape (3 k, nv).
     """
 
-    links: Places
-    statics: Places
+    links: Indices
+    statics: Indices
     points: Vector
     axes: Vector
     gaps: Vector
@@ -65,7 +65,7 @@ class Touching:
     jacobian: Vector
 
     def bias(self, before: Vector, period: float) -> Vector:
-        """Return what is added to the free velocities along the axes, shape (3 k,).
+        """Return the bias of the velocities along the axes, shape (3 k,).
 
         Args:
             before: Velocities before the step, shape (nv,).
@@ -83,11 +83,11 @@ class Touching:
 
 
 @dataclass(frozen=True, eq=False)
-class _Near:
-    """Points near one surface: as `Touching`, their places in the finder, and radii around them."""
+class _NearPoints:
+    """Points near a surface: as `ContactPoints`, with their rows in the finder and their radii."""
 
-    statics: Places
-    rows: Places
+    statics: Indices
+    rows: Indices
     gaps: Vector
     normals: Vector
     axes: Vector
@@ -99,13 +99,13 @@ class _Near:
         cls,
         place: int,
         surface: Surface,
-        rows: Places,
+        rows: Indices,
         gaps: Vector,
         normals: Vector,
         points: Vector,
         radii: Vector,
-    ) -> _Near:
-        """Add the tangents at the surface of the static of that place."""
+    ) -> _NearPoints:
+        """Add the tangents at the surface of the static thing with that index."""
         if isinstance(surface, Plane):
             axes = np.ones((len(rows), 1, 1)) * np.array(axes_of(*surface.normal.tolist()))
         else:
@@ -114,7 +114,7 @@ class _Near:
 
 
 class ContactFinder:
-    """Finds where a robot or object touches what never moves."""
+    """Finds the contacts of a robot or object with static things."""
 
     def __init__(
         self,
@@ -125,10 +125,10 @@ class ContactFinder:
         frames: Sequence[int],
         features: Sequence[str],
     ) -> None:
-        """Prepare the points; `find` computes with the model and its data.
+        """Prepare the points; `find` uses the model and its data.
 
         Raises:
-            FeatureNotSupportedError: A shape is a mesh.
+            FeatureNotSupportedError: If a shape is a mesh.
         """
         self._model, self._data = model, data
         self._surfaces = [
@@ -170,10 +170,10 @@ class ContactFinder:
         self._restitution = first[:, :, 1] * second[:, :, 1]
 
     def _arrange(self, anchors: list[Any], points: int) -> None:
-        """Put points, then the centers of rims, into arrays."""
+        """Collect points, then the centers of rims, in arrays."""
         used = sorted({row[0] for row in anchors})
         model, data = self._model, self._data
-        # Arrays that look into Pinocchio's own memory: they change with each `find`.
+        # Views of Pinocchio's memory, which change with each `find`.
         self._turns = [data.oMi[joint].rotation for joint in used]
         self._places = [data.oMi[joint].translation for joint in used]
         self._moved = np.zeros((len(used), model.nv))
@@ -192,8 +192,8 @@ class ContactFinder:
         """Return whether anything can ever touch."""
         return len(self._joints) > 0
 
-    def find(self, q: Vector, v: Vector, period: float) -> Touching | None:
-        """Return the points that touch, or may within the next step; None where there are none.
+    def find(self, q: Vector, v: Vector, period: float) -> ContactPoints | None:
+        """Return the points that touch, or may within the next step; None if there are none.
 
         Args:
             q: Positions, shape (nq,).
@@ -204,15 +204,15 @@ class ContactFinder:
         joints, turns = self._joints, np.array(self._turns)
         points = np.einsum("nij,nj->ni", turns[joints], self._centers)
         points += np.array(self._places)[joints]
-        # How each joint moves: turn, and drift of what of it is at the world's origin.
+        # Motion of each joint in the step: rotation, and translation at the world's origin.
         twists = period * ((self._moved * v) @ motions.T)
-        steps = _moved(twists[joints], points)
+        steps = _displacements(twists[joints], points)
         reach, first = self._radii, self._first_rim
         if first < len(points):
-            # No point of a rim moves further than its center and its turn take it.
+            # A point of a rim moves no further than its center plus the effect of its rotation.
             spins, reach = _lengths(twists[:, 3:])[joints[first:]], reach.copy()
             reach[first:] += _lengths(steps[first:]) + reach[first:] * spins
-        found: list[_Near] = []
+        found: list[_NearPoints] = []
         for place, surface in self._surfaces:
             gaps, normals = surface.distances(points)
             ahead = gaps + np.einsum("ij,ij->i", normals, steps)
@@ -226,29 +226,31 @@ class ContactFinder:
             if len(rows):
                 radii = self._radii[rows]
                 gaps, normals = gaps[rows] - radii, normals[rows]
-                found.append(_Near.at(place, surface, rows, gaps, normals, points[rows], radii))
+                found.append(
+                    _NearPoints.at(place, surface, rows, gaps, normals, points[rows], radii)
+                )
         return self._touching(motions, found) if found else None
 
     def _near_rims(
         self,
         place: int,
         surface: Surface,
-        rims: Places,
+        rims: Indices,
         turns: Vector,
         points: Vector,
         twists: Vector,
-    ) -> list[_Near]:
-        """Return those points of rims that touch, or may within the next step."""
+    ) -> list[_NearPoints]:
+        """Return the points of rims that touch, or may within the next step."""
         rows, around = np.repeat(rims, 3), self._rims(rims, turns, points)
         gaps, normals = surface.distances(around)
-        steps = _moved(twists[self._joints[rows]], around)
+        steps = _displacements(twists[self._joints[rows]], around)
         close = np.minimum(gaps, gaps + np.einsum("ij,ij->i", normals, steps)) < _MARGIN
         if not close.any():
             return []
         rows, gaps, normals, around = rows[close], gaps[close], normals[close], around[close]
-        return [_Near.at(place, surface, rows, gaps, normals, around, np.zeros(len(rows)))]
+        return [_NearPoints.at(place, surface, rows, gaps, normals, around, np.zeros(len(rows)))]
 
-    def _rims(self, rows: Places, turns: Vector, points: Vector) -> Vector:
+    def _rims(self, rows: Indices, turns: Vector, points: Vector) -> Vector:
         """Return three points of each rim, one of them the deepest, shape (3 rows, 3)."""
         axes = turns[self._joints[rows]] @ self._rim_axes[rows - self._first_rim]
         along = axes[:, :, 2]
@@ -259,15 +261,15 @@ class ContactFinder:
         around = _THIRDS @ np.stack([first, np.cross(along, first)], axis=1)
         return (points[rows][:, None] + self._radii[rows][:, None, None] * around).reshape(-1, 3)
 
-    def _touching(self, motions: Vector, found: list[_Near]) -> Touching:
-        rows, statics = _joined(found, "rows"), _joined(found, "statics")
-        gaps, normals = _joined(found, "gaps"), _joined(found, "normals")
-        depths = _joined(found, "radii") + 0.5 * np.minimum(gaps, 0.0)
-        points = _joined(found, "points") - depths[:, None] * normals
-        axes = _joined(found, "axes")
+    def _touching(self, motions: Vector, found: list[_NearPoints]) -> ContactPoints:
+        rows, statics = _concatenate(found, "rows"), _concatenate(found, "statics")
+        gaps, normals = _concatenate(found, "gaps"), _concatenate(found, "normals")
+        depths = _concatenate(found, "radii") + 0.5 * np.minimum(gaps, 0.0)
+        points = _concatenate(found, "points") - depths[:, None] * normals
+        axes = _concatenate(found, "axes")
         turned = (points @ _CROSS).reshape(-1, 3, 3) @ motions[3:]
         jacobian = axes @ ((motions[:3] - turned) * self._moved[self._joints[rows], None])
-        return Touching(
+        return ContactPoints(
             links=self._links[rows],
             statics=statics,
             points=points,
@@ -290,8 +292,8 @@ def axes_of(x: float, y: float, z: float) -> tuple[tuple[float, float, float], .
     return (a, b, c), (y * c - z * b, z * a - x * c, x * b - y * a), (x, y, z)
 
 
-def _moved(twists: Vector, points: Vector) -> Vector:
-    """Return how far points (n, 3) are moved by drift and turn (n, 6)."""
+def _displacements(twists: Vector, points: Vector) -> Vector:
+    """Return the displacements of points (n, 3) by translations and rotations (n, 6)."""
     return twists[:, :3] + np.einsum(
         "nij,nj->ni", (twists[:, 3:] @ _CROSS).reshape(-1, 3, 3), points
     )
@@ -302,14 +304,14 @@ def _lengths(vectors: Vector) -> Vector:
     return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
 
 
-def _joined(found: list[_Near], name: str) -> Any:
-    """Return one array of all that is near."""
+def _concatenate(found: list[_NearPoints], name: str) -> Any:
+    """Return an attribute of all near points as one array."""
     parts = [getattr(each, name) for each in found]
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _points(shape: CollisionShape) -> tuple[Vector, float]:
-    """Return where spheres are in a shape, and their radius; a radius of 0 is a point."""
+    """Return the centers of spheres in a shape and their radius; a radius of 0 is a point."""
     if shape.kind == "box":
         return _CORNERS * np.array(shape.size), 0.0
     if shape.kind == "sphere":

@@ -1,4 +1,4 @@
-"""Joint limits, motors and Coulomb friction as impulses, once the free motion is known."""
+"""Impulses of joint limits, motors, and Coulomb friction, given the free motion."""
 
 from __future__ import annotations
 
@@ -12,28 +12,27 @@ from physx_core.typing import Vector
 from physx_dart.shared.urdf import Joint
 
 _REGULARIZATION = 1e-9
-"""Share that is added to the diagonal, as DART's solver does."""
+"""Relative addition to the diagonal, as in DART's solver."""
 _FASTEST_RETURN = 10.0
-"""Speed in rad/s or m/s at which a joint comes back into its limits at most, as in DART."""
+"""Largest speed, in rad/s or m/s, at which a joint returns into its limits, as in DART."""
 
 
 class JointConstraints:
-    """Limits of position and velocity, motors, and Coulomb friction, of a robot's joints.
+    """Position and velocity limits, motors, and Coulomb friction of a robot's joints.
 
-    A joint may not leave its limits in the next step, nor move faster than its velocity limit; one
-    that is outside comes back, whatever its velocity limit. Friction stops a joint if it can within
-    its bounds; a motor brings it to its velocity likewise. A motor without bounds does so whatever
-    the limits are.
+    A joint must not leave its limits in the next step, nor exceed its velocity limit; one that is
+    outside returns, whatever its velocity limit. Friction stops a joint and a motor brings it to
+    its target velocity as far as their bounds allow. A motor without bounds ignores the limits.
 
-    Each of these is a row: a velocity that is aimed at, and bounds of the impulse. The lower limits
-    of all joints come first, then the upper ones, then friction and motors where there are any.
+    Each constraint is a row: a target velocity and bounds of the impulse. The lower limits of all
+    joints come first, then the upper limits, then friction and motors, if any.
 
     Attributes:
         joints: Joint of each row, shape (rows,).
         least: Smallest impulse of each row, in N m s or N s, shape (rows,).
         most: Largest impulse of each row.
-        targets: Velocities that the motors aim at, shape (n,), in rad/s or m/s.
-        acts: Whether anything but limits acts.
+        targets: Target velocities of the motors, shape (n,), in rad/s or m/s.
+        acts: Whether there is friction or a motor.
         limits: Whether any joint has limits.
     """
 
@@ -66,21 +65,21 @@ class JointConstraints:
         self._slowest_limit = float(fastest.min(initial=np.inf))
 
     def _arrange(self, friction: Vector, strength: Vector, n: int) -> None:
-        """Set what is known of the rows beforehand."""
+        """Set the constant parts of the rows."""
         nothing, places = np.zeros(n), np.arange(n)
         self.joints = np.concatenate([places, places, self._rubs, self._motors])
         self.least = np.concatenate([nothing, nothing - np.inf, -friction, -strength])
         self.most = np.concatenate([nothing + np.inf, nothing, friction, strength])
 
     def safe(self, positions: Vector, velocities: Vector) -> tuple[int, float]:
-        """Return for how many steps no limit can act while the speed stays below a bound.
+        """Return for how many steps no limit can act as long as the speed stays below a bound.
 
         Args:
             positions: Shape (n,).
             velocities: Likewise.
 
         Returns:
-            The number of steps and the bound of the square of the velocities' length.
+            The number of steps, and the bound of the square of the velocities' norm.
         """
         if not self.limits:
             return 2**30, math.inf
@@ -94,13 +93,13 @@ class JointConstraints:
         return int(min(slack / (bound * self._period), 2**30)), bound * bound
 
     def bounds(self, positions: Vector) -> Vector:
-        """Return how fast joints have to move at least, up for lower and down for upper limits.
+        """Return the least velocities of joints, upward for lower and downward for upper limits.
 
         Args:
             positions: Before the step, shape (n,).
 
         Returns:
-            Shape (2, n), in rad/s or m/s: mostly negative, as joints need not move.
+            Shape (2, n), in rad/s or m/s: mostly negative, as most joints need not move.
         """
         needed = self._limits - self._pace * positions
         bounds = np.maximum(needed, self._slowest)
@@ -109,25 +108,25 @@ class JointConstraints:
         return np.minimum(bounds, _FASTEST_RETURN)
 
     def acting(self, bounds: Vector, velocities: Vector, reach: float) -> NDArray[np.bool_]:
-        """Return which rows act, shape (rows,): motors, friction that moves, and some limits.
+        """Return which rows act, shape (rows,): motors, friction of moving joints, and some limits.
 
-        Those of joints that are outside do always, as other joints may push them further.
+        Limits of joints that are outside always act, as other joints may push them further out.
 
         Args:
             bounds: As `bounds` returned them.
             velocities: After the step, shape (n,).
-            reach: How close to its bound a velocity is when a limit counts as acting.
+            reach: Margin above its bound at which a velocity makes a limit act.
         """
         acts = np.ones(len(self.joints), np.bool_)
         limits = acts[: bounds.size].reshape(bounds.shape)
         np.less(self._signs * velocities, bounds + reach, out=limits)
         limits |= bounds > 0
-        if len(self._rubs):  # what rests without friction stays at rest, as in DART
+        if len(self._rubs):  # a joint that rests without friction stays at rest, as in DART
             acts[bounds.size : bounds.size + len(self._rubs)] = velocities[self._rubs] != 0
         return acts
 
     def aims(self, bounds: Vector) -> Vector:
-        """Return the velocity that each row aims at, shape (rows,)."""
+        """Return the target velocity of each row, shape (rows,)."""
         limits = (self._signs * bounds).ravel()
         if not self.acts:
             return limits
@@ -135,12 +134,12 @@ class JointConstraints:
 
 
 def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vector:
-    """Return the impulses that bring about a change of velocities as far as their bounds allow.
+    """Return the impulses that cause a change of velocities as far as their bounds allow.
 
-    They solve the box-constrained linear complementarity problem by principal pivoting: blocks of
-    pivots as long as they help, else single ones, which always end (J. J. Judice and F. M. Pires,
-    A block principal pivoting algorithm for large-scale strictly monotone linear complementarity
-    problems, Computers & Operations Research 21, 1994).
+    They solve the box-constrained linear complementarity problem by principal pivoting: with blocks
+    of pivots as long as they help, else with single ones, which always terminate (J. J. Judice and
+    F. M. Pires, A block principal pivoting algorithm for large-scale strictly monotone linear
+    complementarity problems, Computers & Operations Research 21, 1994).
 
     Args:
         response: Change of the velocities for unit impulses, shape (n, n), positive definite.
@@ -153,7 +152,7 @@ def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vect
     alone = change / matrix.diagonal()
     if len(change) == 1:
         return np.clip(alone, least, most)
-    # -1: at its least, 1: at its most, 0: between; at first as if no row knew of the others.
+    # -1: at its least, 1: at its most, 0: between; initially as if the rows were independent.
     side = (alone > most).astype(np.int8) - (alone < least)
     best, blocks = len(change) + 1, 3
     impulses = np.zeros(len(change))

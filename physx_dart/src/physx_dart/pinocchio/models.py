@@ -1,4 +1,4 @@
-"""Models of Pinocchio, from the same description as everything else."""
+"""Pinocchio's models of robots and objects."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ _LINK = "physx link "
 
 
 def load_model(mover: Mover, gravity: tuple[float, ...], *, armature: Vector) -> Any:
-    """Return the model of a robot or object whose state is that of `physx_core`'s backends.
+    """Return the model of a robot or object in the convention of `physx_core`.
 
     Raises:
-        ModelError: Pinocchio cannot load it.
+        ModelError: If Pinocchio cannot load it.
     """
     if mover.fixed_base:
-        model = _parsed(mover)
+        model = _parse(mover)
         _weld(model, mover)
     else:
-        model = _parsed(mover, pinocchio.JointModelFreeFlyer())
-    return _finished(model, mover, gravity, armature, 1 if mover.fixed_base else 2)
+        model = _parse(mover, pinocchio.JointModelFreeFlyer())
+    return _finish(model, mover, gravity, armature, 1 if mover.fixed_base else 2)
 
 
 def load_stepping_model(mover: Mover, gravity: tuple[float, ...], *, armature: Vector) -> Any:
-    """Return the model that is stepped: its base moves along the world's axes and turns.
+    """Return the model for stepping, whose base translates along the world's axes.
 
     Its positions are those of `load_model`; the first three velocities of a floating base are along
-    the world's axes, not its own. So semi-implicit Euler keeps the linear momentum of a body that
-    tumbles, as DART does, which it does not in the base's own frame.
+    the world's axes, not its own, so that semi-implicit Euler conserves the linear momentum of a
+    tumbling body, as in DART; in the base's own frame it would not.
 
     Raises:
-        ModelError: Pinocchio cannot load it.
+        ModelError: If Pinocchio cannot load it.
     """
     if mover.fixed_base:
         return load_model(mover, gravity, armature=armature)
@@ -48,14 +48,14 @@ def load_stepping_model(mover: Mover, gravity: tuple[float, ...], *, armature: V
     second = base.addJoint(first, pinocchio.JointModelSpherical(), nowhere, _ROTATION)
     frame = pinocchio.Frame(_ROTATION, second, 0, nowhere, pinocchio.FrameType.BODY)
     place = base.addFrame(frame)
-    robot = _parsed(mover)
+    robot = _parse(mover)
     links = [frame for frame in robot.frames if frame.type == pinocchio.FrameType.BODY]
-    for frame in links:  # appendModel cannot tell a link and a joint of the same name apart
+    for frame in links:  # appendModel confuses a link and a joint of the same name
         frame.name = f"{_LINK}{frame.name}"
     model = pinocchio.appendModel(base, robot, place, nowhere)
     for frame in model.frames:
         frame.name = frame.name.removeprefix(_LINK)
-    return _finished(model, mover, gravity, armature, 3)
+    return _finish(model, mover, gravity, armature, 3)
 
 
 def frames_of(model: Any, mover: Mover) -> list[int]:
@@ -63,7 +63,7 @@ def frames_of(model: Any, mover: Mover) -> list[int]:
     return [model.getFrameId(link, pinocchio.FrameType.BODY) for link in mover.model.links]
 
 
-def _parsed(mover: Mover, *root: Any) -> Any:
+def _parse(mover: Mover, *root: Any) -> Any:
     try:
         return pinocchio.buildModelFromXML(mover.model.text, *root)
     except (ValueError, RuntimeError) as error:
@@ -71,7 +71,7 @@ def _parsed(mover: Mover, *root: Any) -> Any:
 
 
 def _weld(model: Any, mover: Mover) -> None:
-    """Move the root of a robot with a fixed base to its place."""
+    """Place the root of a robot with a fixed base."""
     rotation = to_matrix(mover.orientation)
     base = pinocchio.SE3(rotation, np.array(mover.position))
     for joint in range(1, model.njoints):
@@ -82,7 +82,7 @@ def _weld(model: Any, mover: Mover) -> None:
             model.frames[place].placement = base * frame.placement
 
 
-def _finished(
+def _finish(
     model: Any, mover: Mover, gravity: tuple[float, ...], armature: Vector, first: int
 ) -> Any:
     model.gravity.linear = np.array(gravity, np.float64)
@@ -90,5 +90,5 @@ def _finished(
     moving = list(model.names)[first:]
     if moving != [joint.name for joint in mover.model.joints]:
         path = mover.model.path
-        raise ModelError(f"Pinocchio reads the joints of {path} in another order: {moving}.")
+        raise ModelError(f"Pinocchio reads the joints of {path} in a different order: {moving}.")
     return model

@@ -1,4 +1,4 @@
-"""Entry point `pinocchio`: what the plugin brings; nothing of it is imported yet."""
+"""Entry point `pinocchio`: references to the plugin's components, imported when used."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from physx_core.plugins import hookimpl
 
 @hookimpl
 def physx_backends() -> dict[str, str]:
-    """Return the engine Pinocchio."""
+    """Return the Pinocchio backend."""
     return {"pinocchio": "physx_dart.pinocchio.simulation:PinocchioBackend"}
 
 
 @hookimpl
 def physx_environments() -> dict[str, str]:
-    """Return the environments that Pinocchio simulates."""
+    """Return the environments simulated with Pinocchio."""
     return {
         "arm": "physx_dart.environments.arm:PinocchioArm",
         "double-pendulum": "physx_dart.environments.double_pendulum:PinocchioDoublePendulum",

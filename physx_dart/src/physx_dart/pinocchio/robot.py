@@ -1,8 +1,8 @@
-"""One robot or object, stepped with Pinocchio's algorithms.
+"""A robot or object that is stepped with Pinocchio's algorithms.
 
-Pinocchio has no simulator, so the step is written here, as DART does it: semi-implicit Euler with
-implicit damping and springs; contacts, limits, servos and Coulomb friction by impulses; and a
-floating base whose position and rotation move with its velocities in the world frame.
+Pinocchio has no simulator, so the step is implemented here, in the same way as DART's:
+semi-implicit Euler with implicit damping and springs; impulses for contacts, limits, servos, and
+Coulomb friction; and a floating base that is integrated with its velocities in the world frame.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy import add, multiply
 from physx_core.rotations import rotate, rotate_back, to_matrix
 from physx_core.simulation import CONTACT, World
 from physx_core.typing import Records, Vector
-from physx_dart.pinocchio.contacts import ContactFinder, Places, Touching
+from physx_dart.pinocchio.contacts import ContactFinder, ContactPoints, Indices
 from physx_dart.pinocchio.limits import JointConstraints, solve
 from physx_dart.pinocchio.models import frames_of, load_stepping_model
 from physx_dart.pinocchio.solver import ImpulseSolver
@@ -26,17 +26,17 @@ from physx_dart.shared.engine import RobotEngine, base_accelerations
 from physx_dart.shared.parts import Mover, Static
 
 _UNSEEN = 10
-"""Steps after which it is seen whether a limit might have acted."""
+"""Steps between two checks whether a limit might have acted."""
 _REACH = 1.0
-"""Speed in rad/s or m/s within which a limit takes part where something touches."""
+"""Margin in rad/s or m/s within which a limit takes part while there are contacts."""
 _MISSED = 1e-9
-"""Speed beyond its bound at which a joint counts as having left its limits."""
+"""Excess of a velocity over its bound at which a joint counts as out of its limits."""
 
 
 class PinocchioRobot(RobotEngine):
-    """The state of one robot or object, and how it goes on.
+    """The state of a robot or object, and its steps.
 
-    Inside, the velocities of a floating base are those of `load_stepping_model`.
+    Internally, velocities of a floating base are those of `load_stepping_model`.
     """
 
     def __init__(
@@ -50,8 +50,8 @@ class PinocchioRobot(RobotEngine):
         """Load the models.
 
         Raises:
-            ModelError: Pinocchio cannot load the robot.
-            FeatureNotSupportedError: A collision shape is a mesh.
+            ModelError: If Pinocchio cannot load the robot.
+            FeatureNotSupportedError: If a collision shape is a mesh.
         """
         super().__init__(mover)
         self._period = world.period
@@ -59,13 +59,13 @@ class PinocchioRobot(RobotEngine):
         implicit = resists.armature + dt * resists.damping + dt * dt * resists.stiffness
         self._free = load_stepping_model(mover, world.gravity, armature=implicit)
         self._free_data = self._free.createData()
-        # Constraints act on the robot without its dampers, as in DART.
+        # Constraints act on the robot without its implicit damping, as in DART.
         self._model = load_stepping_model(mover, world.gravity, armature=resists.armature)
         self._data = self._model.createData()
         self._frames = frames_of(self._free, mover)
         self._pushes = pinocchio.StdVec_Force()
         self._pushes.extend(pinocchio.Force.Zero() for _ in range(self._free.njoints))
-        self._more: tuple[Any, ...] = ()  # the wrenches, while there are any
+        self._more: tuple[Any, ...] = ()  # the wrenches, if there are any
         self._joints = JointConstraints(self.model.joints, dt)
         self._contacts = ContactFinder(
             mover, statics, self._free, self._free_data, self._frames, features
@@ -79,16 +79,16 @@ class PinocchioRobot(RobotEngine):
         self._positions, self._velocities = np.zeros(self.nq), np.zeros(self.nv)
         self._earlier, self._before = self._positions, self._velocities
         self._safe_steps, self._bound = 0, 0.0
-        # Arrays multiply each other in half the time that a number and an array take.
+        # Multiplying two arrays takes half the time of multiplying an array by a number.
         self._periods, self._motion = np.full(self.nv, dt), np.zeros(self.nv)
-        self._turned: Vector | None = None  # the velocities that `_twist` was made of
+        self._twist_source: Vector | None = None  # the velocities that `_twist` was computed from
         self._twist = self._velocities
         self._torques = np.zeros(self.nv)
         self._springs = bool(resists.stiffness.any())
         self._smooth = bool(resists.damping.any() or resists.stiffness.any())
-        self._touching: Touching | None = None
+        self._touching: ContactPoints | None = None
         self._impulses = np.zeros(0)
-        # Of an inverse matrix of inertia, Pinocchio computes the upper half.
+        # Pinocchio computes the upper half of the inverse mass matrix.
         self._upper = np.triu(np.ones((self.nv, self.nv)), 1) + 0.5 * np.eye(self.nv)
         self._unit = np.eye(self.nv)
 
@@ -111,8 +111,8 @@ class PinocchioRobot(RobotEngine):
     def _run_free(self, n: int) -> int:
         """Simulate up to n steps while no limit can act; return how many.
 
-        Whether the joints stayed slow enough for that is seen every few steps; if they did not, the
-        last few are taken back.
+        Every few steps it is checked whether the joints stayed slow enough for that; if not, those
+        steps are undone.
         """
         if self._safe_steps <= 0:
             base = self.base
@@ -124,7 +124,7 @@ class PinocchioRobot(RobotEngine):
             state = self._positions, self._velocities, self._earlier, self._before
             if self._smooth:
                 for _ in range(count):
-                    self._step_free(1, self._resisted(self._positions, self._velocities))
+                    self._step_free(1, self._net_torques(self._positions, self._velocities))
             else:
                 self._step_free(count, self._torques)
             v = self._velocities[self.base :]
@@ -137,7 +137,7 @@ class PinocchioRobot(RobotEngine):
         return done
 
     def _step_free(self, count: int, torques: Vector) -> None:
-        """Simulate steps, at least one, in which nothing acts but torques and wrenches."""
+        """Simulate one or more steps in which only torques and wrenches act."""
         model, data, more = self._free, self._free_data, self._more
         periods, motion = self._periods, self._motion
         aba, integrate = pinocchio.aba, pinocchio.integrate
@@ -145,7 +145,7 @@ class PinocchioRobot(RobotEngine):
         earlier, before = q, v
         for _ in range(count):
             earlier, before = q, v
-            # An array of its own, in which the new velocities are made.
+            # A new array, which becomes the new velocities.
             v = aba(model, data, q, v, torques, *more) if more else aba(model, data, q, v, torques)
             multiply(v, periods, v)
             add(v, before, v)
@@ -153,8 +153,8 @@ class PinocchioRobot(RobotEngine):
         self._positions, self._velocities = q, v
         self._earlier, self._before = earlier, before
 
-    def _resisted(self, q: Vector, v: Vector) -> Vector:
-        """Return the held torques less those of dampers and of springs at the step's end."""
+    def _net_torques(self, q: Vector, v: Vector) -> Vector:
+        """Return the held torques minus those of dampers and of springs at the end of the step."""
         resists = self.resistance
         torques = self._torques - resists.damping * v
         if not self._springs:
@@ -163,21 +163,21 @@ class PinocchioRobot(RobotEngine):
         return torques - np.where(resists.stiffness, resists.stiffness * ahead, 0.0)
 
     def _step(self) -> None:
-        """Simulate one step in which anything may act."""
+        """Simulate one step with all constraints."""
         q, v, dt = self._positions, self._velocities, self._period
         model, data = self._free, self._free_data
-        torques = self._resisted(q, v) if self._smooth else self._torques
+        torques = self._net_torques(q, v) if self._smooth else self._torques
         a = pinocchio.aba(model, data, q, v, torques, *self._more)
         self._earlier, self._before = q, v
-        self._velocities = after = self._constrained(q, v, v + dt * a)
+        self._velocities = after = self._apply_constraints(q, v, v + dt * a)
         self._positions = pinocchio.integrate(model, q, dt * after)
 
-    def _constrained(self, q: Vector, before: Vector, v: Vector) -> Vector:
-        """Return velocities (nv,) after the impulses of contacts, limits, servos and friction.
+    def _apply_constraints(self, q: Vector, before: Vector, v: Vector) -> Vector:
+        """Return the velocities (nv,) after the impulses of contacts, limits, servos, and friction.
 
-        Contacts may drive joints out of their limits. So limits that are close take part from the
-        beginning, and those that are left nevertheless join in. Without contacts, as in DART, those
-        limits act that the free motion would leave.
+        Contacts may drive joints out of their limits, so limits that are close take part from the
+        beginning, and others as soon as they are violated. Without contacts, as in DART, the limits
+        that the free motion would violate act.
         """
         base, joints = self.base, self._joints
         touching = None
@@ -191,33 +191,33 @@ class PinocchioRobot(RobotEngine):
         upper = pinocchio.computeMinverse(self._model, self._data, q) * self._upper
         inverse, aims = upper + upper.T, joints.aims(bounds)
         if touching is None:
-            return self._limited(inverse, v, np.flatnonzero(acts), aims)
+            return self._apply_limits(inverse, v, np.flatnonzero(acts), aims)
         while True:
             rows = np.flatnonzero(acts)
-            after = self._touched(inverse, before, v, touching, rows, aims)
+            after = self._apply_contacts(inverse, before, v, touching, rows, aims)
             missed = joints.acting(bounds, after[base:], -_MISSED) & ~acts
             if not missed.any():
                 return after
             acts |= missed
 
-    def _limited(self, inverse: Vector, v: Vector, rows: Places, aims: Vector) -> Vector:
-        """Return velocities after the impulses of rows of the joints alone."""
+    def _apply_limits(self, inverse: Vector, v: Vector, rows: Indices, aims: Vector) -> Vector:
+        """Return the velocities after the impulses of rows of the joints alone."""
         joints = self._joints
         index = joints.joints[rows] + self.base
         spread = inverse[:, index]
         change = aims[rows] - v[index]
         return v + spread @ solve(spread[index], change, joints.least[rows], joints.most[rows])
 
-    def _touched(
+    def _apply_contacts(
         self,
         inverse: Vector,
         before: Vector,
         v: Vector,
-        touching: Touching,
-        rows: Places,
+        touching: ContactPoints,
+        rows: Indices,
         aims: Vector,
     ) -> Vector:
-        """Return velocities after the impulses of contacts and of rows of the joints."""
+        """Return the velocities after the impulses of contacts and of rows of the joints."""
         joints = self._joints
         jacobian, wanted = touching.jacobian, -touching.bias(before, self._period)
         if len(rows):
@@ -235,7 +235,7 @@ class PinocchioRobot(RobotEngine):
         return v + spread @ impulses
 
     def _step_rk4(self) -> None:
-        """Simulate one step with the classic method of fourth order."""
+        """Simulate one step with the classic Runge-Kutta method of fourth order."""
         q, v, dt, model = self._positions, self._velocities, self._period, self._model
         half = 0.5 * dt
         a1 = self._acceleration(q, v)
@@ -286,7 +286,7 @@ class PinocchioRobot(RobotEngine):
         return bool(self._free.frames[self._frames[link]].parentJoint > 0)
 
     def push(self, link: int, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
-        """Add a wrench for the next steps until `release`."""
+        """Apply a wrench until `release`."""
         frame = self._free.frames[self._frames[link]]
         joint, place = frame.parentJoint, frame.placement
         if not local:
@@ -298,7 +298,7 @@ class PinocchioRobot(RobotEngine):
         self._more = (self._pushes,)
 
     def release(self) -> None:
-        """End all wrenches."""
+        """Remove all wrenches."""
         if self._more:
             for joint in range(self._free.njoints):
                 self._pushes[joint] = pinocchio.Force.Zero()
@@ -307,18 +307,18 @@ class PinocchioRobot(RobotEngine):
     # State ----------------------------------------------------------------------------------
 
     def positions(self) -> Vector:
-        """Return the present positions, shape (nq,), in a vector of its own."""
+        """Return the present positions, shape (nq,), as a new vector."""
         q = self._positions.copy()
         if self.base and q[6] < 0:
             q[3:7] *= -1
         return q
 
     def velocities(self) -> Vector:
-        """Return the present velocities, shape (nv,), in a vector of its own."""
+        """Return the present velocities, shape (nv,), as a new vector."""
         if not self.base:
             return self._velocities.copy()
-        if self._turned is not self._velocities:
-            self._turned, self._twist = self._velocities, self._velocities.copy()
+        if self._twist_source is not self._velocities:
+            self._twist_source, self._twist = self._velocities, self._velocities.copy()
             self._twist[:3] = rotate_back(self._positions[3:7].tolist(), *self._twist[:3].tolist())
         return self._twist.copy()
 
@@ -345,16 +345,16 @@ class PinocchioRobot(RobotEngine):
         self._touching, self._safe_steps = None, 0
 
     def native(self) -> tuple[Vector, Vector]:
-        """Return the state as it is stepped, copied."""
+        """Return a copy of the state in the convention of the stepping model."""
         return self._positions.copy(), self._velocities.copy()
 
     def set_native(self, positions: Vector, velocities: Vector) -> None:
-        """Set the state to what `native` returned."""
+        """Set the state that `native` returned."""
         self._positions, self._velocities = positions.copy(), velocities.copy()
         self._earlier, self._before = self._positions, self._velocities
         self._touching, self._safe_steps = None, 0
 
     def speed(self) -> float:
-        """Return the length of the velocities; NaN or inf where the state is broken."""
+        """Return the norm of the velocities; NaN or inf if the state is not finite."""
         v = self._velocities  # positions come from these, so they are finite if these are
         return math.sqrt(v.dot(v))

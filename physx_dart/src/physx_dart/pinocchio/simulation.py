@@ -1,6 +1,7 @@
-"""The engine Pinocchio: its algorithms and constraint solvers, stepped by `pinocchio_robot`.
+"""The engine Pinocchio: its algorithms and constraint solvers, stepped by `PinocchioRobot`.
 
-All calls of pinocchio are in `algorithms` and the modules whose names begin with `pinocchio_`.
+All calls of pinocchio are in `physx_dart.pinocchio`, `physx_dart.batch`, and
+`physx_dart.shared.algorithms`.
 """
 
 from __future__ import annotations
@@ -25,18 +26,18 @@ _WITHOUT_RK4 = ("actuators", "contacts", "isotropic_friction", "joint_friction",
 class PinocchioBackend(Backend):
     """Pinocchio, a library of rigid-body algorithms.
 
-    Robots and objects touch what never moves, but not each other. Contact solvers: ``pgs`` (the
-    usual one) and ``admm``, both with a friction cone. There is one way to find contacts, without a
-    name: by points and spheres, see `physx_dart.pinocchio.contacts`.
+    Robots and objects collide with static things, but not with each other. Contact solvers: ``pgs``
+    (default) and ``admm``, both with a friction cone. Contacts are found with points and spheres,
+    see `physx_dart.pinocchio.contacts`; there is no choice of detectors.
     """
 
     def build(self, world: World, seed: int | None = None) -> Simulation:
-        """Build a simulation; nothing is drawn at random, the seed has no effect.
+        """Build a simulation; it is deterministic, so the seed has no effect.
 
         Raises:
-            ModelError: A robot or mesh cannot be loaded; the message says why.
-            FeatureNotSupportedError: The world asks for what is not there.
-            UnknownOptionError: There is no solver of that name.
+            ModelError: If a robot or mesh cannot be loaded; the message says why.
+            FeatureNotSupportedError: If the world needs a feature that the engine does not have.
+            UnknownOptionError: If there is no solver of that name.
         """
         return PinocchioSimulation(world)
 
@@ -57,9 +58,9 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
         """Build the world.
 
         Raises:
-            ModelError: A robot or mesh cannot be loaded; the message says why.
-            FeatureNotSupportedError: The world asks for what is not there.
-            UnknownOptionError: There is no solver of that name.
+            ModelError: If a robot or mesh cannot be loaded; the message says why.
+            FeatureNotSupportedError: If the world needs a feature that the engine does not have.
+            UnknownOptionError: If there is no solver of that name.
         """
         solver = ImpulseSolver(world.solver or "pgs")
         parts = read_parts(world)

@@ -1,4 +1,4 @@
-"""Impulses of contacts, limits, servos and friction together."""
+"""Solver for the impulses of contacts, limits, servos, and friction together."""
 
 from __future__ import annotations
 
@@ -14,32 +14,31 @@ from physx_dart.pinocchio.contact_problem import ContactProblem
 SOLVERS = ("pgs", "admm")
 _NEWTON_STEPS = 12
 _ITERATIONS = 300
-"""Of Pinocchio's solvers; what they left is Newton's method's again."""
+"""Iterations of Pinocchio's solvers; Newton's method improves what they find."""
 _ACCURACY = 1e-11
 """Of velocities, in m/s, and impulses."""
 _GOOD = 100.0
-"""Error of an iterated solution that is left as it is, as a multiple of an exact one's."""
+"""Error at which an iterated solution is accepted, as a multiple of an exact one's."""
 _ENDLESS = 1e6
-"""Impulse that stands for one without bounds where Pinocchio's solvers want a number."""
+"""Finite bound that stands for infinity in Pinocchio's solvers."""
 
 
 class ImpulseSolver:
     """Solves for the impulses of points with friction cones, and of rows with bounds.
 
-    Newton's method mostly finds them in a few steps, and exactly. Where it goes in circles,
-    Pinocchio's solvers come first, one after the other, and Newton's method goes on from what they
-    found: projected Gauss-Seidel fails at impacts of light links on heavy ones and at jammed
-    joints, ADMM at some that the first finds.
+    Newton's method mostly finds them exactly in a few steps. If it cycles, it continues from the
+    results of Pinocchio's solvers, one after the other: projected Gauss-Seidel fails for impacts of
+    light links on heavy ones and for jammed joints, ADMM for some problems that the former solves.
 
     Args:
-        name: Which comes first: ``"pgs"`` (projected Gauss-Seidel) or ``"admm"``.
+        name: The solver to try first: ``"pgs"`` (projected Gauss-Seidel) or ``"admm"``.
     """
 
     def __init__(self, name: str) -> None:
         """Prepare the solver.
 
         Raises:
-            UnknownOptionError: There is none of that name.
+            UnknownOptionError: If there is no solver of that name.
         """
         if name not in SOLVERS:
             raise UnknownOptionError("World.solver for pinocchio", [name], SOLVERS)
@@ -66,14 +65,14 @@ class ImpulseSolver:
 
         Args:
             response: Velocities for unit impulses, shape (3 k + m, 3 k + m).
-            free: Velocities without impulses, less what is wanted, shape (3 k + m,): of k points
+            free: Velocities without impulses minus the wanted ones, shape (3 k + m,): of k points
                 along two tangents and the normal, then of m rows.
             friction: Coefficients of the points, shape (k,).
-            least: Smallest impulses of the rows, shape (m,): first of those with one bound.
+            least: Smallest impulses of the rows, shape (m,); rows with one bound come first.
             most: Largest impulses, likewise.
 
         Raises:
-            SimulationError: They are no numbers.
+            SimulationError: If a value is not finite.
         """
         if not np.isfinite(free).all() or not np.isfinite(response).all():
             raise SimulationError("The state is no longer finite. Use a smaller period.")
@@ -84,15 +83,15 @@ class ImpulseSolver:
             if least_error < good:
                 break
             good = _GOOD * problem.accuracy
-            begin = self.iterated(problem, name)
+            begin = self.iterate(problem, name)
             if np.isfinite(begin).all():
                 found, error = problem.newton(begin, _NEWTON_STEPS)
                 if error < least_error:
                     best, least_error = found, error
         return best
 
-    def iterated(self, problem: ContactProblem, name: str) -> Vector:
-        """Return what one of Pinocchio's solvers finds, ``"pgs"`` or ``"admm"``."""
+    def iterate(self, problem: ContactProblem, name: str) -> Vector:
+        """Return the result of one of Pinocchio's solvers, ``"pgs"`` or ``"admm"``."""
         models = pinocchio.StdVec_ConstraintModel()
         for coefficient in problem.friction:
             models.append(self._point(float(coefficient)))
@@ -101,11 +100,11 @@ class ImpulseSolver:
         if one_sided:
             models.append(self._limit(one_sided))
         if one_sided < len(least):
-            models.append(self._bounded(least[one_sided:], most[one_sided:]))
+            models.append(self._bounds_model(least[one_sided:], most[one_sided:]))
         data = pinocchio.StdVec_ConstraintData()
         for model in models:
             data.append(model.createData())
-        # Limits of Pinocchio only push upward.
+        # Pinocchio's limits only push upward.
         signs = np.ones(len(problem.free))
         signs[size:][np.isinf(least) & np.isfinite(most)] = -1.0
         delassus = pinocchio.DelassusOperatorDense(problem.matrix * np.outer(signs, signs))
@@ -122,7 +121,7 @@ class ImpulseSolver:
         return self._points[coefficient]
 
     def _limit(self, length: int) -> Any:
-        """Return a constraint of limits that joints of a made-up model are at."""
+        """Return a limit constraint of joints of a dummy model."""
         if length not in self._limits:
             nothing = np.zeros(length)
             model = pinocchio.JointLimitConstraintModel(
@@ -132,8 +131,8 @@ class ImpulseSolver:
             self._limits[length] = pinocchio.ConstraintModel(model)
         return self._limits[length]
 
-    def _bounded(self, least: Vector, most: Vector) -> Any:
-        """Return a constraint with bounds: that of friction in joints of a made-up model."""
+    def _bounds_model(self, least: Vector, most: Vector) -> Any:
+        """Return a constraint with bounds: joint friction of a dummy model."""
         return pinocchio.ConstraintModel(
             pinocchio.JointFrictionConstraintModel(
                 self._chain(len(least)),
@@ -160,7 +159,7 @@ def _joints(length: int) -> Any:
 
 
 def _accurate(settings: Any) -> Any:
-    """Return settings with which a solver goes on until its result is accurate."""
+    """Return settings with which a solver iterates until its result is accurate."""
     settings.max_iterations = _ITERATIONS
     for kind in ("feasibility", "complementarity"):
         setattr(settings, f"absolute_{kind}_tol", _ACCURACY)

@@ -1,4 +1,4 @@
-"""Surfaces of what never moves: how far points are from them, and which way is out."""
+"""Surfaces of static things: distances of points and outward normals."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from physx_dart.shared.shapes import CollisionShape
 
 
 class Surface(ABC):
-    """The surface of one thing.
+    """A surface.
 
     Attributes:
-        even: Whether the distances of two points differ by no more than that between them.
+        even: Whether distances of two points differ by no more than the distance between them.
     """
 
     even: ClassVar[bool] = True
@@ -33,7 +33,7 @@ class Surface(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Plane(Surface):
-    """An endless plane: normal of length 1, and its height along it in m."""
+    """An infinite plane: normal of length 1, and height along it in m."""
 
     normal: Vector
     height: float
@@ -70,7 +70,7 @@ class Solid(Surface):
 
 @dataclass(frozen=True, eq=False)
 class Heights(Surface):
-    """A height field; the distance is that to the plane of the triangle below or above."""
+    """A height field; distances are to the plane of the triangle below or above."""
 
     even: ClassVar[bool] = False
     field: HeightField
@@ -99,10 +99,10 @@ class Heights(Surface):
 
 
 def surfaces_of(static: Static, engine: str, features: Sequence[str]) -> list[Surface]:
-    """Return the surfaces of something that never moves.
+    """Return the surfaces of something static.
 
     Raises:
-        FeatureNotSupportedError: It is a mesh.
+        FeatureNotSupportedError: If it is a mesh.
     """
     what = static.what
     if isinstance(what, HeightField):
@@ -122,7 +122,7 @@ def surfaces_of(static: Static, engine: str, features: Sequence[str]) -> list[Su
 
 
 def _directions(vectors: Vector) -> tuple[Vector, Vector]:
-    """Return lengths and directions; the direction of nothing is upward."""
+    """Return lengths and directions of vectors; the direction of a zero vector is upward."""
     lengths = np.linalg.norm(vectors, axis=1)
     upward = np.array([0.0, 0.0, 1.0])
     safe = np.where(lengths > 1e-12, lengths, 1.0)[:, None]

@@ -1,1 +1,1 @@
-"""What both engines share: models, shapes, algorithms, and the common simulation."""
+"""Models, shapes, algorithms, and the simulation that both engines share."""

@@ -1,7 +1,7 @@
-"""Pinocchio's algorithms for a world's robots and objects, whatever engine simulates them.
+"""Pinocchio's algorithms for the robots and objects of a world, whichever engine simulates it.
 
-All states are those of `physx_core.simulation.layout`, all results are new arrays of float64 in
-C order, so that ``torch.from_numpy`` takes them as they are.
+States follow the convention of `physx_core.simulation.layout`. All results are new arrays of
+float64 in C order, which ``torch.from_numpy`` accepts as they are.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ _velocity, _acceleration = pinocchio.getFrameVelocity, pinocchio.getFrameClassic
 
 
 class MoverAlgorithms:
-    """Pinocchio's algorithms for one robot or object.
+    """Pinocchio's algorithms for a robot or object.
 
     Attributes:
         model: Pinocchio's model, with gravity and the rotors' inertia.
-        data: What its algorithms write to.
-        frames: Frame of each link, by its place in the robot.
-        resistance: What resists its joints' motion; part of the dynamics.
+        data: Workspace of its algorithms.
+        frames: Frame of each link.
+        resistance: Resistance of its joints; part of the dynamics.
     """
 
     def __init__(self, mover: Mover, gravity: tuple[float, ...]) -> None:
@@ -40,7 +40,7 @@ class MoverAlgorithms:
         self._first = 1 if mover.fixed_base else 2
 
     def write_motion(self, frame: int, out: Vector) -> None:
-        """Write pose, velocity and acceleration of a frame after `pinocchio.forwardKinematics`.
+        """Write pose, velocity, and acceleration of a frame, after `pinocchio.forwardKinematics`.
 
         Args:
             frame: The frame.
@@ -60,18 +60,18 @@ class MoverAlgorithms:
         return pose
 
     def forward(self, q: Vector, v: Vector, tau: Vector) -> Vector:
-        """Return the accelerations that torques cause, resistance included."""
+        """Return the accelerations that torques cause, with joint resistance."""
         resisted = tau - self.resistance.torques(q, v)
         return pinocchio.aba(self.model, self.data, q, v, resisted)
 
     def inverse(self, q: Vector, v: Vector, a: Vector) -> Vector:
-        """Return the torques that cause accelerations, resistance included."""
+        """Return the torques that cause accelerations, with joint resistance."""
         return pinocchio.rnea(self.model, self.data, q, v, a) + self.resistance.torques(q, v)
 
     def joint_wrenches(
         self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
     ) -> Vector:
-        """Return what each joint carries, shape (joints, 6); `outer` acts on links."""
+        """Return the reactions of joints, shape (joints, 6), with external wrenches on links."""
         model, data = self.model, self.data
         if outer:
             pinocchio.forwardKinematics(model, data, q)
@@ -103,12 +103,12 @@ class MoverAlgorithms:
         pinocchio.framesForwardKinematics(model, data, q)
         x, y, z = data.oMf[frame].rotation @ point
         arm = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        found = np.array(found, order="C").reshape(6, -1)  # one column comes as a vector
+        found = np.array(found, order="C").reshape(6, -1)  # a single column is returned as a vector
         found[:3] -= arm @ found[3:]
         return found
 
     def derivatives(self, q: Vector, v: Vector, tau: Vector) -> tuple[Vector, Vector, Vector]:
-        """Return the derivatives of `forward` by positions, velocities and torques."""
+        """Return the derivatives of `forward` by positions, velocities, and torques."""
         resisted = tau - self.resistance.torques(q, v)
         found = pinocchio.computeABADerivatives(self.model, self.data, q, v, resisted)
         by_q, by_v, inverse = (np.array(matrix, order="C") for matrix in found)
@@ -119,12 +119,12 @@ class MoverAlgorithms:
 
 
 class Algorithms:
-    """Pinocchio's algorithms for all of a world. Arrays are not checked here.
+    """Pinocchio's algorithms for a world; arrays are not validated.
 
-    ``Algorithms.of(world)`` makes one; the positions' quaternions must have length 1.
+    Create one with ``Algorithms.of(world)``. Quaternions in positions must have length 1.
 
     Attributes:
-        movers: One for each robot, then each object that moves.
+        movers: Algorithms of each robot, then of each moving object.
     """
 
     def __init__(self, parts: Parts) -> None:
@@ -144,7 +144,7 @@ class Algorithms:
         """Return the algorithms of a world.
 
         Raises:
-            ModelError: A robot cannot be loaded; the message says why.
+            ModelError: If a robot cannot be loaded; the message says why.
         """
         return cls(read_parts(world))
 
@@ -165,7 +165,7 @@ class Algorithms:
         return found
 
     def motions(self, q: Vector, v: Vector, a: Vector, bodies: Sequence[int]) -> Vector:
-        """Return how bodies move, shape (bodies, 19), along the world's axes.
+        """Return the motions of bodies, shape (bodies, 19), along the world's axes.
 
         Args:
             q: Positions.
@@ -174,7 +174,7 @@ class Algorithms:
             bodies: Their places in `Layout.names`.
 
         Returns:
-            In each row the pose (7), and velocity (6) and acceleration (6) of the body's origin.
+            In each row the pose (7), velocity (6), and acceleration (6) of the body's origin.
         """
         found = np.empty((len(bodies), 19))
         known: set[int] = set()
@@ -202,14 +202,14 @@ class Algorithms:
     def joint_wrenches(
         self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
     ) -> Vector:
-        """Return what the joints carry in a state, shape (joints, 6).
+        """Return the reactions of joints in a state, shape (joints, 6).
 
         Args:
             q: Positions.
             v: Velocities.
             a: Accelerations.
-            outer: What acts on bodies from outside, by their places: force, and torque about the
-                body's origin, 6 numbers along the world's axes.
+            outer: External wrenches on bodies, by their places: force, then torque about the body's
+                origin, 6 numbers along the world's axes.
         """
         found, begin = [], 0
         for each, x, y in self._slices:
@@ -236,7 +236,7 @@ class Algorithms:
     def forward_dynamics_derivatives(
         self, q: Vector, v: Vector, tau: Vector
     ) -> tuple[Vector, Vector, Vector]:
-        """Return the derivatives of `forward_dynamics` by positions, velocities and torques."""
+        """Return the derivatives of `forward_dynamics` by positions, velocities, and torques."""
         found = [each.derivatives(q[a], v[b], tau[b]) for each, a, b in self._slices]
         by_q, by_v, by_tau = (self._diagonal(blocks) for blocks in zip(*found, strict=True))
         return by_q, by_v, by_tau

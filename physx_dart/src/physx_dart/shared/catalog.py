@@ -1,4 +1,4 @@
-"""The robots that a world may name, with what can be said of each without loading a mesh."""
+"""Catalog of the robots that a world may name, described without loading a mesh."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def robots() -> tuple[RobotInfo, ...]:
 
 
 def describe(name: str, path: Path) -> RobotInfo:
-    """Return what a URDF file says of a robot.
+    """Return the description of a robot.
 
     Args:
         name: Name of the robot.
-        path: The file; if it cannot be loaded, the result says why.
+        path: Its URDF file; if it cannot be loaded, the result says why.
     """
     try:
         model = read_robot(Robot(path))
@@ -52,7 +52,7 @@ def _kind(primitives: int, meshes: int) -> str:
 
 
 def _warning(path: Path, meshes: list[Element]) -> str:
-    """Return what to know of collision meshes: files are looked up, not read."""
+    """Return a warning about collision meshes; their files are looked up, not read."""
     if not meshes:
         return ""
     files = {mesh_path(path, mesh.get("filename", ""), _NO_DIRS) for mesh in meshes}

@@ -1,4 +1,4 @@
-"""What an engine implements for one robot or object."""
+"""Interface that an engine implements for a robot or object."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from physx_dart.shared.resistance import Resistance
 
 
 class RobotEngine(ABC):
-    """One robot or object in an engine. Vectors are in the convention of `physx_core`'s backends.
+    """A robot or object in an engine. Vectors follow the convention of `physx_core`.
 
     Attributes:
-        mover: What it is.
-        model: What its file says.
+        mover: Its description.
+        model: Its model.
         fixed_base: Whether the root link is welded to the world.
         nq: Length of its positions.
         nv: Length of its velocities.
         base: Degrees of freedom of its base: 0 or 6.
-        resistance: What resists the motion of its joints.
+        resistance: Resistance of its joints.
     """
 
     def __init__(self, mover: Mover) -> None:
@@ -36,7 +36,7 @@ class RobotEngine(ABC):
         self.resistance = Resistance.of(mover)
 
     def neutral(self) -> Vector:
-        """Return the positions at rest: 0, or the limit nearest to 0; base where it begins."""
+        """Return the positions at rest: 0 or the closest limit; the base at its initial pose."""
         mover = self.mover
         base = [] if self.fixed_base else [*mover.position, *mover.orientation]
         return np.array([*base, *(max(j.lower, min(0.0, j.upper)) for j in self.model.joints)])
@@ -47,15 +47,15 @@ class RobotEngine(ABC):
 
     @abstractmethod
     def positions(self) -> Vector:
-        """Return the present positions, shape (nq,), in a vector of its own."""
+        """Return the present positions, shape (nq,), as a new vector."""
 
     @abstractmethod
     def velocities(self) -> Vector:
-        """Return the present velocities, shape (nv,), in a vector of its own."""
+        """Return the present velocities, shape (nv,), as a new vector."""
 
     @abstractmethod
     def accelerations(self) -> Vector:
-        """Return the change of the velocities in the last step by the period, shape (nv,)."""
+        """Return the change of the velocities in the last step over the period, shape (nv,)."""
 
     @abstractmethod
     def write(self, positions: Vector, velocities: Vector) -> None:
@@ -63,35 +63,35 @@ class RobotEngine(ABC):
 
     @abstractmethod
     def native(self) -> tuple[Vector, Vector]:
-        """Return the state exactly as the engine has it, copied."""
+        """Return a copy of the engine's own state."""
 
     @abstractmethod
     def set_native(self, positions: Vector, velocities: Vector) -> None:
-        """Set the state to what `native` returned."""
+        """Set the state that `native` returned."""
 
     @abstractmethod
     def speed(self) -> float:
-        """Return the length of the velocities; NaN or inf where the state is broken."""
+        """Return the norm of the velocities; NaN or inf if the state is not finite."""
 
     @abstractmethod
     def can_move(self, link: int) -> bool:
-        """Return whether a link, by its place in the model, can move at all."""
+        """Return whether a link, by its place in the model, can move."""
 
     @abstractmethod
     def push(self, link: int, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
-        """Add a wrench for the next steps until `release`.
+        """Apply a wrench until `release`.
 
         Args:
             link: Place of the link in the model.
-            force: In N, shape (3,), on the point.
-            torque: In N m, shape (3,).
-            point: In the link's frame, in m.
-            local: Whether force and torque are along the link's axes; else along the world's.
+            force: Force on the point, shape (3,), in N.
+            torque: Torque, shape (3,), in N m.
+            point: Point of application in the link's frame, in m.
+            local: Whether force and torque are along the link's axes instead of the world's.
         """
 
     @abstractmethod
     def release(self) -> None:
-        """End all wrenches."""
+        """Remove all wrenches."""
 
 
 def base_accelerations(

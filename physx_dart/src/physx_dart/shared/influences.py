@@ -1,4 +1,4 @@
-"""What acts on a world from outside while it is stepped: wrenches and hooks."""
+"""Wrenches and hooks, which act on a world while it is stepped."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from physx_core.typing import Vector
 
 
 class Wrenches:
-    """The wrenches that act on a world."""
+    """The active wrenches of a world."""
 
     def __init__(self, period: float) -> None:
         self._period = period
@@ -18,29 +18,29 @@ class Wrenches:
         self._next = 0
 
     def __len__(self) -> int:
-        """Return how many act."""
+        """Return the number of active wrenches."""
         return len(self._active)
 
     def add(self, wrench: Wrench, frame: int) -> int:
-        """Let a wrench act from a frame on; return its number."""
+        """Apply a wrench from a frame on; return its number."""
         number, self._next = self._next, self._next + 1
         self._active[number] = AppliedWrench(number, frame, wrench)
         return number
 
     def remove(self, number: int) -> None:
-        """End a wrench.
+        """Remove a wrench.
 
         Raises:
-            SimulationError: None of that number acts.
+            SimulationError: If no wrench with that number acts.
         """
         if number not in self._active:
             raise SimulationError(
-                f"No wrench has the number {number!r}; those that act: {sorted(self._active)}."
+                f"No wrench has the number {number!r}; active wrenches: {sorted(self._active)}."
             )
         del self._active[number]
 
     def at(self, frame: int) -> Iterator[tuple[Wrench, Vector, Vector]]:
-        """Forget those that are over; return each other with its force and torque."""
+        """Drop expired wrenches; return each of the others with its force and torque."""
         for number, applied in list(self._active.items()):
             steps = applied.wrench.steps(self._period)
             if steps is not None and frame >= applied.begin + steps:
@@ -50,18 +50,18 @@ class Wrenches:
                 yield applied.wrench, *applied.wrench.at(time)
 
     def before(self, frame: int) -> Iterator[tuple[Wrench, Vector, Vector]]:
-        """Return each that acted in the step before a frame, with its force and torque then."""
+        """Return each wrench that acted in the step before a frame, with its force and torque."""
         for applied in self._active.values():
             steps, since = applied.wrench.steps(self._period), frame - 1 - applied.begin
             if since >= 0 and (steps is None or since < steps):
                 yield applied.wrench, *applied.wrench.at(since * self._period)
 
     def snapshot(self) -> tuple[AppliedWrench, ...]:
-        """Return all that act."""
+        """Return all active wrenches."""
         return tuple(self._active.values())
 
     def restore(self, applied: Iterable[AppliedWrench]) -> None:
-        """Replace all that act."""
+        """Replace all active wrenches."""
         self._active = {each.number: each for each in applied}
         self._next = max([self._next, *(number + 1 for number in self._active)])
 
@@ -73,41 +73,41 @@ class Hooks:
         self._hooks: list[tuple[Hook, int]] = []
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of hooks."""
         return len(self._hooks)
 
     def add(self, hook: Hook, every: int) -> None:
         """Call a function before the steps whose frame is a multiple of `every`.
 
         Raises:
-            SimulationError: It cannot be called.
+            SimulationError: If it is not callable.
         """
         if not callable(hook):
-            raise SimulationError(f"{hook!r} cannot be called, so it is no hook.")
+            raise SimulationError(f"{hook!r} is not callable, so it cannot be a hook.")
         self._hooks.append((hook, every))
 
     def remove(self, hook: Hook) -> None:
-        """Call a function no longer.
+        """Remove a hook.
 
         Raises:
-            SimulationError: It is not called.
+            SimulationError: If the function is not a hook of this simulation.
         """
         for place, (known, _) in enumerate(self._hooks):
             if known == hook:
                 del self._hooks[place]
                 return
-        raise SimulationError(f"{hook!r} is no hook of this simulation.")
+        raise SimulationError(f"{hook!r} is not a hook of this simulation.")
 
     def clear(self) -> None:
-        """Forget all."""
+        """Remove all hooks."""
         self._hooks.clear()
 
     def pause(self, frame: int) -> int:
-        """Return after how many steps from a frame the next one is due, at least 1."""
+        """Return the number of steps from a frame to the next call, at least 1."""
         return min((every - frame % every for _, every in self._hooks), default=2**30)
 
     def call(self, simulation: Simulation, frame: int) -> None:
-        """Call those that are due at a frame."""
+        """Call the hooks that are due at a frame."""
         for hook, every in tuple(self._hooks):
             if frame % every == 0:
                 hook(simulation)

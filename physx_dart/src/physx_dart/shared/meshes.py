@@ -1,4 +1,4 @@
-"""Mesh files: their vertices, and the boxes and capsules around them."""
+"""Vertices of mesh files, and the boxes and capsules around them."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
     """Return the vertices of a mesh file, shape (n, 3), in m.
 
     Args:
-        path: Of a file in one of the formats stl, obj and dae.
+        path: Path of an stl, obj, or dae file.
         scale: Factors of the lengths along each axis.
 
     Raises:
-        ModelError: The file does not exist, is of another format, or cannot be read.
+        ModelError: If the file does not exist, is of another format, or cannot be read.
     """
     if not path.is_file():
         raise ModelError(f"There is no mesh file {path}.")
     if path.suffix.lower() not in _FORMATS:
-        raise ModelError(f"The mesh {path} is in none of the formats {', '.join(_FORMATS)}.")
+        raise ModelError(f"The mesh {path} is not in one of the formats {', '.join(_FORMATS)}.")
     import coal  # only worlds with meshes need it
 
     try:
@@ -35,7 +35,7 @@ def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
     except (ValueError, RuntimeError, TypeError) as error:
         raise ModelError(f"The mesh {path} cannot be read: {error}") from error
     if not len(vertices) or not np.isfinite(vertices).all():
-        raise ModelError(f"The mesh {path} has no vertices, or such that are not finite.")
+        raise ModelError(f"The mesh {path} has no vertices, or some that are not finite.")
     return vertices
 
 

@@ -1,4 +1,4 @@
-"""A world as the engines load it: everything that moves as a robot model, the rest as statics."""
+"""Parts of a world as the engines load them: movers as robot models, and static things."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ _OBJECT = (
 
 @dataclass(frozen=True)
 class Mover:
-    """A robot, or an object that moves.
+    """A robot or moving object.
 
     Attributes:
         name: Its name in the world.
-        model: What its file says; an object is a robot of one link named ``body``.
+        model: Its model; an object is a robot with one link named ``body``.
         fixed_base: Whether its root link is welded to the world.
-        position: Of the root link at first, in m.
-        orientation: Likewise, quaternion x, y, z, w.
-        self_collisions: Whether its links touch each other.
+        position: Initial position of the root link, in m.
+        orientation: Its initial orientation, quaternion x, y, z, w.
+        self_collisions: Whether its links collide with each other.
         is_object: Whether it is an object.
     """
 
@@ -44,13 +44,13 @@ class Mover:
 
 @dataclass(frozen=True)
 class Static:
-    """Something that never moves.
+    """A static object or the ground.
 
     Attributes:
         name: Its name in the world.
-        what: A shape, or the ground.
-        position: Of the shape, in m.
-        orientation: Likewise, quaternion x, y, z, w.
+        what: The shape or the ground.
+        position: Position of the shape, in m.
+        orientation: Its orientation, quaternion x, y, z, w.
     """
 
     name: str
@@ -61,12 +61,12 @@ class Static:
 
 @dataclass(frozen=True)
 class Parts:
-    """All of a world.
+    """All parts of a world.
 
     Attributes:
         world: Its description.
-        movers: Robots, then objects that move.
-        statics: The ground, then objects that do not.
+        movers: Robots, then moving objects.
+        statics: The ground, then static objects.
     """
 
     world: World
@@ -78,14 +78,14 @@ def read_parts(world: World) -> Parts:
     """Read the files of a world.
 
     Raises:
-        ModelError: A file cannot be read, or a robot has no joint and a fixed base.
+        ModelError: If a file cannot be read, or a robot has no joint and a fixed base.
     """
     movers = []
     for robot in world.robots:
         model = read_robot(robot, touching=_touches(world, robot.self_collisions))
         if robot.fixed_base and not model.joints:
             raise ModelError(
-                f'Robot "{robot.name}", {model.path}: it has no joint that moves and a fixed base. '
+                f'Robot "{robot.name}", {model.path}: it has no movable joint and a fixed base. '
                 "Use fixed_base=False."
             )
         pose = robot.position, robot.orientation
@@ -118,7 +118,7 @@ def _object(thing: WorldObject) -> Mover:
 
 
 def static_poses(parts: Parts) -> np.ndarray:
-    """Return the poses of what never moves, shape (statics, 7)."""
+    """Return the poses of static things, shape (statics, 7)."""
     poses = [[*static.position, *static.orientation] for static in parts.statics]
     found = np.array(poses, np.float64).reshape(-1, 7)
     found[found[:, 6] < 0, 3:] *= -1
@@ -129,7 +129,7 @@ def layout_of(parts: Parts) -> Layout:
     """Return names and places of everything in the state.
 
     Raises:
-        ModelError: Two bodies have one name.
+        ModelError: If two bodies have one name.
     """
     several = len(parts.world.robots) > 1
     joints: list[Joint] = []
@@ -180,6 +180,5 @@ def _check_names(names: Sequence[str]) -> None:
         return
     name = next(name for name in names if names.count(name) > 1)
     raise ModelError(
-        f'A link and an object, or the ground, have the same name "{name}". '
-        "Give the object another one."
+        f'A link and an object or the ground share the name "{name}". Give the object another one.'
     )

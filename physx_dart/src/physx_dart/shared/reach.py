@@ -1,4 +1,4 @@
-"""How far the collision shapes of a robot or object reach along a direction."""
+"""Extent of the collision shapes of a robot or object along a direction."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from physx_dart.shared.shapes import CollisionShape
 
 
 class Reach:
-    """The collision shapes of one robot or object, ready to be asked."""
+    """The collision shapes of a robot or object, prepared for queries."""
 
     def __init__(self, mover: Mover) -> None:
         links = {name: i for i, name in enumerate(mover.model.links)}
@@ -26,7 +26,7 @@ class Reach:
 
         Args:
             direction: CollisionShape (3,).
-            poses: Of the links, shape (links, 7).
+            poses: Poses of the links, shape (links, 7).
         """
         found = [-math.inf]
         for (link, shape), corners in zip(self._shapes, self._corners, strict=True):
@@ -52,7 +52,7 @@ def _corners(shape: CollisionShape) -> Vector | None:
 
 
 def _round(shape: CollisionShape, along: Vector) -> float:
-    """Return how far a shape with an axis reaches from its center along a local direction."""
+    """Return the extent of a round shape from its center along a local direction."""
     radius, length = shape.size[0], float(np.linalg.norm(along))
     if shape.kind == "sphere":
         return radius * length

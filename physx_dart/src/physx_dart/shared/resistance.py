@@ -1,4 +1,4 @@
-"""What resists the motion of a robot's joints: damping, Coulomb friction and springs."""
+"""Resistance of a robot's joints: damping, Coulomb friction, and springs."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from physx_dart.shared.parts import Mover
 
 
 class Resistance:
-    """Damping, friction, springs and rotors of a robot, each of shape (nv,); 0 for its base.
+    """Damping, friction, springs, and rotors of a robot, each of shape (nv,); 0 for its base.
 
     Attributes:
         damping: In N m s/rad or N s/m.
         friction: In N m or N.
-        stiffness: Of the springs, in N m/rad or N/m.
-        rest: Where the springs are slack, in rad or m.
+        stiffness: Stiffness of the springs, in N m/rad or N/m.
+        rest: Relaxed positions of the springs, in rad or m.
         armature: Inertia of the rotors, in kg m² or kg.
         table: All five as rows, shape (5, nv).
     """
 
     def __init__(self, table: Vector) -> None:
-        """Keep the five, in the order above.
+        """Keep the rows, in the order above.
 
         Args:
             table: Shape (5, nv).
@@ -35,7 +35,7 @@ class Resistance:
 
     @classmethod
     def of(cls, mover: Mover) -> Self:
-        """Return what resists the joints of a robot or object."""
+        """Return the resistance of a robot or object."""
         base = 0 if mover.fixed_base else 6
         table = np.zeros((5, base + len(mover.model.joints)))
         for column, joint in zip(table.T[base:], mover.model.joints, strict=True):
@@ -44,13 +44,13 @@ class Resistance:
         return cls(table)
 
     def torques(self, positions: Vector, velocities: Vector) -> Vector | float:
-        """Return the torques against a motion, shape (..., nv), or 0."""
+        """Return the torques against a motion, shape (..., nv), or 0 if there are none."""
         if not self._any:
             return 0.0
         return self.smooth(positions, velocities) + self.friction * np.sign(velocities)
 
     def smooth(self, positions: Vector, velocities: Vector) -> Vector | float:
-        """Return the torques of damping and springs alone, shape (..., nv), or 0."""
+        """Return the torques of damping and springs alone, likewise."""
         if not self._smooth:
             return 0.0
         stretch = positions[..., positions.shape[-1] - velocities.shape[-1] :] - self.rest

@@ -1,4 +1,4 @@
-"""Where robot descriptions and the meshes that they name lie on this machine."""
+"""Look-up of robot descriptions and of the meshes that they name."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from physx_core import simulation
 from physx_core.errors import MissingMeshesError, ModelError, nearest
 
 EXAMPLE_DATA = "example-robot-data"
-"""Distribution with many robots, and the package that their mesh names begin with."""
+"""Distribution with many robots; also the package that their mesh names begin with."""
 OWN_ROBOTS = Path(__file__).parents[1] / "robots"
-"""Folder of the robots that come with physx."""
+"""Folder of the robots of this package."""
 
 
 def find_robot(urdf: str | Path) -> Path:
     """Return the URDF file of a robot.
 
     Args:
-        urdf: A path; or the name of an own robot, as in ``"cartpole"``, or of one of
-            ``example-robot-data``, as in ``"a1/a1"``; ``physx robots`` lists them.
+        urdf: A path; or the name of a robot of this package, as in ``"cartpole"``, or of
+            ``example-robot-data``, as in ``"a1/a1"``; ``physx robots`` lists the names.
 
     Raises:
-        ModelError: It is no path of a URDF file, and there is no robot of that name.
+        ModelError: If it is neither the path of a URDF file nor the name of a robot.
     """
     path = Path(urdf).absolute()
     if isinstance(urdf, Path) or urdf.lower().endswith(".urdf") or path.is_file():
@@ -44,13 +44,13 @@ def find_robot(urdf: str | Path) -> Path:
 
 
 def named_robots() -> dict[str, Path]:
-    """Return the files of all robots that have a name: own ones, then installed ones."""
+    """Return the files of all robots with a name: those of this package, then installed ones."""
     own = {path.stem: path for path in sorted(OWN_ROBOTS.glob("*.urdf"))}
     return own | _installed()
 
 
 def _installed(wanted: str | None = None) -> dict[str, Path]:
-    """Return the files of installed robots by name, of one family or of all."""
+    """Return the files of installed robots by name, of one family or all."""
     folder = example_data_dir()
     found: dict[str, Path] = {}
     for root in sorted((folder / "robots").iterdir()) if folder is not None else ():
@@ -61,7 +61,7 @@ def _installed(wanted: str | None = None) -> dict[str, Path]:
 
 
 def example_data_dir() -> Path | None:
-    """Return the folder of the package ``example-robot-data``, None where it is not installed."""
+    """Return the folder of the package ``example-robot-data``, None if it is not installed."""
     try:
         distribution = importlib.metadata.distribution(EXAMPLE_DATA)
     except importlib.metadata.PackageNotFoundError:
@@ -81,10 +81,10 @@ def example_robot(name: str) -> Path:
     """Return the path of a robot of ``example-robot-data``.
 
     Args:
-        name: Path below its folder ``robots``, as in ``"panda_description/urdf/panda.urdf"``.
+        name: Path in its folder ``robots``, as in ``"panda_description/urdf/panda.urdf"``.
 
     Raises:
-        ModelError: The package is not installed, or has no such robot.
+        ModelError: If the package is not installed, or has no such robot.
     """
     folder = example_data_dir()
     if folder is None:

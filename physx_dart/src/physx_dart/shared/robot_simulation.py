@@ -21,8 +21,8 @@ from physx_core.simulation import (
     Simulation,
     State,
     Wrench,
+    copy_to,
     finite_vector,
-    written,
 )
 from physx_core.typing import Records, Vector
 from physx_dart.shared.checks import LayoutChecks, integer
@@ -32,7 +32,7 @@ from physx_dart.shared.parts import Parts, layout_of
 from physx_dart.shared.reach import Reach
 
 if TYPE_CHECKING:
-    from physx_dart.batch.processes import SharedBatches
+    from physx_dart.batch.processes import ParallelBatchDynamics
     from physx_dart.shared.algorithms import Algorithms
 
 _FASTEST = 1e8
@@ -76,7 +76,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._joints = [place.joints for place in places]
         self._links = [(robot, link) for robot in robots for link in range(len(robot.model.links))]
         self._made_algorithms: Algorithms | None = None
-        self._made_batches: SharedBatches | None = None
+        self._made_batches: ParallelBatchDynamics | None = None
         self._reaches: dict[int, Reach] = {}
         for robot in robots:
             robot.write(robot.neutral(), np.zeros(robot.nv))
@@ -98,7 +98,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._least, self._most = least, most
         self._forces_only = bool((modes == "force").all())
         tame = min(most.min(initial=np.inf), -least.max(initial=-np.inf))
-        # Square of a length up to which no command needs to be cut.
+        # Square of a norm up to which no command has to be clipped.
         self._tame = tame**2 if tame > 0 else -1.0
         self._positioned = np.flatnonzero(modes == "position")
 
@@ -123,7 +123,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return self._frame
 
     def set_torques(self, torques: Vector) -> None:
-        """Hold torques, shape (joints,), in N m or N; the joints' limits cut them."""
+        """Hold torques, shape (joints,), in N m or N, clipped at the joints' limits."""
         if self._closed:
             self._check_open()
         if not self._forces_only:
@@ -139,13 +139,13 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._hold(finite_vector("torques", torques, self._joint_count))
 
     def set_commands(self, commands: Vector) -> None:
-        """Hold commands, shape (joints,), each as its joint's mode says; the limits cut them."""
+        """Hold commands, shape (joints,), in each joint's mode, clipped at the limits."""
         if self._closed:
             self._check_open()
         self._hold(finite_vector("commands", commands, self._joint_count))
 
     def commands(self) -> Vector:
-        """Return the held commands as the joints' limits cut them, shape (joints,)."""
+        """Return the held commands, clipped at the joints' limits, shape (joints,)."""
         if self._closed:
             self._check_open()
         return self._commands.copy()
@@ -168,7 +168,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         if type(n) is not int or n < 0:
             n = integer("n, the number of steps,", n, 0)
         if self._stepping:
-            raise SimulationError("A hook cannot call step: it is called by it.")
+            raise SimulationError("A hook must not call step, which calls the hook.")
         if self._watched:
             self._step_watched(n)
             return
@@ -204,7 +204,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
                 self._release()
 
     def _push(self) -> None:
-        """Let the wrenches of this frame act."""
+        """Apply the wrenches of this frame."""
         if not len(self._wrenches):
             return
         self._release()
@@ -218,7 +218,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
             robot.release()
 
     def _steer(self) -> None:
-        """Give the servos of joints with a position command their velocities."""
+        """Update the velocities of servos that approach position commands."""
         if not len(self._positioned):
             return
         commands = self._commands.copy()
@@ -240,11 +240,11 @@ class RobotSimulation(Simulation, Generic[Engine]):
                 raise SimulationError(
                     f"The state is no longer finite, or faster than {_FASTEST:g} rad/s or m/s, "
                     f'after frame {self._frame} ("{robot.mover.name}", {robot.model.path.name}). '
-                    "Use a smaller period, or gentler torques."
+                    "Use a smaller period or smaller torques."
                 )
 
     def _watch(self) -> None:
-        """Note whether anything acts between the steps."""
+        """Note whether anything has to be done between steps."""
         self._watched = bool(len(self._hooks) or len(self._wrenches) or len(self._positioned))
 
     def add_hook(self, hook: Hook, every: int = 1) -> None:
@@ -254,13 +254,13 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._watch()
 
     def remove_hook(self, hook: Hook) -> None:
-        """Call a function no longer."""
+        """Remove a hook."""
         self._check_open()
         self._hooks.remove(hook)
         self._watch()
 
     def apply_wrench(self, wrench: Wrench) -> int:
-        """Let a force act on a body from now on; return its number for `remove_wrench`."""
+        """Apply a wrench to a body from now on; return its number for `remove_wrench`."""
         self._check_open()
         self._check_wrench(wrench)
         number = self._wrenches.add(wrench, self._frame)
@@ -269,13 +269,13 @@ class RobotSimulation(Simulation, Generic[Engine]):
 
     def _check_wrench(self, wrench: Wrench) -> None:
         if not isinstance(wrench, Wrench):
-            raise SimulationError(f"{wrench!r} is no Wrench.")
+            raise SimulationError(f"{wrench!r} is not a Wrench.")
         body = self._checks.body(wrench.body)
         if body >= len(self._links) or not self._links[body][0].can_move(self._links[body][1]):
-            raise SimulationError(f'"{wrench.body}" cannot move, so no wrench acts on it.')
+            raise SimulationError(f'"{wrench.body}" cannot move, so no wrench can act on it.')
 
     def remove_wrench(self, number: int) -> None:
-        """End a wrench."""
+        """Remove a wrench."""
         self._check_open()
         self._wrenches.remove(number)
         self._watch()
@@ -285,23 +285,23 @@ class RobotSimulation(Simulation, Generic[Engine]):
     # State ----------------------------------------------------------------------------------
 
     def positions(self, out: Vector | None = None) -> Vector:
-        """Return the positions, shape (nq,), written into `out` if it is given."""
+        """Return the positions, shape (nq,), copied to `out` if it is given."""
         if self._closed:
             self._check_open()
         only = self._only
         found = only.positions() if only else _join([robot.positions() for robot in self._robots])
-        return found if out is None else written(found, out)
+        return found if out is None else copy_to(found, out)
 
     def velocities(self, out: Vector | None = None) -> Vector:
-        """Return the velocities, shape (nv,), written into `out` if it is given."""
+        """Return the velocities, shape (nv,), copied to `out` if it is given."""
         if self._closed:
             self._check_open()
         only = self._only
         found = only.velocities() if only else _join([each.velocities() for each in self._robots])
-        return found if out is None else written(found, out)
+        return found if out is None else copy_to(found, out)
 
     def accelerations(self) -> Vector:
-        """Return the change of the velocities in the last step by the period, shape (nv,)."""
+        """Return the change of the velocities in the last step over the period, shape (nv,)."""
         if self._closed:
             self._check_open()
         if not self._stepped:
@@ -310,7 +310,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return only.accelerations() if only else _join([r.accelerations() for r in self._robots])
 
     def set_state(self, positions: Vector, velocities: Vector) -> None:
-        """Put the world into a state; time goes on."""
+        """Set the state; time goes on."""
         self._check_open()
         q = self._checks.positions(positions)
         self._write(q, self._checks.velocities("velocities", velocities))
@@ -321,7 +321,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
             robot.write(q[part], v[speed])
 
     def snapshot(self) -> State:
-        """Return everything that `restore` needs to go on exactly from here."""
+        """Return everything that `restore` needs to continue exactly from here."""
         self._check_open()
         return State(
             self.positions(),
@@ -334,10 +334,10 @@ class RobotSimulation(Simulation, Generic[Engine]):
         )
 
     def restore(self, state: State) -> None:
-        """Go back to a snapshot: bit for bit to an own one, within rounding to another engine's."""
+        """Return to a snapshot: bit for bit to an own one, within rounding to another engine's."""
         self._check_open()
         if not isinstance(state, State):
-            raise SimulationError(f"restore takes what snapshot returned, not {state!r}.")
+            raise SimulationError(f"restore needs the result of snapshot, not {state!r}.")
         commands = finite_vector("state.commands", state.commands, len(self.layout.joints))
         q = self._checks.positions(state.positions)
         v = finite_vector("state.velocities", state.velocities, self.layout.nv)
@@ -374,13 +374,13 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return self.read_contacts() if self._stepped else np.zeros(0, CONTACT)
 
     def joint_wrenches(self) -> Vector:
-        """Return what the joints carried in the last step, shape (joints, 6)."""
+        """Return the reactions of joints in the last step, shape (joints, 6)."""
         self._check_open()
         q, v, a = self.positions(), self.velocities(), self.accelerations()
         return self._algorithms.joint_wrenches(q, v, a, self._outer(q))
 
     def _outer(self, q: Vector) -> dict[int, list[float]]:
-        """Return what acted on bodies in the last step: force, torque about their origins."""
+        """Return external forces on bodies in the last step, and torques about their origins."""
         found: dict[int, list[float]] = {}
         if not self._stepped:
             return found
@@ -437,7 +437,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return self.body_motions(names)[:, 13:].copy()
 
     def body_motions(self, names: Sequence[str] | None = None) -> Vector:
-        """Return the present poses, velocities and accelerations of bodies, shape (names, 19)."""
+        """Return the present poses, velocities, and accelerations of bodies, shape (names, 19)."""
         if self._closed:
             self._check_open()
         q, v, a = self.positions(), self.velocities(), self.accelerations()
@@ -484,7 +484,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
     def forward_dynamics_derivatives(
         self, positions: Vector, velocities: Vector, torques: Vector
     ) -> tuple[Vector, Vector, Vector]:
-        """Return the derivatives of `forward_dynamics` by positions, velocities and torques."""
+        """Return the derivatives of `forward_dynamics` by positions, velocities, and torques."""
         return self._algorithms.forward_dynamics_derivatives(
             *self._checked_state(positions, velocities, torques=torques)
         )
@@ -525,13 +525,13 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return q, check("velocities", velocities), check(name, values)
 
     @property
-    def _batches(self) -> SharedBatches:
+    def _batches(self) -> ParallelBatchDynamics:
         if self._made_batches is None:
-            from physx_dart.batch.batches import Batches, MoverBatches
-            from physx_dart.batch.processes import SharedBatches
+            from physx_dart.batch.batches import BatchDynamics, MoverBatchDynamics
+            from physx_dart.batch.processes import ParallelBatchDynamics
 
-            movers = [MoverBatches(x.model, x.resistance) for x in self._algorithms.movers]
-            self._made_batches = SharedBatches(Batches(movers))
+            movers = [MoverBatchDynamics(x.model, x.resistance) for x in self._algorithms.movers]
+            self._made_batches = ParallelBatchDynamics(BatchDynamics(movers))
         return self._made_batches
 
     @property
@@ -547,7 +547,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
             raise SimulationError("The simulation is closed; build a new one.")
 
     def close(self) -> None:
-        """Free the world; calling it again does nothing."""
+        """Free the world; further calls do nothing."""
         self._closed = True
         self._robots, self._only = (), None
         self._links, self._slices = [], []
@@ -563,6 +563,6 @@ def _join(parts: Sequence[Vector]) -> Vector:
 
 
 def _add(wrenches: dict[int, list[float]], body: int, force: Any, torque: Any) -> None:
-    """Add a force and a torque to those of a body."""
+    """Add a force and a torque on a body."""
     before = wrenches.get(body, (0.0,) * 6)
     wrenches[body] = [a + b for a, b in zip(before, (*force, *torque), strict=True)]

@@ -1,4 +1,4 @@
-"""Collision shapes: what of a robot or object touches other things, the same for both engines."""
+"""Collision shapes of robots and objects, the same for both engines."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from physx_dart.shared.robot_files import mesh_path
 
 @dataclass(frozen=True, eq=False)
 class CollisionShape:
-    """One shape of a body.
+    """A collision shape of a body.
 
     Attributes:
         kind: ``box``, ``sphere``, ``capsule``, ``cylinder`` or ``mesh``.
         size: In m: edges of a box (3,); radius of a sphere (1,); radius and length of the cylinder
             alone (2,). For a mesh the factors of its lengths (3,).
-        position: Of its center in the body's frame, shape (3,), in m.
-        rotation: Matrix of its axes there, shape (3, 3).
+        position: Position of its center in the body's frame, shape (3,), in m.
+        rotation: Rotation matrix of its axes there, shape (3, 3).
         body: Name of the link or object.
         friction: Coefficient of friction.
         restitution: Coefficient of restitution.
@@ -42,7 +42,7 @@ class CollisionShape:
 
 
 def shapes_of_robot(robot: Robot, path: Path, tree: UrdfTree) -> tuple[CollisionShape, ...]:
-    """Return the shapes with which a robot touches things.
+    """Return the collision shapes of a robot.
 
     Args:
         robot: Its description.
@@ -50,7 +50,7 @@ def shapes_of_robot(robot: Robot, path: Path, tree: UrdfTree) -> tuple[Collision
         tree: Its links.
 
     Raises:
-        ModelError: A shape makes no sense, a mesh cannot be read, or a foot is no link.
+        ModelError: If a shape is invalid, a mesh cannot be read, or a foot is not a link.
     """
     unknown = [name for name in robot.feet if name not in tree.links]
     if unknown:
@@ -71,7 +71,7 @@ def shapes_of_robot(robot: Robot, path: Path, tree: UrdfTree) -> tuple[Collision
                 pose = each.pose[:3, 3].copy(), each.pose[:3, :3].copy()
                 mesh = mesh_path(path, each.mesh, robot.package_dirs) if each.mesh else None
                 shape = CollisionShape(each.kind, each.size, *pose, name, *material, mesh)
-                shapes.append(_replaced(shape, robot.collisions))
+                shapes.append(_simplify(shape, robot.collisions))
     return tuple(shapes)
 
 
@@ -79,7 +79,7 @@ def shape_of_object(thing: WorldObject) -> CollisionShape:
     """Return the shape of an object.
 
     Raises:
-        ModelError: Its kind is unknown, or its mesh does not exist or cannot be read.
+        ModelError: If its kind is unknown, or its mesh does not exist or cannot be read.
     """
     mesh = None
     if isinstance(thing, Box):
@@ -93,7 +93,9 @@ def shape_of_object(thing: WorldObject) -> CollisionShape:
         kind, size, mesh = "mesh", (float(thing.scale),) * 3, Path(thing.path).absolute()
         read_vertices(mesh, size)
     else:
-        raise ModelError(f'Object "{thing.name}" is a {type(thing).__name__}, which is no shape.')
+        raise ModelError(
+            f'Object "{thing.name}" is a {type(thing).__name__}, which is not a shape.'
+        )
     material = thing.friction, thing.restitution
     return CollisionShape(kind, size, np.zeros(3), np.eye(3), thing.name, *material, mesh)
 
@@ -123,8 +125,8 @@ def _round_moments(shape: CollisionShape, mass: float) -> tuple[float, float, fl
     return across, across, cylinder * r**2 / 2 + sphere * 0.4 * r**2
 
 
-def _replaced(shape: CollisionShape, collisions: str) -> CollisionShape:
-    """Return a mesh's bounding box or capsule, where that is wanted; else the shape itself."""
+def _simplify(shape: CollisionShape, collisions: str) -> CollisionShape:
+    """Return the bounding box or capsule of a mesh, if that is wanted, else the shape itself."""
     if shape.mesh is None:
         return shape
     vertices = read_vertices(shape.mesh, shape.size)

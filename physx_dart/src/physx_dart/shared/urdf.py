@@ -1,13 +1,13 @@
-"""Reading URDF files: the tree of links and joints, and a plain text of it for the engines.
+"""Robot models from URDF files: names, joints, collision shapes, and a text for the engines.
 
 Both engines load the same text, rebuilt from the file: links with their inertia, joints with their
-place and axis. Everything else is read here, so that it means the same in both:
+origin and axis. Everything else is read here, so that it has the same meaning in both:
 
-- Shapes are left out; `physx_dart.shared.shapes` reads those for collisions. All meshes must exist.
+- Shapes are omitted; `physx_dart.shared.shapes` reads those for collisions. All meshes must exist.
 - A link without inertia, or of mass 0, gets 1e-9 kg and 1e-12 kg m².
 - Mimic joints are joints like any other.
 - A position limit whose ends are equal or absent, and a velocity or effort limit that is 0 or
-  absent, is no limit: many files write zeros where they know none.
+  absent, is not a limit: many files contain zeros instead of unknown limits.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ _NEGLIGIBLE = (
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint of one degree of freedom.
+    """A joint with one degree of freedom.
 
     Attributes:
         name: Name in the file.
-        lower: Lower limit of the position, in rad or m; -inf: none.
-        upper: Upper limit, likewise.
+        lower: Lower position limit, in rad or m; -inf: none.
+        upper: Upper position limit, likewise.
         max_velocity: Limit of the velocity, in rad/s or m/s.
         max_torque: Limit of the torque, in N m or N.
-        damping: Torque against the motion for each unit of velocity, in N m s/rad or N s/m.
+        damping: Viscous damping, in N m s/rad or N s/m.
         friction: Coulomb friction, in N m or N.
-        settings: What else the world says of it.
+        settings: The world's settings of it.
     """
 
     name: str
@@ -69,14 +69,14 @@ class Joint:
 
 @dataclass(frozen=True)
 class RobotModel:
-    """What a URDF file says.
+    """The model of a robot.
 
     Attributes:
         path: The file, absolute.
         text: URDF text for the engines.
         links: Names of all links, parents before children, in the order of the tree.
-        joints: The joints of one degree of freedom, in the order of the tree.
-        shapes: What touches other things; none where nothing can be touched.
+        joints: The joints with one degree of freedom, in the order of the tree.
+        shapes: Collision shapes; none if there is nothing to touch.
     """
 
     path: Path
@@ -93,11 +93,11 @@ def read_robot(robot: Robot, *, touching: bool = False) -> RobotModel:
 
     Args:
         robot: The robot's description.
-        touching: Whether its collision shapes are wanted.
+        touching: Whether to read its collision shapes.
 
     Raises:
-        ModelError: The file is missing or is no URDF, or its links form no tree.
-        MissingMeshesError: Mesh files that it names do not exist.
+        ModelError: If the file is missing or is not a URDF file, or its links do not form a tree.
+        MissingMeshesError: If mesh files that it names do not exist.
     """
     path = find_robot(robot.urdf)
     root = parse_urdf(path)
@@ -125,7 +125,7 @@ def _check_settings(robot: Robot, joints: tuple[Joint, ...]) -> None:
     for name in robot.joints:
         if name not in known:
             raise ModelError(
-                f'joints has settings for "{name}", which is no joint that moves.'
+                f'joints has settings for "{name}", which is not a movable joint.'
                 f"{nearest(name, known)} Joints: {listed(known)}"
             )
 
@@ -151,7 +151,7 @@ def _joint(joint: Element, all_settings: Mapping[str, JointSettings]) -> Joint:
 
 
 def _number(joint: Element, tag: str, attribute: str) -> float:
-    """Return a finite number; 0 where it is absent."""
+    """Return a finite number; 0 if it is absent."""
     element = joint.find(tag)
     text = "0" if element is None else element.get(attribute, "0")
     signed = attribute in ("lower", "upper")
@@ -168,40 +168,40 @@ def _engine_text(tree: UrdfTree) -> str:
     parts = ['<robot name="robot">']
     for name in tree.links:
         link = _inertial(name, tree.elements[name])
-        parts.append(f"<link name={_quoted(name)}>{link}</link>")
+        parts.append(f"<link name={_quote(name)}>{link}</link>")
     for joint in tree.joints:
         moving = joint.get("type") in _MOVING
         kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
         name = joint.get("name", "")
-        parts.append(f'<joint name={_quoted(name)} type="{kind if moving else "fixed"}">')
+        parts.append(f'<joint name={_quote(name)} type="{kind if moving else "fixed"}">')
         parts.append(_origin(f'joint "{name}"', joint))
         for tag in ("parent", "child"):
-            parts.append(f"<{tag} link={_quoted(link_of(joint, tag))}/>")
+            parts.append(f"<{tag} link={_quote(link_of(joint, tag))}/>")
         if moving:
             parts.append(f'<axis xyz="{_axis(joint)}"/>{_UNLIMITED}')
         parts.append("</joint>")
     return "".join([*parts, "</robot>"])
 
 
-def _quoted(name: str) -> str:
+def _quote(name: str) -> str:
     if not _SPECIAL.search(name):
         return f'"{name}"'
-    from xml.sax.saxutils import quoteattr  # it loads much that is seldom needed
+    from xml.sax.saxutils import quoteattr  # a slow import that is seldom needed
 
     return quoteattr(name)
 
 
 def _inertial(name: str, link: Element) -> str:
-    """Return the text of what is known of a link's inertia, each number checked."""
+    """Return the text of a link's inertia, with each number validated."""
     given, where = link.find("inertial"), f'link "{name}"'
     mass = None if given is None else given.find("mass")
-    if given is None or mass is None or _checked(where, mass, "value", "0", 1) == "0":
+    if given is None or mass is None or _checked_text(where, mass, "value", "0", 1) == "0":
         return _NEGLIGIBLE
     if float(mass.get("value", "0")) < 0:
         raise ModelError(f'{where} has the mass "{mass.get("value")}"')
     inertia = given.find("inertia")
     found = Element("none") if inertia is None else inertia
-    moments = " ".join(f'{key}="{_checked(where, found, key, "0", 1)}"' for key in _MOMENTS)
+    moments = " ".join(f'{key}="{_checked_text(where, found, key, "0", 1)}"' for key in _MOMENTS)
     value = mass.get("value", "")
     origin = _origin(where, given)
     return f'<inertial>{origin}<mass value="{value}"/><inertia {moments}/></inertial>'
@@ -211,11 +211,11 @@ def _origin(where: str, given: Element) -> str:
     origin = given.find("origin")
     if origin is None:
         return ""
-    xyz, rpy = (_checked(where, origin, key, "0 0 0", 3) for key in ("xyz", "rpy"))
+    xyz, rpy = (_checked_text(where, origin, key, "0 0 0", 3) for key in ("xyz", "rpy"))
     return f'<origin xyz="{xyz}" rpy="{rpy}"/>'
 
 
-def _checked(where: str, element: Element, attribute: str, default: str, count: int) -> str:
+def _checked_text(where: str, element: Element, attribute: str, default: str, count: int) -> str:
     """Return the text of an attribute that must be finite numbers; "0" for a number that is 0."""
     numbers = numbers_of(where, element, attribute, default, count)
     return element.get(attribute, default) if any(numbers) or count > 1 else "0"

@@ -1,4 +1,4 @@
-"""World descriptions: plain, picklable data from which any backend builds its simulation."""
+"""World descriptions: plain, picklable data from which every backend builds a simulation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a world stands on: a plane, stairs, or a field of heights. It never moves."""
+"""Ground of a world, which never moves: a plane, stairs, or a height field."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from physx_core.errors import ConfigError
 
 @dataclass(frozen=True)
 class Ground:
-    """An endless plane; its upper side points along `normal`.
+    """An infinite plane whose upper side faces along `normal`.
 
     Attributes:
         friction: Coefficient of friction.
         restitution: Coefficient of restitution.
-        height: Of the plane above the world's origin along the normal, in m.
+        height: Height of the plane above the world's origin along the normal, in m.
         normal: Direction away from the ground, of any length.
     """
 
@@ -28,30 +28,30 @@ class Ground:
     normal: tuple[float, ...] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Check the values, and bring the normal to length 1.
+        """Check the values and scale the normal to length 1.
 
         Raises:
-            ConfigError: A value cannot be.
+            ConfigError: If a value is out of range.
         """
         checks.options(checks.not_negative, "Ground.", self, "friction", "restitution")
         checks.finite("Ground.height", self.height)
         normal = checks.vector("Ground.normal", self.normal, 3)
         length = float(np.linalg.norm(normal))
         if not length > 0:
-            raise ConfigError("Ground.normal has no direction: it is 0.")
+            raise ConfigError("Ground.normal must not be 0.")
         object.__setattr__(self, "normal", tuple(part / length for part in normal))
 
 
 @dataclass(frozen=True)
 class Stairs:
-    """A plane at height 0 with stairs that climb along x, and a landing behind the last step.
+    """A plane at height 0 with stairs that climb along x and a landing after the last step.
 
     Attributes:
-        steps: How many steps there are.
+        steps: Number of steps.
         rise: Height of each step, in m.
         run: Length of each step along x, in m.
-        width: Of the stairs along y, centered at y = 0, in m.
-        begin: Where along x the first step begins, in m.
+        width: Width of the stairs along y, centered at y = 0, in m.
+        begin: Position of the first step along x, in m.
         landing: Length of the last step beyond `run`, in m.
         friction: Coefficient of friction.
         restitution: Coefficient of restitution.
@@ -70,7 +70,7 @@ class Stairs:
         """Check the values.
 
         Raises:
-            ConfigError: A value cannot be.
+            ConfigError: If a value is out of range.
         """
         checks.options(checks.not_negative, "Stairs.", self, "friction", "restitution")
         if not isinstance(self.steps, int) or self.steps < 1:
@@ -80,7 +80,7 @@ class Stairs:
         checks.not_negative("Stairs.landing", self.landing)
 
     def boxes(self) -> list[tuple[tuple[float, float, float], tuple[float, float, float]]]:
-        """Return center and full size, in m, of the box under each step; they stand at 0."""
+        """Return center and full size, in m, of the box under each step, from height 0 up."""
         found = []
         for step in range(self.steps):
             last = self.landing if step == self.steps - 1 else 0.0
@@ -94,8 +94,8 @@ class Stairs:
 class HeightField:
     """Ground whose height is given at the points of a grid.
 
-    Each cell of the grid is two triangles, cut along the diagonal from its corner at the lowest x
-    and y. Beyond the grid there is no ground.
+    Each cell of the grid is two triangles, split along the diagonal from its corner at the lowest x
+    and y. There is no ground beyond the grid.
 
     Attributes:
         heights: In m, shape (nx, ny), at least 2 each; kept read-only.
@@ -112,16 +112,16 @@ class HeightField:
     restitution: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values, and copy the heights.
+        """Check the values and copy the heights.
 
         Raises:
-            ConfigError: A value cannot be.
+            ConfigError: If a value is out of range.
         """
         checks.options(checks.not_negative, "HeightField.", self, "friction", "restitution")
         try:
             heights = np.array(self.heights, np.float64)
         except (TypeError, ValueError, OverflowError) as error:
-            raise ConfigError(f"HeightField.heights are no numbers: {error}.") from error
+            raise ConfigError(f"HeightField.heights are not numbers: {error}.") from error
         if heights.ndim != 2 or min(heights.shape) < 2 or not np.isfinite(heights).all():
             raise ConfigError(
                 f"HeightField.heights has the shape {heights.shape} but needs two axes of 2 or "

@@ -1,4 +1,4 @@
-"""Objects that lie about in a world: single bodies of one shape."""
+"""Objects of a world: single bodies with one shape."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from physx_core.errors import ConfigError
 
 @dataclass(frozen=True, kw_only=True)
 class WorldObject:
-    """What all objects have. The shape's center is its center of mass.
+    """Options of all objects. The shape's center is its center of mass.
 
     Attributes:
         name: Name of the object in the world, and of its body in the state.
-        mass: In kg, spread evenly.
-        static: Whether it never moves; then its mass does not matter.
-        position: Of its center at first, in m.
-        orientation: Quaternion x, y, z, w.
+        mass: Mass of uniform density, in kg.
+        static: Whether it never moves; then its mass has no effect.
+        position: Initial position of its center, in m.
+        orientation: Initial orientation: quaternion x, y, z, w.
         friction: Coefficient of friction.
         restitution: Coefficient of restitution.
     """
@@ -39,7 +39,7 @@ class WorldObject:
         """Check the values.
 
         Raises:
-            ConfigError: A value cannot be.
+            ConfigError: If a value is out of range.
         """
         kind = type(self).__name__
         checks.name(kind.lower(), self.name)
@@ -65,7 +65,7 @@ class Box(WorldObject):
         """Check the values.
 
         Raises:
-            ConfigError: A value cannot be.
+            ConfigError: If a value is out of range.
         """
         super().__post_init__()
         size = checks.vector(f'Box "{self.name}": size', self.size, 3)
@@ -88,11 +88,11 @@ class Sphere(WorldObject):
 
 @dataclass(frozen=True, kw_only=True)
 class Capsule(WorldObject):
-    """A cylinder along the object's z axis with a half sphere at either end.
+    """A cylinder along the object's z axis with a hemisphere at either end.
 
     Attributes:
         radius: In m.
-        length: Of the cylinder alone, in m.
+        length: Length of the cylinder alone, in m.
     """
 
     lengths: ClassVar[tuple[str, ...]] = ("radius", "length")
@@ -119,8 +119,8 @@ class Mesh(WorldObject):
     """A triangle mesh from a file; its moments of inertia are those of its bounding box.
 
     Attributes:
-        path: Of a file in one of the formats stl, obj and dae. Its origin is the object's center.
-        scale: Factor of its lengths.
+        path: Path of an stl, obj, or dae file. Its origin is the object's center.
+        scale: Factor of all lengths.
     """
 
     lengths: ClassVar[tuple[str, ...]] = ("scale",)
@@ -131,7 +131,7 @@ class Mesh(WorldObject):
         """Check the values.
 
         Raises:
-            ConfigError: A value cannot be.
+            ConfigError: If a value is out of range.
         """
         super().__post_init__()
         if not isinstance(self.path, (str, Path)):

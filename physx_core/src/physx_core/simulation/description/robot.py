@@ -1,4 +1,4 @@
-"""Robots: a URDF file, and what a world adds to it."""
+"""Robots: a URDF file and the options that a world adds to it."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ Collisions = Literal["shapes", "boxes", "capsules", "none"]
 
 @dataclass(frozen=True)
 class JointSettings:
-    """How a joint is driven, and what resists it. None: what the URDF file says.
+    """Drive and resistance of a joint. None: as in the URDF file.
 
     Attributes:
-        mode: What a command to the joint means. ``"force"``: a torque, in N m or N.
+        mode: Meaning of a command to the joint. ``"force"``: a torque, in N m or N.
             ``"servo"``: a velocity, in rad/s or m/s, that the joint's motor reaches as far as its
-            torque limit allows. ``"velocity"``: a velocity that the joint has whatever it takes.
+            torque limit allows. ``"velocity"``: a velocity that is imposed on the joint.
             ``"position"``: a position, in rad or m, that a servo approaches.
-        gain: In the mode ``"position"``, the servo's velocity for each unit of position error, in
-            1/s, cut at the velocity limit; at most 1 / period.
-        damping: Torque against the motion for each unit of velocity, in N m s/rad or N s/m.
+        gain: In the mode ``"position"``, the servo's velocity per position error, in 1/s, clipped
+            at the velocity limit; at most 1 / period.
+        damping: Viscous damping, in N m s/rad or N s/m.
         friction: Coulomb friction, in N m or N.
-        stiffness: Of a spring between the links, in N m/rad or N/m.
-        rest: Position at which the spring is slack, in rad or m.
-        armature: Inertia of the motor's rotor as the joint sees it, in kg m² or kg.
+        stiffness: Stiffness of a spring between the links, in N m/rad or N/m.
+        rest: Position at which the spring is relaxed, in rad or m.
+        armature: Inertia of the motor's rotor as seen from the joint, in kg m² or kg.
     """
 
     mode: Mode = "force"
@@ -44,7 +44,7 @@ class JointSettings:
         """Check the values.
 
         Raises:
-            ConfigError: The mode does not exist, or a value cannot be.
+            ConfigError: If the mode does not exist or a value is out of range.
         """
         if self.mode not in get_args(Mode):
             raise UnknownOptionError("JointSettings.mode", [str(self.mode)], get_args(Mode))
@@ -65,14 +65,14 @@ class Robot:
         name: Name of the robot in the world.
         fixed_base: Whether the root link is welded to the world; otherwise it floats freely.
         package_dirs: Folder of each package that mesh names ``package://<name>/...`` begin with.
-        position: Where the root link is at first, in m; for good, if the base is fixed.
-        orientation: How it is turned there: quaternion x, y, z, w.
-        collisions: What touches other things: ``"shapes"``, the collision shapes of the file;
-            ``"boxes"`` or ``"capsules"``, the same with each mesh replaced by its bounding box or
-            a capsule around it, which is many times faster; ``"none"``.
-        self_collisions: Whether links that no joint connects touch each other.
-        feet: Links that touch the world with a sphere around their origin instead of their own
-            shapes: the radius of each, in m.
+        position: Initial position of the root link, in m; permanent if the base is fixed.
+        orientation: Its orientation, likewise: quaternion x, y, z, w.
+        collisions: Collision shapes: ``"shapes"``, those of the file; ``"boxes"`` or
+            ``"capsules"``, the same with each mesh replaced by its bounding box or capsule, which
+            is many times faster; ``"none"``.
+        self_collisions: Whether links that are not connected by a joint collide with each other.
+        feet: Links that collide as a sphere around their origin instead of with their own shapes:
+            the radius of each, in m.
         friction: Coefficient of friction of all links.
         restitution: Coefficient of restitution of all links.
         joints: Settings of joints, by their name in the URDF file.
@@ -92,10 +92,10 @@ class Robot:
     joints: Mapping[str, JointSettings] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the values; whether links and joints of these names exist is seen when building.
+        """Check the values; names of links and joints are checked when a simulation is built.
 
         Raises:
-            ConfigError: A value cannot be.
+            ConfigError: If a value is out of range.
         """
         checks.name("robot", self.name)
         where = f'Robot "{self.name}": '

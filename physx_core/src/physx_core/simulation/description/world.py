@@ -1,4 +1,4 @@
-"""The world: robots and objects on a ground, and how they are to be simulated."""
+"""The world: robots and objects on a ground, and the options of their simulation."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ Integrator = Literal["euler", "rk4"]
 
 @dataclass(frozen=True)
 class World:
-    """Everything that a simulation is built from.
+    """Description of everything in a simulation.
 
     Attributes:
         robots: The robots.
         period: Length of one physics step, in s.
         gravity: Acceleration of free fall in the world frame, in m/s².
-        objects: Boxes, spheres and the like; their names differ from each other and the robots'.
-        ground: What they stand on: `Ground`, `Stairs` or `HeightField`; None: nothing.
-        contacts: What touches: ``"all"``; ``"static"``, only what moves with what does not;
-            ``"none"``.
+        objects: Boxes, spheres, and the like; their names differ from each other and the robots'.
+        ground: `Ground`, `Stairs`, or `HeightField`; None: no ground.
+        contacts: Which contacts there are: ``"all"``; ``"static"``, only of moving things with
+            static ones; ``"none"``.
         integrator: ``"euler"``, semi-implicit, which every engine has, or ``"rk4"``, of fourth
-            order, for robots without contacts, limits and friction.
-        detector: The engine's collision detector by name; None: the engine's usual one.
-        solver: The engine's contact solver by name; None: the engine's usual one.
+            order, for robots without contacts, limits, and friction.
+        detector: Name of the engine's collision detector; None: its default.
+        solver: Name of the engine's contact solver; None: its default.
     """
 
     robots: Sequence[Robot] = ()
@@ -45,27 +45,29 @@ class World:
     solver: str | None = None
 
     def __post_init__(self) -> None:
-        """Check that the description makes sense.
+        """Check the description.
 
         Raises:
-            ConfigError: Nothing moves in it, two things have one name, or a value cannot be.
+            ConfigError: If nothing can move, two things share a name, or a value is out of range.
         """
         kinds: tuple[tuple[type, Sequence[object]], ...]
         kinds = ((Robot, self.robots), (WorldObject, self.objects))
         for kind, things in kinds:
             wrong = [thing for thing in things if not isinstance(thing, kind)]
             if wrong:
-                raise ConfigError(f"World: {wrong[0]!r} is no {kind.__name__}.")
+                raise ConfigError(f"World: {wrong[0]!r} is not a {kind.__name__}.")
         names = [robot.name for robot in self.robots] + [thing.name for thing in self.objects]
         if len(set(names)) != len(names) or "ground" in names:
             raise ConfigError(
-                f"A world needs robots and objects with names that differ, not {names}; "
-                'the name "ground" is taken.'
+                f"Robots and objects of a world need distinct names, not {names}; "
+                'the name "ground" is reserved.'
             )
         if not self.robots and all(thing.static for thing in self.objects):
-            raise ConfigError("A world needs a robot, or an object that moves.")
+            raise ConfigError("A world needs a robot or a moving object.")
         if self.ground is not None and not isinstance(self.ground, (Ground, Stairs, HeightField)):
-            raise ConfigError(f"World.ground is {self.ground!r}, not Ground, Stairs, HeightField.")
+            raise ConfigError(
+                f"World.ground is {self.ground!r}, not Ground, Stairs, or HeightField."
+            )
         checks.positive("World.period", self.period)
         object.__setattr__(self, "gravity", checks.vector("World.gravity", self.gravity, 3))
         for option, known in (

@@ -1,4 +1,4 @@
-"""Forces from outside on a body: held, for a while, or along a profile."""
+"""External forces on a body: permanent, for some time, or along a profile."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ Frame = Literal["world", "body"]
 class Wrench:
     """A force and a torque on a body.
 
-    Without `duration` and `times` it is held until it is removed; with `duration` it is an impulse;
-    with `times` it follows a profile, linear between its points and 0 after the last.
+    Without `duration` and `times` it acts until it is removed; with `duration` it is a pulse; with
+    `times` it follows a profile, linear between its points and 0 after the last.
 
     Attributes:
         body: Name of the link or object.
         force: In N, shape (3,), or (k, 3) along a profile.
         torque: In N m, likewise.
-        point: Where the force acts, in the body's frame, in m.
+        point: Point of application, in the body's frame, in m.
         frame: Axes of force and torque: the world's, or the body's own.
-        duration: How long it acts from when it is applied, in s, as a whole number of physics
-            steps, at least one; None: until it is removed, or to the profile's end.
-        times: Of the profile's points from when it is applied, in s, shape (k,), growing.
+        duration: Time for which it acts, in s, rounded to physics steps, at least one; None: until
+            it is removed, or to the profile's end.
+        times: Times of the profile's points since it was applied, in s, shape (k,), increasing.
     """
 
     body: str
@@ -41,10 +41,10 @@ class Wrench:
     times: NDArray[np.float64] | tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Check the values, and copy the arrays.
+        """Check the values and copy the arrays.
 
         Raises:
-            ConfigError: A value cannot be.
+            ConfigError: If a value is out of range.
         """
         where = f"Wrench on {self.body!r}: "
         if not isinstance(self.body, str):
@@ -58,7 +58,7 @@ class Wrench:
         if self.times is not None:
             times = _array(f"{where}times", self.times)
             if times.ndim != 1 or len(times) < 1 or (np.diff(times) <= 0).any():
-                raise ConfigError(f"{where}times must be one axis of growing numbers.")
+                raise ConfigError(f"{where}times must be one axis of increasing numbers.")
             object.__setattr__(self, "times", times)
             shape = (len(times), 3)
         for option in ("force", "torque"):
@@ -66,7 +66,9 @@ class Wrench:
             if self.times is not None and values.shape == (3,):
                 values = np.tile(values, (shape[0], 1))
             if values.shape != shape:
-                raise ConfigError(f"{where}{option} has the shape {values.shape}, wanted {shape}.")
+                raise ConfigError(
+                    f"{where}{option} has the shape {values.shape} but needs {shape}."
+                )
             object.__setattr__(self, option, values)
 
     def at(self, time: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -87,7 +89,7 @@ class Wrench:
         )
 
     def steps(self, period: float) -> int | None:
-        """Return for how many physics steps it acts; None: until it is removed."""
+        """Return the number of physics steps for which it acts; None: until it is removed."""
         if self.duration is not None:
             return max(1, round(self.duration / period))
         if self.times is not None:
@@ -99,7 +101,7 @@ def _array(option: str, values: Any) -> NDArray[np.float64]:
     try:
         array = np.array(values, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise ConfigError(f"{option}: no numbers: {error}.") from error
+        raise ConfigError(f"{option} must be numbers: {error}.") from error
     if not np.isfinite(array).all():
         raise ConfigError(f"{option} must be finite numbers.")
     array.flags.writeable = False

@@ -1,4 +1,4 @@
-"""Motors: from commands to joint torques, the same on every engine."""
+"""Motors, which turn commands into joint torques, the same on every engine."""
 
 from __future__ import annotations
 

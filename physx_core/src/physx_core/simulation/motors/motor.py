@@ -1,4 +1,4 @@
-"""What a motor is: plain, picklable data."""
+"""Description of a motor: plain, picklable data."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ class Motor:
     `reduction` times slower with a torque `reduction` times higher. On a joint that slides, read N
     for N m and m for rad behind the gear.
 
-    The torque of the command is cut at `max_torque` and, close to `max_velocity`, at
+    The commanded torque is clipped at `max_torque` and, close to `max_velocity`, at
     ``slope * (max_velocity - velocity)``, and never drives the shaft beyond `max_velocity`; then
-    friction takes its part. Dry friction of a rigid gear is ``dry * tanh(velocity /
+    friction is subtracted. Dry friction of a rigid gear is ``dry * tanh(velocity /
     dry_velocity)``, so it creeps; friction that sticks is `JointSettings.friction`, or that of an
     elastic gear.
 
-    The gear is rigid without `stiffness`: then `inertia` belongs into the engine's mass matrix, by
-    `with_rotors`, for engines with the feature ``armature``. With `stiffness` the rotor is a body
-    of its own, simulated here, that drives the joint through a spring and damper, with `backlash`
-    between them if there is any: for all engines, with contacts too.
+    Without `stiffness` the gear is rigid and `inertia` belongs in the engine's mass matrix, by
+    `with_rotors`, on engines with the feature ``armature``. With `stiffness` the rotor is a
+    separate body, simulated here, that drives the joint through a spring and damper, possibly with
+    `backlash`: on all engines, with contacts too.
 
     Attributes:
         joint: Name of the joint in `Layout.joints`.
-        max_torque: In N m; inf: only the joint's own limit holds.
-        max_velocity: Velocity at which no torque is left, in rad/s; inf: none.
-        slope: How fast the torque falls towards `max_velocity`, in N m s/rad; inf: all at once.
-        viscous: Friction for each unit of velocity, in N m s/rad; a pair: forward, backward.
+        max_torque: In N m; inf: only the joint's own limit applies.
+        max_velocity: Velocity at which the torque vanishes, in rad/s; inf: no limit.
+        slope: Slope of the torque limit near `max_velocity`, in N m s/rad; inf: a step.
+        viscous: Viscous friction, in N m s/rad; a pair: forward, backward.
         dry: Dry friction, in N m; a pair: forward, backward.
         dry_velocity: Velocity at which 76 % of the dry friction acts, in rad/s.
         reduction: Turns of the motor for one of the joint; negative: the other way.
@@ -45,7 +45,7 @@ class Motor:
         stiffness: Of the gear at the joint, in N m/rad; None: rigid.
         damping: Of an elastic gear at the joint, in N m s/rad.
         backlash: Play of an elastic gear at the joint, from one flank to the other, in rad.
-        period: How often the motor takes over its command and measures its velocity, in s; a
+        period: Time between updates of the motor's command and measured velocity, in s; a
             multiple of the physics' period; None: at every physics step.
     """
 
@@ -67,7 +67,7 @@ class Motor:
         """Check the values.
 
         Raises:
-            ConfigError: A value cannot be.
+            ConfigError: If a value is out of range.
         """
         where = f'Motor of "{self.joint}": '
         if not isinstance(self.joint, str):
@@ -78,7 +78,7 @@ class Motor:
             object.__setattr__(self, option, _both_ways(where + option, getattr(self, option)))
         checks.positive(f"{where}dry_velocity", self.dry_velocity)
         if not checks.finite(f"{where}reduction", self.reduction):
-            raise ConfigError(f"{where}reduction cannot be 0.")
+            raise ConfigError(f"{where}reduction must not be 0.")
         if self.period is not None:
             checks.positive(f"{where}period", self.period)
         if self.stiffness is not None:
@@ -89,17 +89,17 @@ class Motor:
 
     @property
     def armature(self) -> float:
-        """The rotor's inertia as the joint feels it, in kg m² or kg."""
+        """The rotor's inertia as seen from the joint, in kg m² or kg."""
         return self.inertia * self.reduction**2
 
 
 def with_rotors(world: World, motors: Sequence[Motor]) -> World:
     """Return the world with the rotors of motors with rigid gears added to its joints' armature.
 
-    Engines without the feature ``armature`` refuse to build it.
+    Engines without the feature ``armature`` cannot build it.
 
     Raises:
-        ConfigError: A motor's joint belongs to no robot of the world.
+        ConfigError: If a motor's joint does not belong to a robot of the world.
     """
     robots = list(world.robots)
     for motor in motors:
@@ -128,7 +128,7 @@ def _robot_of(world: World, joint: str) -> tuple[int, str]:
         if robot.name == owner:
             return place, name
     raise ConfigError(
-        f'The motor\'s joint "{joint}" belongs to none of the robots '
+        f'The motor\'s joint "{joint}" does not belong to any of the robots '
         f"{[robot.name for robot in world.robots]}: write <robot>/<joint>."
     )
 

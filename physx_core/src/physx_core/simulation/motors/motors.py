@@ -1,4 +1,4 @@
-"""The motors of a simulation."""
+"""Motors of a simulation: commands in, joint torques out."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class MotorState:
         torques: Torques on the motors' joints in the last step, shape (motors,), in N m or N.
         rotor_positions: Of rotors behind elastic gears, in rad or m of the joint.
         rotor_velocities: Likewise, in rad/s or m/s.
-        fresh: Whether they have not run since they were made or reset.
+        fresh: Whether they have not run since they were created or reset.
     """
 
     commands: Vector
@@ -63,19 +63,19 @@ class Motors:
     """
 
     def __init__(self, simulation: Simulation, world: World, motors: Sequence[Motor]) -> None:
-        """Put motors on joints, with commands of 0.
+        """Attach motors to joints, with commands of 0.
 
         Args:
-            simulation: Whose joints they drive.
-            world: What the simulation was built from.
+            simulation: The simulation whose joints they drive.
+            world: The world that the simulation was built from.
             motors: At most one for each joint.
 
         Raises:
-            ComponentNotFoundError: The simulation has no joint of that name.
-            ConfigError: Two motors are on one joint, a joint's mode is not ``"force"``, a period is
-                no multiple of the physics', a gear is too stiff for it, or a rotor's inertia is
+            ComponentNotFoundError: If the simulation has no joint of that name.
+            ConfigError: If two motors share a joint, a joint's mode is not ``"force"``, a period is
+                not a multiple of the physics', a gear is too stiff for it, or a rotor's inertia is
                 missing in the world.
-            FeatureNotSupportedError: The engine has no armature, but a rigid gear's rotor needs it.
+            FeatureNotSupportedError: If the rotor of a rigid gear needs the feature ``armature``.
         """
         self.motors = tuple(motors)
         self.joints = tuple(motor.joint for motor in motors)
@@ -134,24 +134,24 @@ class Motors:
     # Commands -------------------------------------------------------------------------------
 
     def set_commands(self, commands: ArrayLike) -> None:
-        """Hold torques of the shafts; each motor takes its own over at its next period.
+        """Hold torques of the shafts; each motor adopts its own at its next period.
 
         Args:
             commands: Shape (motors,), in N m.
 
         Raises:
-            SimulationError: The shape is wrong or a value is not finite.
+            SimulationError: If the shape is wrong or a value is not finite.
         """
         overwrite("commands", self._commands, commands)
 
     def set_others(self, commands: ArrayLike) -> None:
-        """Hold commands of the joints without motors, until then those when these were made.
+        """Hold commands of the joints without motors; before, those at the motors' creation count.
 
         Args:
-            commands: Of all joints, shape (joints,); where a motor is, its entry does nothing.
+            commands: Of all joints, shape (joints,); entries of joints with motors are ignored.
 
         Raises:
-            SimulationError: The shape is wrong or a value is not finite.
+            SimulationError: If the shape is wrong or a value is not finite.
         """
         overwrite("commands", self._sent, commands)
         self._sent[self._span] = self._torques
@@ -168,7 +168,7 @@ class Motors:
 
     @property
     def torques_view(self) -> Vector:
-        """The same as `torques`, without a copy: read-only, the same memory for life."""
+        """The same as `torques`, without a copy: read-only, always the same memory."""
         found = self._torques.view()
         found.flags.writeable = False
         return found
@@ -176,7 +176,7 @@ class Motors:
     # Running --------------------------------------------------------------------------------
 
     def __call__(self, simulation: Simulation) -> None:
-        """Set the torques for the physics step that comes; to be called once before each."""
+        """Set the torques for the next physics step; to be called once before each."""
         due = self._due(simulation.frame)
         if due is False and not self._reads:
             return
@@ -203,15 +203,15 @@ class Motors:
         self._send(simulation, torques)
 
     def _send(self, simulation: Simulation, torques: Vector) -> None:
-        """Cut torques at the joints' limits, and command them and the joints without motors."""
-        if self._limited:  # those of elastic gears have acted on the rotors already
+        """Clip torques at the joints' limits; command them and the joints without motors."""
+        if self._limited:  # elastic gears have acted on the rotors already
             torques = np.minimum(np.maximum(torques, -self._joint_limit), self._joint_limit)
         self._torques[:] = torques
         self._sent[self._span] = torques
         simulation.set_commands(self._sent)
 
     def _due(self, frame: int) -> Vector | bool:
-        """Return which motors take over their commands at a frame."""
+        """Return which motors adopt their commands at a frame."""
         if self._fresh:
             self._fresh = False
             return True
@@ -223,7 +223,7 @@ class Motors:
     # State ----------------------------------------------------------------------------------
 
     def reset(self, simulation: Simulation) -> None:
-        """Begin anew from the simulation's present state: commands are 0, rotors in mid gear."""
+        """Restart from the simulation's present state: commands 0, gears unloaded."""
         self._commands[:] = self._drives[:] = 0.0
         self._send(simulation, self._drives)
         self._fresh = True
@@ -232,7 +232,7 @@ class Motors:
             self._rotors.velocities = simulation.velocities()[self._v[self._elastic]]
 
     def snapshot(self) -> MotorState:
-        """Return everything that `restore` needs to go on exactly from here."""
+        """Return everything that `restore` needs to continue exactly from here."""
         rotors, none, others = self._rotors, np.zeros(0), self._sent.copy()
         others[self._span] = 0.0
         return MotorState(
@@ -246,10 +246,10 @@ class Motors:
         )
 
     def restore(self, state: MotorState) -> None:
-        """Go back to a snapshot.
+        """Return to a snapshot.
 
         Raises:
-            SimulationError: It is of other motors.
+            SimulationError: If the snapshot is of other motors.
         """
         own = self.snapshot()
         for name, value in vars(own).items():

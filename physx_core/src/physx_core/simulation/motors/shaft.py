@@ -1,4 +1,4 @@
-"""What happens on the shafts of motors: torque limits, friction, and rotors behind elastic gears.
+"""Shafts of motors: torque limits, friction, and rotors behind elastic gears.
 
 Everything is an array with one entry for each motor.
 """
@@ -14,7 +14,7 @@ from physx_core.simulation.motors.motor import Motor
 from physx_core.typing import Vector
 
 _SUDDEN = 1e200
-"""Slope that cuts all at once; a number, as infinity times 0 is none."""
+"""Slope of a step; finite, because infinity times 0 is NaN."""
 
 
 def column(motors: Sequence[Motor], option: str) -> Vector:
@@ -23,7 +23,7 @@ def column(motors: Sequence[Motor], option: str) -> Vector:
 
 
 class TorqueLimits:
-    """What a motor can give at a velocity."""
+    """Torque limits of motors, which depend on their velocities."""
 
     def __init__(self, motors: Sequence[Motor]) -> None:
         self._most = column(motors, "max_torque")
@@ -38,12 +38,12 @@ class TorqueLimits:
             return commands
         if not self.needs_velocity:
             return np.minimum(np.maximum(commands, -self._most), self._most)
-        forward = self._left(self._fastest - velocities)
-        backward = self._left(self._fastest + velocities)
+        forward = self._remaining(self._fastest - velocities)
+        backward = self._remaining(self._fastest + velocities)
         return np.minimum(np.maximum(commands, -backward), forward)
 
-    def _left(self, margin: Vector) -> Vector:
-        """Return the torque that is left at a distance, in rad/s, from the highest velocity."""
+    def _remaining(self, margin: Vector) -> Vector:
+        """Return the torque available at a distance, in rad/s, from the highest velocity."""
         with np.errstate(over="ignore"):
             left: Vector = np.minimum(self._slope * np.maximum(margin, 0.0), self._most)
         return left
@@ -72,7 +72,7 @@ class Rotors:
     """Rotors behind elastic gears, seen from the joints: bodies of one degree of freedom each.
 
     A rotor is integrated like the joints, with semi-implicit Euler; its friction is implicit, so
-    dry friction sticks. The gear pushes and never pulls where it has backlash.
+    dry friction sticks. A gear with backlash pushes but never pulls.
 
     Attributes:
         positions: Of the rotors, in rad or m of the joint.
@@ -80,15 +80,15 @@ class Rotors:
     """
 
     def __init__(self, motors: Sequence[Motor], period: float, limits: Vector) -> None:
-        """Put the rotors at 0.
+        """Place the rotors at 0.
 
         Args:
             motors: Those with elastic gears.
             period: The physics' period, in s.
-            limits: Of the joints' torques, in N m or N; the gears slip there.
+            limits: Torque limits of the joints, in N m or N, at which the gears slip.
 
         Raises:
-            ConfigError: A gear is too stiff for the period.
+            ConfigError: If a gear is too stiff for the period.
         """
         self._period, self._limits = period, limits
         self._reduction = column(motors, "reduction")
@@ -99,7 +99,7 @@ class Rotors:
         square = self._reduction**2
         self._viscous = (column(motors, "viscous") * square[:, None]).T.copy()
         self._dry = (column(motors, "dry") * np.abs(self._reduction)[:, None]).T.copy()
-        self._rubs = bool(self._viscous.any() or self._dry.any())
+        self._has_friction = bool(self._viscous.any() or self._dry.any())
         self.positions, self.velocities = np.zeros(len(motors)), np.zeros(len(motors))
         self._check(motors)
 
@@ -108,7 +108,7 @@ class Rotors:
         for motor, each in zip(motors, pace, strict=True):
             if each >= 4:
                 raise ConfigError(
-                    f'Motor of "{motor.joint}": its gear is too stiff, or damped too much, for '
+                    f'Motor of "{motor.joint}": its gear is too stiff or too strongly damped for '
                     f"the physics' period {self._period:g} s: (stiffness * period² + 2 * damping * "
                     f"period) / (inertia * reduction²) is {each:.3g} but must be below 4."
                 )
@@ -128,12 +128,12 @@ class Rotors:
         pulls = (gear * stretch < 0) & (self._half > 0)
         gear = np.where(pulls, 0.0, np.minimum(np.maximum(gear, -self._limits), self._limits))
         self.velocities = self.velocities + self._period / self._inertia * (torques - gear)
-        if self._rubs:
-            self._rub()
+        if self._has_friction:
+            self._apply_friction()
         self.positions = self.positions + self._period * self.velocities
         return gear
 
-    def _rub(self) -> None:
+    def _apply_friction(self) -> None:
         forward = self.velocities * self._reduction > 0
         share = self._period / self._inertia
         dry = np.where(forward, self._dry[0], self._dry[1])

@@ -1,4 +1,4 @@
-"""Sensors: what a robot measures of itself, with a sensor's imperfections, on every engine."""
+"""Sensors of a robot, with their imperfections, the same on every engine."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""What sensors would measure if they were perfect: one class for each kind, for all of its kind.
+"""Ideal sensors: noise-free measurements, one class for all sensors of a kind.
 
-Each writes its sensors' components from nothing but the contract of `Simulation`, so that they are
-the same on every engine.
+They use nothing but the interface of `Simulation`, so they are the same on every engine.
 """
 
 from __future__ import annotations
@@ -27,14 +26,14 @@ from physx_core.simulation.sensors.sensor import (
 from physx_core.typing import Vector
 
 
-class Truth(Protocol):
-    """Measures all sensors of one kind without errors."""
+class IdealSensors(Protocol):
+    """Noise-free measurements of all sensors of one kind."""
 
     def measure(self, simulation: Simulation, out: Vector) -> None:
-        """Write the components to `out`, shape (sensors, width)."""
+        """Write the components of all sensors to `out`, shape (sensors, width)."""
 
 
-class EncoderTruth:
+class IdealEncoders:
     """Positions and velocities of joints."""
 
     def __init__(self, sensors: Sequence[Encoder], simulation: Simulation) -> None:
@@ -52,15 +51,15 @@ class EncoderTruth:
             out *= self._reduction
 
 
-class ImuTruth:
-    """Orientation, angular velocity and acceleration of places on bodies."""
+class IdealImus:
+    """Orientation, angular velocity, and acceleration of points on bodies."""
 
     def __init__(self, sensors: Sequence[Imu], simulation: Simulation, world: World) -> None:
-        _needs("accelerations", simulation, "An Imu")
+        _require("accelerations", simulation, "An Imu")
         self._bodies = [sensor.body for sensor in sensors]
         places_of("body", self._bodies, simulation.layout.names)
-        self._arms = [_unless(sensor.position, (0.0, 0.0, 0.0)) for sensor in sensors]
-        self._rotations = [_unless(sensor.rotation, IDENTITY) for sensor in sensors]
+        self._arms = [_none_if(sensor.position, (0.0, 0.0, 0.0)) for sensor in sensors]
+        self._rotations = [_none_if(sensor.rotation, IDENTITY) for sensor in sensors]
         self._gravity = tuple(float(part) for part in world.gravity)
         layout = simulation.layout
         floating = [part for part in layout.parts.values() if part.floating]
@@ -68,16 +67,16 @@ class ImuTruth:
         self._bases = [bases[body] for body in self._bodies if body in bases]
 
     def measure(self, simulation: Simulation, out: Vector) -> None:
-        """Write orientation, angular velocity and acceleration."""
+        """Write orientation, angular velocity, and acceleration."""
         if len(self._bases) == len(out):
             self._measure_bases(simulation, out)
             return
         motions = simulation.body_motions(self._bodies).tolist()
         for row, motion in enumerate(motions):
-            out[row] = self._measured(motion, self._arms[row], self._rotations[row])
+            out[row] = self._components_of(motion, self._arms[row], self._rotations[row])
 
     def _measure_bases(self, simulation: Simulation, out: Vector) -> None:
-        """Do so where all are on bases that float, whose motion is a part of the state."""
+        """Measure sensors that are all on floating bases, whose motion is a part of the state."""
         state = simulation.positions(), simulation.velocities(), simulation.accelerations()
         for row, base in enumerate(self._bases):
             first = base.velocities.start
@@ -85,7 +84,7 @@ class ImuTruth:
             attitude: Sequence[float] = (x, y, z, w) if w >= 0 else (-x, -y, -z, -w)
             g, h, o, p, q, r = state[1][first : first + 6].tolist()
             a, b, c, d, e, f = state[2][first : first + 6].tolist()
-            # The velocity is along axes that turn themselves.
+            # The velocity is in a rotating frame.
             i, j, k = rotate_back(attitude, *self._gravity)
             s, t, u = cross(p, q, r, g, h, o)
             a, b, c = a + s - i, b + t - j, c + u - k
@@ -100,7 +99,7 @@ class ImuTruth:
                 a, b, c = rotate_back(rotation, a, b, c)
             out[row] = (*attitude, p, q, r, a, b, c)
 
-    def _measured(
+    def _components_of(
         self, motion: list[float], arm: Sequence[float] | None, rotation: Sequence[float] | None
     ) -> tuple[float, ...]:
         """Return the components of one sensor from a row of `Simulation.body_motions`."""
@@ -122,18 +121,18 @@ class ImuTruth:
         )
 
 
-class ContactTruth:
+class IdealContactSensors:
     """Forces of contacts on bodies."""
 
     def __init__(self, sensors: Sequence[ContactSensor], simulation: Simulation) -> None:
-        _needs("contacts", simulation, "A ContactSensor")
+        _require("contacts", simulation, "A ContactSensor")
         bodies = [sensor.body for sensor in sensors]
         self._rows: dict[int, list[int]] = {}
         for row, place in enumerate(places_of("body", bodies, simulation.layout.names).tolist()):
             self._rows.setdefault(place, []).append(row)
 
     def measure(self, simulation: Simulation, out: Vector) -> None:
-        """Write touching, normal force and force."""
+        """Write touching, normal force, and force."""
         sums = [[0.0] * 5 for _ in out]
         for first, second, _, (x, y, z), (a, b, c), _ in simulation.contacts().tolist():
             for place, sign in ((first, 1.0), (second, -1.0)):
@@ -147,11 +146,11 @@ class ContactTruth:
         out[:] = sums
 
 
-class ForceTorqueTruth:
+class IdealForceTorqueSensors:
     """Wrenches that joints carry."""
 
     def __init__(self, sensors: Sequence[ForceTorqueSensor], simulation: Simulation) -> None:
-        _needs("joint_wrenches", simulation, "A ForceTorqueSensor")
+        _require("joint_wrenches", simulation, "A ForceTorqueSensor")
         joints = [sensor.joint for sensor in sensors]
         self._joints = as_slice(places_of("joint", joints, simulation.layout.joints))
 
@@ -160,7 +159,7 @@ class ForceTorqueTruth:
         out[:] = simulation.joint_wrenches()[self._joints]
 
 
-class EffortTruth:
+class IdealEffortSensors:
     """Torques that drive joints."""
 
     def __init__(self, sensors: Sequence[EffortSensor], simulation: Simulation) -> None:
@@ -180,38 +179,38 @@ class EffortTruth:
         out[:, 0] = simulation.commands()[self._joints]
 
 
-def truth_of(
+def ideal_sensors(
     kind: type[Sensor], sensors: Sequence[Any], simulation: Simulation, world: World
-) -> Truth:
-    """Return what measures sensors of one kind.
+) -> IdealSensors:
+    """Return the ideal sensors of one kind.
 
     Raises:
-        ComponentNotFoundError: A joint or body is not in the simulation.
-        ConfigError: The kind is unknown, or a joint's torque is not known.
-        FeatureNotSupportedError: The engine lacks what the kind needs.
+        ComponentNotFoundError: If a joint or body is not in the simulation.
+        ConfigError: If the kind is unknown, or a joint's torque is not known.
+        FeatureNotSupportedError: If the engine lacks what the kind needs.
     """
     if kind is Imu:
-        return ImuTruth(sensors, simulation, world)
+        return IdealImus(sensors, simulation, world)
     kinds: dict[type[Sensor], Any] = {
-        Encoder: EncoderTruth,
-        ContactSensor: ContactTruth,
-        ForceTorqueSensor: ForceTorqueTruth,
-        EffortSensor: EffortTruth,
+        Encoder: IdealEncoders,
+        ContactSensor: IdealContactSensors,
+        ForceTorqueSensor: IdealForceTorqueSensors,
+        EffortSensor: IdealEffortSensors,
     }
     if kind not in kinds:
-        raise ConfigError(f"{kind.__name__} is no kind of sensor that is known.")
-    found: Truth = kinds[kind](sensors, simulation)
+        raise ConfigError(f"{kind.__name__} is not a known kind of sensor.")
+    found: IdealSensors = kinds[kind](sensors, simulation)
     return found
 
 
-def _needs(feature: str, simulation: Simulation, what: str) -> None:
+def _require(feature: str, simulation: Simulation, what: str) -> None:
     if feature not in simulation.features:
         raise FeatureNotSupportedError(
             simulation.engine, feature, simulation.features, f"{what} needs it."
         )
 
 
-def _unless(values: Sequence[float], nothing: Sequence[float]) -> tuple[float, ...] | None:
-    """Return values, None where they are nothing."""
+def _none_if(values: Sequence[float], nothing: Sequence[float]) -> tuple[float, ...] | None:
+    """Return values as floats; None if they equal `nothing`."""
     found = tuple(float(value) for value in values)
     return None if found == tuple(nothing) else found

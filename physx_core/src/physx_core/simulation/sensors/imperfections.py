@@ -1,4 +1,4 @@
-"""What is wrong with sensors: delay, jitter, bias, random walk and noise, of all at once."""
+"""Imperfections of sensors: delay, jitter, bias, random walk, and noise, of all sensors at once."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from physx_core.typing import Vector
 Mask = NDArray[np.bool_]
 
 
-class Places:
-    """Where the components and errors of sensors are in their flat vectors.
+class Components:
+    """Places of the sensors' components and errors in flat vectors.
 
     Attributes:
-        components: Number of all components.
+        count: Number of all components.
         owners: Sensor of each component.
-        attitudes: Components of the orientations, shape (n, 4).
+        orientations: Components of the orientations, shape (n, 4).
         switches: Components that are 0 or 1.
-        errors: Number of all errors.
+        error_count: Number of all errors.
         error_owners: Sensor of each error.
-        added: Component that each additive error is added to.
-        adding: Additive errors.
-        turning: Errors of the orientations, shape (n, 3).
+        shifted: Components with an additive error.
+        shifts: Their additive errors.
+        turns: Errors of the orientations, shape (n, 3).
     """
 
     def __init__(self, sensors: Sequence[Sensor]) -> None:
         owners: list[int] = []
         error_owners: list[int] = []
-        attitudes, switches, added, adding, turning = [], [], [], [], []
+        orientations, switches, shifted, shifts, turns = [], [], [], [], []
         for owner, sensor in enumerate(sensors):
             widths = sensor.error_widths()
             for name, width in sensor.quantities.items():
@@ -41,32 +41,32 @@ class Places:
                 owners += [owner] * width
                 error_owners += [owner] * len(errors)
                 if name == "orientation":
-                    attitudes.append(components)
-                    turning.append(errors)
+                    orientations.append(components)
+                    turns.append(errors)
                 elif errors:
-                    added += components
-                    adding += errors
+                    shifted += components
+                    shifts += errors
                 else:
                     switches += components
-        self.components, self.errors = len(owners), len(error_owners)
+        self.count, self.error_count = len(owners), len(error_owners)
         self.owners, self.error_owners = np.array(owners), np.array(error_owners)
-        self.attitudes = np.array(attitudes, np.intp).reshape(-1, 4)
-        self.turning = np.array(turning, np.intp).reshape(-1, 3)
+        self.orientations = np.array(orientations, np.intp).reshape(-1, 4)
+        self.turns = np.array(turns, np.intp).reshape(-1, 3)
         self.switches = np.array(switches, np.intp)
-        self.added, self.adding = np.array(added, np.intp), np.array(adding, np.intp)
+        self.shifted, self.shifts = np.array(shifted, np.intp), np.array(shifts, np.intp)
 
 
 class Delays:
-    """What sensors saw a while ago.
+    """Delays of sensors, with the past values that they need.
 
     Attributes:
         acts: Whether any sensor has a delay.
-        past: The last true values, shape (kept, components), each component in turn.
-        counts: How many values of each sensor there were, shape (sensors,).
+        past: The last ideal values, shape (kept, components), a ring buffer of each component.
+        counts: Number of values that each sensor has had, shape (sensors,).
     """
 
-    def __init__(self, sensors: Sequence[Sensor], places: Places, periods: Vector) -> None:
-        self._places = places
+    def __init__(self, sensors: Sequence[Sensor], components: Components, periods: Vector) -> None:
+        self._components = components
         self._lag = np.array([sensor.delay for sensor in sensors]) / periods
         self._jitter = np.array([sensor.jitter for sensor in sensors]) / periods
         self._shaken = np.flatnonzero(self._jitter)
@@ -75,27 +75,27 @@ class Delays:
         self.acts = longest > 0
         self.draws = bool(len(self._shaken))
         self._kept = int(np.ceil(longest)) + 2 if self.acts else 1
-        self._column = np.arange(places.components)
+        self._column = np.arange(components.count)
         self.clear()
 
     def clear(self) -> None:
         """Forget the past."""
-        self.past = np.zeros((self._kept, self._places.components))
-        self.past[:, self._places.attitudes[:, 3]] = 1.0
+        self.past = np.zeros((self._kept, self._components.count))
+        self.past[:, self._components.orientations[:, 3]] = 1.0
         self.counts = np.zeros(len(self._lag), np.int64)
 
-    def delayed(self, truth: Vector, due: Mask, rng: np.random.Generator | None) -> Vector:
-        """Keep the true values of the sensors that are due; return what they see.
+    def delay(self, ideal: Vector, due: Mask, rng: np.random.Generator | None) -> Vector:
+        """Keep the ideal values of the sensors that are due; return the delayed values.
 
         Args:
-            truth: Shape (components,).
-            due: Shape (sensors,); what others see has no meaning.
+            ideal: Shape (components,).
+            due: Shape (sensors,); the values of the others have no meaning.
             rng: For the jitter.
         """
-        owners = self._places.owners
+        owners = self._components.owners
         mine = due[owners]
         slots = self.counts[owners] % self._kept
-        self.past[slots[mine], self._column[mine]] = truth[mine]
+        self.past[slots[mine], self._column[mine]] = ideal[mine]
         lag = self._lag
         if self.draws and rng is not None:
             lag = lag.copy()
@@ -109,30 +109,30 @@ class Delays:
         seen = later
         if share.any():
             earlier = self.past[(self.counts - whole - 1)[owners] % self._kept, self._column]
-            seen = self._mixed(later, earlier, share)
+            seen = self._interpolate(later, earlier, share)
         self.counts = self.counts + due
         return seen
 
-    def _mixed(self, later: Vector, earlier: Vector, share: Vector) -> Vector:
+    def _interpolate(self, later: Vector, earlier: Vector, share: Vector) -> Vector:
         seen: Vector = later + share * (earlier - later)
-        at = self._places.attitudes
+        at = self._components.orientations
         if at.size:
             seen[at] = interpolate_rows(later[at], earlier[at], share[at[:, :1]])
-        switches = self._places.switches
+        switches = self._components.switches
         seen[switches] = seen[switches] >= 0.5
         return seen
 
 
 class Errors:
-    """Bias, random walk and noise.
+    """Bias, random walk, and noise.
 
     Attributes:
-        bias: The errors that stay, those drawn at the beginning included, shape (errors,).
-        walk: The errors that wander, likewise.
+        bias: Constant errors, given and drawn, shape (errors,).
+        walk: Random walks, likewise.
     """
 
-    def __init__(self, sensors: Sequence[Sensor], places: Places, periods: Vector) -> None:
-        self._places = places
+    def __init__(self, sensors: Sequence[Sensor], components: Components, periods: Vector) -> None:
+        self._components = components
 
         def column(option: str) -> Vector:
             amounts = [value for sensor in sensors for value in sensor.amounts(option)]
@@ -140,44 +140,45 @@ class Errors:
 
         self._noise, self._given = column("noise"), column("bias")
         self._deviation = column("bias_deviation")
-        self._stride = column("random_walk") * np.sqrt(periods[places.error_owners])
+        self._stride = column("random_walk") * np.sqrt(periods[components.error_owners])
         self._noisy, self._walking = np.flatnonzero(self._noise), np.flatnonzero(self._stride)
         self._varied = np.flatnonzero(self._deviation)
         self.acts = any(each.any() for each in (self._noise, self._given, self._deviation))
         self.acts = self.acts or bool(len(self._walking))
         self.draws = bool(len(self._noisy) or len(self._walking) or len(self._varied))
-        self.bias, self.walk = self._given.copy(), np.zeros(places.errors)
+        self.bias, self.walk = self._given.copy(), np.zeros(components.error_count)
 
     def begin(self, rng: np.random.Generator | None) -> None:
-        """Draw the biases, and end all wandering."""
-        self.bias, self.walk = self._given.copy(), np.zeros(self._places.errors)
+        """Draw the biases and start the random walks at 0."""
+        self.bias, self.walk = self._given.copy(), np.zeros(self._components.error_count)
         if len(self._varied) and rng is not None:
             drawn = rng.standard_normal(len(self._varied))
             self.bias[self._varied] += self._deviation[self._varied] * drawn
 
-    def added(self, seen: Vector, due: Mask, rng: np.random.Generator | None) -> Vector:
-        """Return values with the errors of this measurement; what is not due does not wander.
+    def add(self, seen: Vector, due: Mask, rng: np.random.Generator | None) -> Vector:
+        """Return values with the errors of this measurement; random walks of what is not due rest.
 
         Args:
             seen: Shape (components,).
             due: Shape (sensors,).
-            rng: For walk and noise.
+            rng: For the random walk and the noise.
         """
         error = self.bias
         if len(self._walking) and rng is not None:
             at = self._walking
             strides = self._stride[at] * rng.standard_normal(len(at))
             self.walk = self.walk.copy()
-            self.walk[at] += np.where(due[self._places.error_owners[at]], strides, 0.0)
+            self.walk[at] += np.where(due[self._components.error_owners[at]], strides, 0.0)
             error = error + self.walk
         if len(self._noisy) and rng is not None:
             at = self._noisy
             error = error.copy()
             error[at] += self._noise[at] * rng.standard_normal(len(at))
-        places = self._places
+        components = self._components
         found = seen.copy()
-        found[places.added] += error[places.adding]
-        if places.attitudes.size:
-            turns = from_rotation_vector_rows(error[places.turning])
-            found[places.attitudes] = multiply_rows(seen[places.attitudes], turns)
+        found[components.shifted] += error[components.shifts]
+        if components.orientations.size:
+            turns = from_rotation_vector_rows(error[components.turns])
+            at = components.orientations
+            found[at] = multiply_rows(seen[at], turns)
         return found

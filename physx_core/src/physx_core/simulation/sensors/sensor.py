@@ -1,4 +1,4 @@
-"""What a sensor is: plain, picklable data."""
+"""Descriptions of sensors: plain, picklable data."""
 
 from __future__ import annotations
 
@@ -15,27 +15,26 @@ Amounts = float | Mapping[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """What all sensors have.
+    """Options of all sensors.
 
-    A measurement is the true value as it was `delay` plus a part of `jitter` ago, plus the bias,
-    plus noise. Errors are in the units of what is measured; those of an orientation are small
-    rotations about the sensor's own axes, in rad.
+    A measurement is the ideal value of `delay` plus a random share of `jitter` ago, plus bias,
+    random walk, and noise. Errors are in the units of the quantity; those of an orientation are
+    small rotations about the sensor's own axes, in rad.
 
     Attributes:
         name: Name of the sensor.
         period: Time between two measurements, in s; a multiple of the physics' period; None: the
             physics' period.
-        noise: Standard deviation of each measurement's own error.
-        bias: Error that is the same in all measurements.
-        bias_deviation: Standard deviation of a further error that is drawn once, at the beginning
-            and at each reset.
-        random_walk: Standard deviation that a wandering error, 0 at first, has after 1 s; it grows
-            with the square root of the time.
+        noise: Standard deviation of the white noise of each measurement.
+        bias: Constant error.
+        bias_deviation: Standard deviation of a further constant error, drawn at the beginning and
+            at each reset.
+        random_walk: Standard deviation of the random walk after 1 s; it starts at 0 and grows with
+            the square root of time.
         delay: In s.
-        jitter: The delay grows at each measurement by an amount drawn evenly between 0 and this,
-            in s.
-        interpolation: What was between two measurements: 0, what the earlier one saw; 1, what is
-            on the line between them.
+        jitter: Largest random addition to the delay, drawn uniformly for each measurement, in s.
+        interpolation: Value between two measurements: 0, that of the earlier one; 1, linear
+            interpolation.
     """
 
     quantities: ClassVar[Mapping[str, int]] = {}
@@ -57,29 +56,31 @@ class Sensor:
         """Check the values.
 
         Raises:
-            ConfigError: A value cannot be.
+            ConfigError: If a value is out of range.
         """
         kind = type(self).__name__
         if not self.quantities:
-            raise ConfigError(f"{kind} is no kind of sensor; use one of its subclasses.")
+            raise ConfigError(f"{kind} is not a kind of sensor; use one of its subclasses.")
         if not isinstance(self.name, str) or not self.name:
-            raise ConfigError(f"The name of a sensor is {self.name!r} but must be a text.")
+            raise ConfigError(
+                f"The name of a sensor is {self.name!r} but must be a nonempty string."
+            )
         where = f'{kind} "{self.name}": '
         if self.period is not None:
             checks.positive(f"{where}period", self.period)
         checks.options(checks.not_negative, where, self, "delay", "jitter")
         if self.interpolation not in (0, 1):
-            raise ConfigError(f"{where}interpolation is {self.interpolation!r}, not 0 or 1.")
+            raise ConfigError(f"{where}interpolation is {self.interpolation!r} but must be 0 or 1.")
         for option in ("noise", "bias", "bias_deviation", "random_walk"):
             for value in self.amounts(option):
                 if option != "bias":
                     checks.not_negative(where + option, value)
 
     def amounts(self, option: str) -> list[float]:
-        """Return ``"noise"`` or another error for each component, 3 for an orientation.
+        """Return the amounts of an error, as ``"noise"``, by component; 3 for an orientation.
 
         Raises:
-            ConfigError: A quantity does not exist or has no errors, or a value is no number.
+            ConfigError: If a quantity does not exist or has no errors, or a value is not a number.
         """
         given = getattr(self, option)
         where = f'{type(self).__name__} "{self.name}": {option}'
@@ -97,7 +98,7 @@ class Sensor:
         return found
 
     def error_widths(self) -> dict[str, int]:
-        """Return how many errors each quantity has; those without are left out."""
+        """Return the number of errors of each quantity that has errors."""
         return {
             name: 3 if name == "orientation" else width
             for name, width in self.quantities.items()
@@ -111,7 +112,7 @@ class Encoder(Sensor):
 
     Attributes:
         joint: Name of the joint in `Layout.joints`.
-        reduction: Turns of what is measured for one of the joint, where it sits on a motor.
+        reduction: Turns of the measured shaft for one of the joint, for an encoder on the motor.
     """
 
     quantities: ClassVar[Mapping[str, int]] = {"position": 1, "velocity": 1}
@@ -123,20 +124,20 @@ class Encoder(Sensor):
         """Check the values.
 
         Raises:
-            ConfigError: A value cannot be.
+            ConfigError: If a value is out of range.
         """
         super().__post_init__()
         if not checks.finite(f'Encoder "{self.name}": reduction', self.reduction):
-            raise ConfigError(f'Encoder "{self.name}": reduction cannot be 0.')
+            raise ConfigError(f'Encoder "{self.name}": reduction must not be 0.')
 
 
 @dataclass(frozen=True, kw_only=True)
 class Imu(Sensor):
-    """Measures how a place on a body moves, along the sensor's own axes.
+    """Measures the motion of a point on a body, along the sensor's own axes.
 
     ``orientation``: quaternion x, y, z, w of the sensor in the world. ``angular_velocity`` in
-    rad/s. ``acceleration`` in m/s², that of the last physics step, less that of free fall: at rest
-    it points up.
+    rad/s. ``acceleration`` (specific force) of the last physics step in m/s²: at rest it points
+    up.
 
     Attributes:
         body: Name of the link or object.
@@ -158,7 +159,7 @@ class Imu(Sensor):
         """Check the values.
 
         Raises:
-            ConfigError: A value cannot be.
+            ConfigError: If a value is out of range.
         """
         super().__post_init__()
         where = f'Imu "{self.name}": '
@@ -169,10 +170,10 @@ class Imu(Sensor):
 
 @dataclass(frozen=True, kw_only=True)
 class ContactSensor(Sensor):
-    """Measures what touches a body, as of the last physics step.
+    """Measures the contacts of a body in the last physics step.
 
-    ``touching``: 1 or 0, without errors. ``normal_force``: sum of the contacts' forces along their
-    normals, in N. ``force``: sum of all forces of contacts on the body, in N, in the world frame.
+    ``touching``: 1 or 0, without errors. ``normal_force``: sum of the contact forces along their
+    normals, in N. ``force``: sum of all contact forces on the body, in N, in the world frame.
 
     Attributes:
         body: Name of the link or object.
@@ -186,10 +187,10 @@ class ContactSensor(Sensor):
 
 @dataclass(frozen=True, kw_only=True)
 class ForceTorqueSensor(Sensor):
-    """Measures what a joint carries: ``force`` in N and ``torque`` in N m, of the last step.
+    """Measures the reaction of a joint: ``force`` in N and ``torque`` in N m, in the last step.
 
-    They act on the link behind the joint, at its origin and along its axes. Static loads, motion,
-    contacts and wrenches all count. Needs an engine with the feature ``joint_wrenches``.
+    They act on the joint's child link, at its origin and along its axes. Static loads, motion,
+    contacts, and wrenches all count. Needs an engine with the feature ``joint_wrenches``.
 
     Attributes:
         joint: Name of the joint in `Layout.joints`.
@@ -202,7 +203,7 @@ class ForceTorqueSensor(Sensor):
 
 @dataclass(frozen=True, kw_only=True)
 class EffortSensor(Sensor):
-    """Measures the ``torque`` that drives a joint of the mode ``"force"``, in N m or N.
+    """Measures the ``torque`` that drives a joint with the mode ``"force"``, in N m or N.
 
     Attributes:
         joint: Name of the joint in `Layout.joints`.

@@ -1,4 +1,4 @@
-"""Sensors of one kind, which measure together."""
+"""Groups of sensors of one kind, which measure together."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 
 from physx_core.simulation.backend import Simulation
 from physx_core.simulation.description import World
-from physx_core.simulation.sensors.ideal import Truth, truth_of
+from physx_core.simulation.sensors.ideal import IdealSensors, ideal_sensors
 from physx_core.simulation.sensors.sensor import Sensor
 from physx_core.typing import Vector
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
-    """All sensors of one kind, and where their components are.
+class SensorGroup:
+    """All sensors of one kind, and the place of their components.
 
     Attributes:
         kind: Their class.
-        truth: What measures them.
+        ideal: Their noise-free measurements.
         components: Their part of the values.
         shape: Of their block: sensors, components of each.
         every: Frames between two measurements of each, shape (sensors,).
@@ -29,7 +29,7 @@ class Group:
     """
 
     kind: type[Sensor]
-    truth: Truth
+    ideal: IdealSensors
     components: slice
     shape: tuple[int, int]
     every: NDArray[np.int64]
@@ -40,16 +40,16 @@ class Group:
         return values[self.components].reshape(self.shape)
 
     def measure(self, simulation: Simulation, out: Vector, frame: int, first: bool) -> bool:
-        """Write what those that are due measure; return whether any was.
+        """Measure with the sensors that are due; return whether any was.
 
         Args:
-            simulation: What they measure.
-            out: Their block of the true values; those of others stay.
-            frame: The present frame.
-            first: Whether all are due, whatever the frame.
+            simulation: The simulation that they measure.
+            out: Their block of the ideal values; rows of sensors that are not due stay.
+            frame: The current frame.
+            first: Whether all are due in any case.
         """
         if first or (self.shared_every is not None and frame % self.shared_every == 0):
-            self.truth.measure(simulation, out)
+            self.ideal.measure(simulation, out)
             return True
         if self.shared_every is not None:
             return False
@@ -57,26 +57,26 @@ class Group:
         if not due.any():
             return False
         measured = np.empty(self.shape)
-        self.truth.measure(simulation, measured)
+        self.ideal.measure(simulation, measured)
         out[due] = measured[due]
         return True
 
 
 def groups_of(
     sensors: Sequence[Sensor], every: Sequence[int], simulation: Simulation, world: World
-) -> list[Group]:
-    """Return the groups of sensors; those of one kind must follow each other.
+) -> list[SensorGroup]:
+    """Return the groups of sensors; sensors of one kind must be adjacent.
 
     Args:
         sensors: The sensors.
         every: Frames between two measurements of each.
-        simulation: What they measure.
-        world: What the simulation was built from.
+        simulation: The simulation that they measure.
+        world: The world that the simulation was built from.
 
     Raises:
-        ComponentNotFoundError: A joint or body is not in the simulation.
-        ConfigError: A kind is unknown, or a joint's torque is not known.
-        FeatureNotSupportedError: The engine lacks what a kind needs.
+        ComponentNotFoundError: If a joint or body is not in the simulation.
+        ConfigError: If a kind is unknown, or a joint's torque is not known.
+        FeatureNotSupportedError: If the engine lacks what a kind needs.
     """
     found, begin = [], 0
     for kind in dict.fromkeys(type(sensor) for sensor in sensors):
@@ -85,9 +85,9 @@ def groups_of(
         shape = len(places), sum(kind.quantities.values())
         end = begin + shape[0] * shape[1]
         found.append(
-            Group(
+            SensorGroup(
                 kind,
-                truth_of(kind, [sensors[place] for place in places], simulation, world),
+                ideal_sensors(kind, [sensors[place] for place in places], simulation, world),
                 slice(begin, end),
                 shape,
                 np.array(steps),

@@ -1,4 +1,4 @@
-"""The sensors of a simulation."""
+"""Sensors of a simulation: they measure at their periods, with their imperfections."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from physx_core.errors import ComponentNotFoundError, ConfigError, SimulationErr
 from physx_core.simulation.backend import Simulation
 from physx_core.simulation.description import World
 from physx_core.simulation.devices import check_unique, steps_of
-from physx_core.simulation.sensors.imperfections import Delays, Errors, Mask, Places
+from physx_core.simulation.sensors.imperfections import Components, Delays, Errors, Mask
 from physx_core.simulation.sensors.sensor import Sensor
 from physx_core.simulation.sensors.sensor_groups import groups_of
 from physx_core.typing import Vector
@@ -25,18 +25,18 @@ class SensorState:
     """A snapshot of sensors; plain and picklable.
 
     Attributes:
-        values: What was measured last, shape (components,).
-        truth: Likewise without errors and delay.
-        past: Earlier true values.
-        counts: How often each sensor measured.
-        bias: Errors that stay.
-        walk: Errors that wander.
-        frame: Frame of the last measurement; -1: there was none.
-        rng: State of what errors are drawn from; None: nothing is drawn.
+        values: Last measurements, shape (components,).
+        ideal: The same without errors and delay.
+        past: Earlier ideal values.
+        counts: Number of measurements of each sensor.
+        bias: Constant errors.
+        walk: Random walks.
+        frame: Frame of the last measurement; -1: none yet.
+        rng: State of the random generator; None: nothing is drawn.
     """
 
     values: Vector
-    truth: Vector
+    ideal: Vector
     past: Vector
     counts: NDArray[np.int64]
     bias: Vector
@@ -48,8 +48,8 @@ class SensorState:
 class Sensors:
     """Sensors of a simulation: each measures at its own period.
 
-    As a hook of the simulation they run by themselves before each physics step; `update` brings
-    them to the present after the last one, and measures nothing twice::
+    As a hook of the simulation they run by themselves before each physics step; `update` measures
+    what is due after the last step, and nothing twice::
 
         sensors = Sensors(simulation, world, [Encoder(name="knee", joint="knee", noise=1e-3)], rng)
         simulation.add_hook(sensors)
@@ -61,14 +61,13 @@ class Sensors:
     multiples of their periods. They keep no reference to the simulation and can be pickled. After
     `Simulation.set_state` call `reset`, and beside its `snapshot` and `restore` their own.
 
-    `view` and `block` are the measurements without copies, in memory that stays for life. Sensors
-    without noise, bias and delay cost the least.
+    `view` and `block` give the measurements without a copy, always in the same memory. Sensors
+    without noise, bias, and delay cost the least.
 
     Attributes:
-        sensors: The sensors, in the order of the values: those of one kind stand together, kinds
-            and those of one kind as they were given.
+        sensors: The sensors, in the order of the values: grouped by kind, in the given order.
         dtype: Record of all values: a record for each sensor, by its name, and in it its
-            quantities by theirs. All are float64, without gaps.
+            quantities by their names. All are float64, without gaps.
         size: Number of values of all sensors.
     """
 
@@ -79,19 +78,19 @@ class Sensors:
         sensors: Sequence[Sensor],
         rng: np.random.Generator | None = None,
     ) -> None:
-        """Put sensors on a simulation; they measure nothing yet.
+        """Attach sensors to a simulation's bodies and joints; they measure nothing yet.
 
         Args:
-            simulation: What they measure.
-            world: What the simulation was built from.
-            sensors: With names that differ.
-            rng: What biases, noise, random walks and jitter are drawn from.
+            simulation: The simulation that they measure.
+            world: The world that the simulation was built from.
+            sensors: Sensors with distinct names.
+            rng: Source of biases, noise, random walks, and jitter.
 
         Raises:
-            ComponentNotFoundError: The simulation has no joint or body of that name.
-            ConfigError: Two sensors have one name, a period is no multiple of the physics', a
+            ComponentNotFoundError: If the simulation has no joint or body of that name.
+            ConfigError: If two sensors share a name, a period is not a multiple of the physics', a
                 joint's torque is not known, or `rng` is missing.
-            FeatureNotSupportedError: The engine lacks what a sensor needs.
+            FeatureNotSupportedError: If the engine lacks what a sensor needs.
         """
         kinds = list(dict.fromkeys(type(sensor) for sensor in sensors))
         sensors = sorted(sensors, key=lambda sensor: kinds.index(type(sensor)))
@@ -103,42 +102,42 @@ class Sensors:
         ]
         self._every = np.array(every)
         self._hook_every = int(np.gcd.reduce(self._every))
-        self._places = Places(sensors)
-        self.size = self._places.components
+        self._components = Components(sensors)
+        self.size = self._components.count
         self.dtype = np.dtype([(each.name, _record(each)) for each in sensors])
         self._groups = groups_of(sensors, every, simulation, world)
         periods = self._every * simulation.period
-        self._delays = Delays(sensors, self._places, periods)
-        self._errors = Errors(sensors, self._places, periods)
+        self._delays = Delays(sensors, self._components, periods)
+        self._errors = Errors(sensors, self._components, periods)
         if rng is None and (self._delays.draws or self._errors.draws):
             raise ConfigError(
-                "Noise, bias_deviation, random_walk and jitter are drawn at random: give "
+                "Noise, bias_deviation, random_walk, and jitter are drawn at random: give "
                 "Sensors(..., rng=np.random.default_rng(seed))."
             )
         self._rng, self._frame = rng, -1
         self._exact = not (self._delays.acts or self._errors.acts)
-        self._truth = np.full(self.size, np.nan)
-        self._values = self._truth if self._exact else self._truth.copy()
+        self._ideal = np.full(self.size, np.nan)
+        self._values = self._ideal if self._exact else self._ideal.copy()
         self._arrange()
         self._errors.begin(rng)
 
     def _arrange(self) -> None:
-        """Find the kinds' places in the vectors again; they are not pickled."""
-        self._blocks = [(group, group.block(self._truth)) for group in self._groups]
+        """Create the views of the groups, which are not pickled."""
+        self._blocks = [(group, group.block(self._ideal)) for group in self._groups]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is pickled: all but views of it."""
+        """Return everything but the views."""
         return {name: value for name, value in vars(self).items() if name != "_blocks"}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
-        """Take over what was pickled."""
+        """Restore the attributes and the views."""
         vars(self).update(state)
         self._arrange()
 
     # Measuring ------------------------------------------------------------------------------
 
     def update(self, simulation: Simulation) -> None:
-        """Measure what is due at the present frame, unless that was done already."""
+        """Measure what is due in the current frame, unless that is done already."""
         frame = simulation.frame
         if frame == self._frame:
             return
@@ -159,15 +158,15 @@ class Sensors:
             return
         for group, block in self._blocks:
             group.measure(simulation, block, frame, first)
-        self._frame, seen = frame, self._truth
+        self._frame, seen = frame, self._ideal
         if self._delays.acts:
-            seen = self._delays.delayed(seen, due, self._rng)
+            seen = self._delays.delay(seen, due, self._rng)
         if self._errors.acts:
-            seen = self._errors.added(seen, due, self._rng)
+            seen = self._errors.add(seen, due, self._rng)
         if due.all():
             self._values[:] = seen
         else:
-            np.copyto(self._values, seen, where=due[self._places.owners])
+            np.copyto(self._values, seen, where=due[self._components.owners])
 
     __call__ = update
 
@@ -180,17 +179,17 @@ class Sensors:
 
     @property
     def view(self) -> Vector:
-        """What is measured, shape (size,): read-only, the same memory for life; NaN at first."""
+        """The measurements, shape (size,): read-only, always the same memory; NaN at first."""
         return _read_only(self._values)
 
     def block(self, kind: type[Sensor]) -> Vector:
-        """Return what sensors of one kind measure, shape (sensors, components).
+        """Return the measurements of one kind of sensor, shape (sensors, components).
 
-        It is a part of `view`: read-only, the same memory for life; NaN at first. Rows are in the
+        This is a part of `view`: read-only, always the same memory; NaN at first. Rows are in the
         order of `sensors`.
 
         Raises:
-            ComponentNotFoundError: There is no sensor of that kind.
+            ComponentNotFoundError: If there is no sensor of that kind.
         """
         for group in self._groups:
             if group.kind is kind:
@@ -201,38 +200,38 @@ class Sensors:
 
     @property
     def values(self) -> Vector:
-        """All that was measured last, shape (size,); a copy.
+        """The last measurements, shape (size,); a copy.
 
         Raises:
-            SimulationError: Nothing was measured yet.
+            SimulationError: If nothing has been measured yet.
         """
         self._check_measured()
         return self._values.copy()
 
     @property
-    def truth(self) -> Vector:
-        """The same without errors and delay.
+    def ideal(self) -> Vector:
+        """The last measurements without errors and delay, shape (size,); a copy.
 
         Raises:
-            SimulationError: Nothing was measured yet.
+            SimulationError: If nothing has been measured yet.
         """
         self._check_measured()
-        return self._truth.copy()
+        return self._ideal.copy()
 
     def read(self) -> Any:
-        """Return all that was measured last as one record of `dtype`; a copy.
+        """Return the last measurements as one record of `dtype`; a copy.
 
         Raises:
-            SimulationError: Nothing was measured yet.
+            SimulationError: If nothing has been measured yet.
         """
         return self.values.view(self.dtype)[0]
 
     def __getitem__(self, name: str) -> Any:
-        """Return what one sensor measured last: a record of its quantities; a copy.
+        """Return the last measurement of one sensor: a record of its quantities; a copy.
 
         Raises:
-            ComponentNotFoundError: There is no sensor of that name.
-            SimulationError: Nothing was measured yet.
+            ComponentNotFoundError: If there is no sensor of that name.
+            SimulationError: If nothing has been measured yet.
         """
         if name not in (self.dtype.names or ()):
             known = self.dtype.names or ()
@@ -241,29 +240,29 @@ class Sensors:
 
     def _check_measured(self) -> None:
         if self._frame < 0:
-            raise SimulationError("The sensors have measured nothing yet: call update(simulation).")
+            raise SimulationError("The sensors have not measured yet: call update(simulation).")
 
     # State ----------------------------------------------------------------------------------
 
     def reset(self, rng: np.random.Generator | None = None) -> None:
-        """Forget all measurements, and draw new biases.
+        """Discard all measurements and draw new biases.
 
         Args:
-            rng: What to draw from, from now on; None: go on with the present one.
+            rng: New source of random numbers; None: keep the present one.
         """
         if rng is not None:
             self._rng = rng
-        self._values[:] = self._truth[:] = np.nan
+        self._values[:] = self._ideal[:] = np.nan
         self._frame = -1
         self._delays.clear()
         self._errors.begin(self._rng)
 
     def snapshot(self) -> SensorState:
-        """Return everything that `restore` needs to go on exactly from here."""
+        """Return everything that `restore` needs to continue exactly from here."""
         rng = self._rng
         return SensorState(
             self._values.copy(),
-            self._truth.copy(),
+            self._ideal.copy(),
             self._delays.past.copy(),
             self._delays.counts.copy(),
             self._errors.bias.copy(),
@@ -273,17 +272,17 @@ class Sensors:
         )
 
     def restore(self, state: SensorState) -> None:
-        """Go back to a snapshot; draws go on as they did then.
+        """Return to a snapshot, the state of the random generator included.
 
         Raises:
-            SimulationError: It is of other sensors.
+            SimulationError: If the snapshot is of other sensors.
         """
         for name, own in vars(self.snapshot()).items():
             given: Any = getattr(state, name, None)
             fits = np.shape(given) == np.shape(own) if isinstance(own, np.ndarray) else True
             if not fits or (given is None) != (own is None):
                 raise SimulationError(f"The snapshot is not of these sensors: {name} differs.")
-        self._truth[:], self._values[:] = state.truth, state.values
+        self._ideal[:], self._values[:] = state.ideal, state.values
         self._delays.past, self._delays.counts = state.past.copy(), state.counts.copy()
         self._errors.bias, self._errors.walk = state.bias.copy(), state.walk.copy()
         self._frame = state.frame
@@ -298,7 +297,7 @@ def _read_only(values: Vector) -> Vector:
 
 
 def _record(sensor: Sensor) -> np.dtype[np.void]:
-    """Return the record of one sensor's quantities."""
+    """Return the record type of one sensor's quantities."""
     return np.dtype(
         [
             (name, np.float64) if width == 1 else (name, np.float64, (width,))
