@@ -89,7 +89,7 @@ def test_limits_slope_friction_and_reduction_of_each_motor():
     assert simulation.held.tolist() == [1, 0, 0]
 
 
-def test_a_limit_without_slope_cuts_all_at_once():
+def test_a_limit_without_slope_is_a_step():
     simulation = Held()
     motors = Motors(simulation, WORLD, [Motor(joint="a", max_velocity=10, max_torque=4)])
     assert run(motors, simulation, [9.0], (9.999, 0, 0)) == [4]
@@ -97,7 +97,7 @@ def test_a_limit_without_slope_cuts_all_at_once():
     assert run(motors, simulation, [-9.0], (10, 0, 0)) == [-4]
 
 
-def test_commands_are_checked_and_nothing_is_taken_over_of_a_wrong_one():
+def test_invalid_commands_are_rejected_as_a_whole():
     simulation = Held()
     motors = Motors(simulation, WORLD, [Motor(joint="a")])
     motors.set_commands([2.0])
@@ -109,7 +109,7 @@ def test_commands_are_checked_and_nothing_is_taken_over_of_a_wrong_one():
     assert motors.commands.tolist() == [2]
 
 
-def test_what_cannot_be_is_refused():
+def test_invalid_values_are_rejected():
     with pytest.raises(ComponentNotFoundError, match='no joint "d".*It has: a, b, c'):
         Motors(Held(), WORLD, [Motor(joint="d")])
     with pytest.raises(ConfigError, match='2 of motor on joint "a"'):
@@ -171,7 +171,7 @@ def test_descriptions_are_checked(options):
         Motor(**{"joint": "a", **options})
 
 
-def test_motors_are_plain_and_their_states_belong_to_them():
+def test_motors_can_be_pickled_and_reject_states_of_others():
     motor = Motor(joint="a", stiffness=10.0, inertia=0.1, backlash=0.1)
     assert pickle.loads(pickle.dumps(motor)) == motor  # noqa: S301
     simulation = Held()

@@ -105,7 +105,7 @@ def test_delay_counts_in_time_not_in_the_sensors_own_period():
     np.testing.assert_allclose(found, np.maximum(taken - 0.01, 0), atol=1e-15)
 
 
-def test_jitter_stays_in_its_range_and_is_spread_evenly():
+def test_jitter_is_uniform_in_its_range():
     simulation = Signal()
     encoder = Encoder(name="a", joint="a", delay=2e-3, jitter=5e-3, interpolation=1)
     sensors = Sensors(simulation, WORLD, [encoder], np.random.default_rng(0))
@@ -131,7 +131,7 @@ def test_noise_and_bias_have_their_statistics():
     assert not sensors.ideal.any()
 
 
-def test_drawn_biases_stay_until_the_reset_and_walks_grow_with_the_root_of_time():
+def test_drawn_biases_last_until_the_reset_and_walks_grow_with_the_root_of_time():
     simulation = Signal(lambda t: np.zeros(2))
     kinds = [
         Encoder(name=f"e{i}", joint="a", bias_deviation={"position": 0.5}, random_walk=0.2)
@@ -185,7 +185,7 @@ def test_each_sensor_measures_at_its_own_period_as_a_hook():
     assert sensors.values.shape == (5,) and sensors.dtype.itemsize == 40
 
 
-def test_what_cannot_be_is_refused():
+def test_invalid_values_are_rejected():
     simulation = Signal()
 
     def make(*kinds, **options):
@@ -234,7 +234,7 @@ def test_descriptions_are_checked(options, error, words):
         Encoder(**{"name": "x", "joint": "a", **options})
 
 
-def test_a_contact_has_no_errors_and_the_base_is_no_sensor():
+def test_touching_has_no_errors_and_the_base_class_is_not_a_sensor():
     with pytest.raises(UnknownOptionError, match="touching"):
         ContactSensor(name="x", body="b", noise={"touching": 0.1})
     with pytest.raises(ConfigError, match="not a kind of sensor"):

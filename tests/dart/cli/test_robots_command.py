@@ -39,7 +39,7 @@ def test_robots_of_all_backends_are_listed_once(only, capsys):
     assert len([line for line in lines if line.startswith("arm")]) == 1
 
 
-def test_without_backends_it_says_what_to_install(only, capsys):
+def test_without_backends_it_names_the_package_to_install(only, capsys):
     only()
     assert main(["robots"]) == 0
     assert "pip install physx-dart" in capsys.readouterr().out

@@ -21,7 +21,7 @@ def rms(samples):
     return np.sqrt(np.mean([sample["tracking_error"] ** 2 for sample in samples]))
 
 
-def test_the_environments_are_found_by_name():
+def test_environments_are_found_by_name():
     assert plugins.resolve("environment", "dart/arm") is DartArm
     assert plugins.resolve("environment", "pinocchio/arm") is PinocchioArm
     assert plugins.resolve("environment", "dart/double-pendulum") is DartDoublePendulum
@@ -67,7 +67,7 @@ def test_seed_and_instance_determine_the_samples(environment, drive):
 
 
 @pytest.mark.parametrize("environment", [DartArm, PinocchioDoublePendulum])
-def test_each_motion_is_a_trajectory_of_its_own(environment, drive):
+def test_each_motion_is_a_separate_trajectory(environment, drive):
     made = drive.make(environment, episode_steps=3)
     numbers = []
     for _ in range(8):
@@ -104,7 +104,7 @@ def test_feed_forward_makes_the_arm_follow(arm, drive):
     assert follow("none", trajectory=1) != alone
 
 
-def test_predictions_act_in_the_period_that_they_are_for(drive):
+def test_predictions_act_in_their_own_period(drive):
     model = drive(DartArm, 100, task="track", feedforward="model")
     # A network that is exact gives the same motion, bit for bit, whatever its field is called.
     for field in ("torque", "prediction"):
@@ -137,7 +137,7 @@ def test_tracking_begins_at_rest_on_the_reference_whatever_the_seed(drive):
     np.testing.assert_array_equal(begin(seed=1), begin(seed=2, instance_id=3))
 
 
-def test_predictions_that_do_not_fit_are_named(drive):
+def test_invalid_predictions_are_named(drive):
     environment = drive.make(DartArm, task="track", prediction_field="tau")
     drive(environment, 1)
     with pytest.raises(ConfigError, match='prediction_field is "tau".*torque'):
@@ -229,7 +229,7 @@ def test_stored_samples_are_replayed(environment, options, drive):
     assert len(shown) == 6
 
 
-def test_without_the_robots_the_arm_says_what_to_install(monkeypatch):
+def test_without_the_robots_the_arm_names_the_package_to_install(monkeypatch):
     def missing(name):
         raise importlib.metadata.PackageNotFoundError(name)
 

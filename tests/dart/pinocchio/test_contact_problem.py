@@ -53,7 +53,7 @@ def test_impulses_obey_coulombs_law_and_bounds(name, points, limits, bounded):
 
 
 @pytest.mark.parametrize("name", ["pgs", "admm"])
-def test_a_plate_on_four_points_is_carried_whatever_newton_makes_of_it(name):
+def test_a_plate_on_four_points_is_carried_even_if_newton_cycles(name):
     """More points than directions: many impulses do, and Newton's method alone goes in circles."""
     corners = np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [0, 0, 0.0]])
     rows = [np.hstack([np.eye(3), -np.cross(np.eye(3), c)]) for c in corners]
@@ -66,7 +66,7 @@ def test_a_plate_on_four_points_is_carried_whatever_newton_makes_of_it(name):
         check(problem, solver.solve(*problem))
 
 
-def test_the_iterated_solutions_are_those_of_newton():
+def test_the_iterative_solvers_agree_with_newton():
     rng = np.random.default_rng(3)
     for name in ("pgs", "admm"):
         solver = ImpulseSolver(name)
@@ -78,14 +78,14 @@ def test_the_iterated_solutions_are_those_of_newton():
         assert problem.error(iterate) < 1e-6
 
 
-def test_what_is_no_number_is_an_error():
+def test_values_that_are_not_finite_are_an_error():
     with pytest.raises(SimulationError, match="no longer finite"):
         ImpulseSolver("pgs").solve(
             np.eye(3), np.full(3, np.nan), np.ones(1), np.zeros(0), np.zeros(0)
         )
 
 
-def test_what_cannot_move_gets_no_impulse():
+def test_directions_without_motion_get_no_impulse():
     """A cart on a rail, in the ground: its contacts can only be moved along the rail."""
     response, free = np.zeros((3, 3)), np.array([0.5, 0.0, -2.0])
     response[0, 0] = 1.0

@@ -28,7 +28,7 @@ def test_impulses_are_within_bounds_and_complementary(n):
         assert (missing[impulses == most] < scale).all()
 
 
-def test_a_joint_that_is_limited_and_rubs_is_there_twice():
+def test_a_joint_with_limit_and_friction_has_two_rows():
     response, bound = np.ones((2, 2)), np.array([np.inf, 0.25])
     impulses = solve(response, np.array([1.0, 1.0]), np.array([0.0, -0.25]), bound)
     np.testing.assert_allclose(impulses.sum(), 1.0, rtol=1e-6)

@@ -115,7 +115,7 @@ def test_joints_pushed_into_their_limits_agree(dart, pinocchio, example):
         assert (one.positions() < one.layout.upper + 1e-8).all()
 
 
-def test_a_double_pendulum_goes_the_same_way_for_a_thousand_steps(dart, pinocchio):
+def test_double_pendulums_agree_for_a_thousand_steps(dart, pinocchio):
     with dart.build(World([Robot(URDF)])) as one, pinocchio.build(World([Robot(URDF)])) as other:
         for simulation in (one, other):
             simulation.set_state([1.0, 0.5], [0.0, 0.0])
@@ -123,7 +123,7 @@ def test_a_double_pendulum_goes_the_same_way_for_a_thousand_steps(dart, pinocchi
         np.testing.assert_allclose(one.positions(), other.positions(), atol=1e-10)
 
 
-def test_a_quadruped_tumbles_the_same_way_for_a_second(dart, pinocchio, example):
+def test_tumbling_quadrupeds_agree_for_a_second(dart, pinocchio, example):
     world = World([Robot(example("go2_description/urdf/go2.urdf"), fixed_base=False)])
     with dart.build(world) as one, pinocchio.build(world) as other:
         for simulation in (one, other):

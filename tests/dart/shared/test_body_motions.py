@@ -97,7 +97,7 @@ def test_engines_agree(dart, pinocchio, falling):
         np.testing.assert_allclose(mine[:, 13:], theirs[:, 13:], atol=1e-5 * scale)
 
 
-def test_a_motion_is_pose_velocity_and_acceleration(backend, falling):
+def test_body_motions_are_poses_velocities_and_accelerations(backend, falling):
     with backend.build(falling) as simulation:
         spun(simulation)
         names = ["box", "trunk", "ground", "RR_foot"]
@@ -124,7 +124,7 @@ def test_a_motion_is_pose_velocity_and_acceleration(backend, falling):
             simulation.body_accelerations("trunk")
 
 
-def test_before_the_first_step_only_the_motion_itself_accelerates(backend, bar):
+def test_before_the_first_step_accelerations_are_centripetal_only(backend, bar):
     with backend.build(World([bar()])) as simulation:
         assert not simulation.body_accelerations().any()
         simulation.set_state([0.0], [2.0])
@@ -132,7 +132,7 @@ def test_before_the_first_step_only_the_motion_itself_accelerates(backend, bar):
         np.testing.assert_allclose(tip, [0, 0, 4, 0, 0, 0], atol=1e-12)
 
 
-def test_commands_are_those_that_are_held(backend, bar):
+def test_commands_returns_the_held_commands(backend, bar):
     robot = bar('<limit effort="2" velocity="0"/>')
     with backend.build(World([robot])) as simulation:
         given = np.array([1.0])

@@ -56,7 +56,7 @@ def test_a_box_on_an_incline_holds_below_the_friction_angle_and_slides_above(eng
 
 
 @pytest.mark.parametrize("engine", ISOTROPIC, ids=str)
-def test_friction_is_the_same_across_the_axes_where_it_is_said_to_be(engine):
+def test_friction_is_isotropic_with_the_feature(engine):
     gravity, angle = tilted(1.2, 0.5, (1.0, 1.0))
     with build(engine, cube(friction=0.5), gravity=gravity) as simulation:
         assert "isotropic_friction" in simulation.features
@@ -67,7 +67,7 @@ def test_friction_is_the_same_across_the_axes_where_it_is_said_to_be(engine):
 
 
 @pytest.mark.parametrize("solver", ["dantzig", "pgs"])
-def test_the_friction_pyramid_holds_more_across_its_axes(solver):
+def test_the_friction_pyramid_is_stronger_along_its_diagonals(solver):
     gravity, _ = tilted(1.2, 0.5, (1.0, 1.0))
     with build(("dart", None, solver), cube(friction=0.5), gravity=gravity) as simulation:
         assert "isotropic_friction" not in simulation.features
@@ -101,7 +101,7 @@ def test_things_bounce_by_the_product_of_their_restitutions(engine, restitution)
 
 
 @pytest.mark.parametrize("engine", ENGINES, ids=str)
-def test_a_box_at_rest_weighs_what_it_weighs_and_does_not_sink(engine):
+def test_the_contact_force_of_a_resting_box_is_its_weight_and_it_does_not_sink(engine):
     with build(engine, cube(mass=3.0)) as simulation:
         simulation.step(500)
         contacts = simulation.contacts()
@@ -133,7 +133,7 @@ def test_a_dropped_box_sinks_little_and_its_energy_never_rises(engine):
 
 
 @pytest.mark.parametrize("engine", BOTH, ids=str)
-def test_the_ground_bears_weight_and_force_from_outside(engine):
+def test_the_ground_bears_weight_and_external_forces(engine):
     with build(engine, cube(mass=2.0)) as simulation:
         simulation.step(200)
         simulation.apply_wrench(Wrench("cube", force=(0, 0, -30)))
@@ -143,7 +143,7 @@ def test_the_ground_bears_weight_and_force_from_outside(engine):
 
 
 @pytest.mark.parametrize("engine", BOTH, ids=str)
-def test_a_pushed_box_accelerates_by_force_less_friction(engine):
+def test_a_pushed_box_accelerates_by_force_minus_friction(engine):
     with build(engine, cube(mass=2.0, friction=0.4)) as simulation:
         simulation.step(200)
         # At the height of the ground, so that the box does not tip.
@@ -195,7 +195,7 @@ def test_a_ball_rolls_down_a_height_field(engine):
 
 
 @pytest.mark.parametrize("engine", [*BOTH, ("pinocchio", None, "admm")], ids=str)
-def test_light_wheels_under_a_heavy_base_are_no_springboard(engine):
+def test_light_wheels_under_a_heavy_base_do_not_bounce(engine):
     """Gauss-Seidel alone does not come to an end at this impact, and drives the wheels."""
     name, _, solver = engine
     base = Robot("wheeled_base", fixed_base=False, position=(0, 0, 0.6))

@@ -22,7 +22,7 @@ BALL = Sphere(name="ball", radius=0.1, mass=2.0)
 CALM = {"gravity": (0.0, 0.0, 0.0)}
 
 
-def test_contacts_of_two_moving_things_name_both(dart):
+def test_contacts_of_two_moving_things_name_both_bodies(dart):
     world = World(
         objects=[
             Box(name="low", size=(0.4, 0.4, 0.1), position=(0, 0, 0.05)),
@@ -50,7 +50,7 @@ def test_contacts_of_two_moving_things_name_both(dart):
 
 
 @pytest.mark.parametrize("contacts", ["static", "none"])
-def test_things_pass_through_each_other_where_it_is_said(backend, contacts):
+def test_the_option_contacts_disables_collisions(backend, contacts):
     things = [
         Box(name="low", size=(0.2, 0.2, 0.2), position=(0, 0, 0.1)),
         Box(name="high", size=(0.2, 0.2, 0.2), position=(0, 0, 0.35)),
@@ -66,7 +66,7 @@ def test_things_pass_through_each_other_where_it_is_said(backend, contacts):
             assert heights[0] < -0.5
 
 
-def test_links_of_a_robot_touch_each_other_where_it_is_said(dart, write_urdf):
+def test_links_collide_with_each_other_if_asked(dart, write_urdf):
     ball = '<collision><geometry><sphere radius="0.3"/></geometry></collision>'
     mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
     link = f'<link name="{{}}">{mass}</inertial>{ball}</link>'
@@ -86,7 +86,7 @@ def test_links_of_a_robot_touch_each_other_where_it_is_said(dart, write_urdf):
             assert (gap > 0.55) == collide
 
 
-def test_rays_meet_what_is_nearest(dart):
+def test_rays_hit_the_nearest_body(dart):
     ball = Sphere(name="ball", radius=0.5, position=(0, 0, 2))
     with dart.build(World(objects=[ball], ground=Ground())) as simulation:
         for _ in range(2):
@@ -118,14 +118,14 @@ def test_rays_meet_what_is_nearest(dart):
         ("dart", {"objects": [Capsule(name="c", radius=1, length=1)], "detector": "fcl"}, "caps"),
     ],
 )
-def test_what_an_engine_lacks_is_an_error_with_what_it_has(engine, options, feature):
+def test_a_missing_feature_is_an_error_that_lists_the_features(engine, options, feature):
     with pytest.raises(FeatureNotSupportedError, match=feature) as caught:
         plugins.resolve("backend", engine).build(World(**options))
     assert caught.value.features
     assert set(caught.value.features) <= FEATURES.keys()
 
 
-def test_features_of_a_simulation_are_known_ones(backend):
+def test_features_of_a_simulation_are_known(backend):
     with backend.build(World(objects=[BALL])) as simulation:
         assert simulation.features <= FEATURES.keys()
         if "raycast" not in simulation.features:
@@ -142,7 +142,7 @@ def test_unknown_detectors_and_solvers_are_named(dart, pinocchio):
         pinocchio.build(World(objects=[BALL], solver="dantzig"))
 
 
-def test_objects_fall_as_their_shapes_say(backend):
+def test_objects_have_the_inertia_of_their_shapes(backend):
     things = [
         Capsule(name="capsule", radius=0.1, length=0.3, mass=2.0),
         Cylinder(name="cylinder", radius=0.1, length=0.3, mass=2.0, position=(1, 0, 0)),

@@ -155,12 +155,12 @@ def campaign(engine, seed, calls):
 
 
 @pytest.mark.parametrize("engine", ["dart", "pinocchio"])
-def test_random_calls_return_or_are_refused(engine):
+def test_random_calls_return_or_are_rejected(engine):
     campaign(engine, 0, 1000)
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize("engine", ["dart", "pinocchio"])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_ten_thousand_random_calls_return_or_are_refused(engine, seed):
+def test_ten_thousand_random_calls_return_or_are_rejected(engine, seed):
     campaign(engine, seed, 10_000)

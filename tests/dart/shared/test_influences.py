@@ -33,7 +33,7 @@ def drawn(backend, bar, steps=1, command=0.0, **settings):
 # Wrenches ---------------------------------------------------------------------------------------
 
 
-def test_a_held_wrench_acts_until_it_is_removed(backend):
+def test_a_permanent_wrench_acts_until_it_is_removed(backend):
     with backend.build(World(objects=[BALL], **CALM)) as simulation:
         number = simulation.apply_wrench(Wrench("ball", force=(4.0, 0, 0)))
         simulation.step(100)
@@ -58,7 +58,7 @@ def test_a_force_follows_the_world_or_the_body(backend, frame):
         np.testing.assert_allclose(speed, expected, atol=1e-3)
 
 
-def test_a_force_beside_the_center_turns(backend):
+def test_a_force_off_the_center_rotates(backend):
     with backend.build(World(objects=[BALL], **CALM)) as simulation:
         wrench = Wrench("ball", force=(0, 2.0, 0), torque=(0, 0, 0.5), point=(0.1, 0, 0))
         simulation.apply_wrench(wrench)
@@ -97,7 +97,7 @@ def test_wrenches_are_part_of_a_snapshot(backend):
         simulation.remove_wrench(kept)
 
 
-def test_wrenches_on_what_cannot_move_are_refused(backend, bar):
+def test_wrenches_on_immobile_bodies_are_rejected(backend, bar):
     robot = bar()
     with backend.build(World([robot], ground=Ground())) as simulation:
         for name, words in (
@@ -114,7 +114,7 @@ def test_wrenches_on_what_cannot_move_are_refused(backend, bar):
 # Hooks ------------------------------------------------------------------------------------------
 
 
-def test_hooks_are_called_before_the_steps_that_they_ask_for(backend, bar):
+def test_hooks_are_called_at_their_frames(backend, bar):
     frames = {1: [], 4: []}
     with backend.build(World([bar()])) as simulation:
         simulation.step(3)
@@ -129,7 +129,7 @@ def test_hooks_are_called_before_the_steps_that_they_ask_for(backend, bar):
             simulation.remove_hook(hooks[1])
 
 
-def test_a_hook_may_control_but_not_step_or_close(backend, bar):
+def test_a_hook_may_set_commands_but_not_step_or_close(backend, bar):
     with backend.build(World([bar()], **CALM)) as simulation:
         simulation.add_hook(lambda s: s.set_torques([0.6 if s.frame % 2 else -0.6]))
         simulation.step(3)
@@ -160,7 +160,7 @@ def test_stepping_with_a_hook_is_stepping(backend, example):
 # Actuators and springs --------------------------------------------------------------------------
 
 
-def test_a_velocity_joint_has_its_velocity_at_once(backend, bar):
+def test_a_velocity_joint_reaches_its_velocity_at_once(backend, bar):
     with drawn(backend, bar, 1, 0.7, mode="velocity") as simulation:
         np.testing.assert_allclose(simulation.velocities(), [0.7], rtol=1e-6)
         simulation.step(100)
@@ -180,7 +180,7 @@ def test_a_servo_reaches_its_velocity_as_fast_as_its_torque_allows(backend, bar)
         np.testing.assert_array_equal(simulation.snapshot().commands, [5.0])
 
 
-def test_a_position_joint_goes_where_it_is_sent_and_holds_against_gravity(backend, bar):
+def test_a_position_joint_reaches_its_target_and_holds_against_gravity(backend, bar):
     limit = '<limit lower="-2" upper="2" velocity="3" effort="60"/>'
     settings = {"hinge": JointSettings(mode="position", gain=30)}
     robot = bar(limit, "revolute", joints=settings)
@@ -208,7 +208,7 @@ def test_engines_agree_on_actuators(dart, pinocchio, bar, mode):
         np.testing.assert_allclose(one.positions(), other.positions(), atol=1e-6)
 
 
-def test_set_torques_says_which_joints_it_does_not_drive(backend, bar):
+def test_set_torques_names_the_joints_that_it_cannot_drive(backend, bar):
     simulation = drawn(backend, bar, mode="servo")
     with simulation, pytest.raises(SimulationError, match=r"hinge\. Use set_commands"):
         simulation.set_torques([1.0])

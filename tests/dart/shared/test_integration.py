@@ -41,7 +41,7 @@ def energy_error(backend, robot, period, integrator, seconds=10):
     return worst / weight
 
 
-def test_energy_of_a_pendulum_errs_in_proportion_to_the_period(backend, bar):
+def test_the_energy_error_of_a_pendulum_is_proportional_to_the_period(backend, bar):
     errors = [energy_error(backend, bar(), period, "euler") for period in (1e-3, 5e-4)]
     assert errors[0] < 1e-3
     np.testing.assert_allclose(errors[0] / errors[1], 2.0, rtol=0.05)
@@ -108,7 +108,7 @@ def test_rk4_of_a_spring_with_a_rotor_follows_its_solution(pinocchio, write_urdf
             np.testing.assert_allclose(state, exact, atol=1e-7)
 
 
-def test_rk4_follows_the_solution_under_forces_that_are_held(pinocchio, write_urdf):
+def test_rk4_follows_the_solution_under_constant_forces(pinocchio, write_urdf):
     """Two masses on springs; a controller sets their forces every 10 ms."""
     joints = {"first": JointSettings(stiffness=40), "second": JointSettings(stiffness=25)}
     world = World([Robot(write_urdf(SLIDERS), joints=joints)], gravity=(0, 0, 0), integrator="rk4")
@@ -132,7 +132,7 @@ def test_rk4_follows_the_solution_under_forces_that_are_held(pinocchio, write_ur
             np.testing.assert_allclose(state, x, atol=1e-7)
 
 
-def test_an_impulse_has_its_edges_and_its_size(backend, write_urdf):
+def test_a_pulse_has_the_right_edges_and_size(backend, write_urdf):
     world = World([Robot(write_urdf(SLIDERS))], gravity=(0, 0, 0))
     with backend.build(world) as simulation:
         simulation.step(100)
@@ -207,13 +207,13 @@ def test_accelerations_of_a_floating_base_agree(dart, pinocchio, brick):
         ("pinocchio", {"mode": "servo"}, "actuators in rk4"),
     ],
 )
-def test_rk4_is_refused_where_it_does_not_hold(engine, change, words, bar):
+def test_rk4_is_rejected_where_it_is_not_valid(engine, change, words, bar):
     robot = dataclasses.replace(bar(), joints={"hinge": JointSettings(**change)})
     with pytest.raises(FeatureNotSupportedError, match=words):
         plugins.resolve("backend", engine).build(World([robot], integrator="rk4"))
 
 
-def test_rk4_refuses_limits(pinocchio, bar):
+def test_rk4_rejects_limits(pinocchio, bar):
     robot = bar('<limit lower="-0.3" upper="0.5" velocity="0.8" effort="50"/>', "revolute")
     with pytest.raises(FeatureNotSupportedError, match="limits in rk4"):
         pinocchio.build(World([robot], integrator="rk4"))

@@ -19,7 +19,7 @@ def floating(robot, **options):
     return World([robot], gravity=(0, 0, 0), period=PERIOD, **options)
 
 
-def test_the_velocity_stays_below_its_bound_and_nears_it_exponentially(backend, bar):
+def test_the_velocity_approaches_its_bound_exponentially(backend, bar):
     """Below the slope the acceleration is constant; on it the gap to the bound decays."""
     world = floating(bar())
     with backend.build(world) as simulation:
@@ -43,7 +43,7 @@ def test_the_velocity_stays_below_its_bound_and_nears_it_exponentially(backend, 
         assert abs((simulation.velocities()[0] - v[-1]) / PERIOD + 40 / INERTIA) < 1e-6
 
 
-def test_viscous_friction_and_reduction_end_at_the_steady_speed(backend, bar):
+def test_viscous_friction_and_reduction_give_the_steady_speed(backend, bar):
     world = floating(bar())
     with backend.build(world) as simulation:
         motor = Motor(joint="hinge", viscous=(0.02, 0.05), dry=(0.3, 0.1), reduction=10)
@@ -106,7 +106,7 @@ def test_a_rotor_behind_an_elastic_gear_follows_the_two_mass_system(backend, bar
         np.testing.assert_allclose(x[0] - x[1], twist.real, rtol=2e-2)
 
 
-def test_backlash_lets_the_rotor_run_alone_then_both_go_together(backend, bar):
+def test_within_the_backlash_the_rotor_moves_alone(backend, bar):
     world = floating(bar())
     with backend.build(world) as simulation:
         gear = elastic(backlash=0.1, stiffness=3000.0, damping=20.0)
@@ -146,7 +146,7 @@ def test_dry_friction_of_an_elastic_gear_sticks(backend, bar):
         np.testing.assert_allclose(2000 * bent, weight, rtol=1e-5)
 
 
-def test_motors_take_over_commands_at_their_own_periods(backend, example):
+def test_motors_adopt_commands_at_their_own_periods(backend, example):
     robot = Robot(example("panda_description/urdf/panda.urdf"))
     world = World([robot], period=PERIOD)
     with backend.build(world) as simulation:
@@ -172,7 +172,7 @@ def test_motors_take_over_commands_at_their_own_periods(backend, example):
 
 
 @pytest.mark.parametrize("copied", [False, True])
-def test_a_restored_motor_goes_on_bit_for_bit(backend, bar, copied):
+def test_a_restored_motor_continues_bit_for_bit(backend, bar, copied):
     world = World([bar()], period=PERIOD)
     motor = elastic(backlash=0.02, dry=0.01, max_velocity=30, slope=0.3, period=5e-3)
     with backend.build(world) as simulation:

@@ -108,7 +108,7 @@ def test_restore_gives_the_same_bits_in_contact(case):
             assert drive(one, 6) == expected
 
 
-def test_a_snapshot_of_another_world_is_refused(case, bar):
+def test_a_snapshot_of_another_world_is_rejected(case, bar):
     engine, world = case
     backend = plugins.resolve("backend", engine)
     with backend.build(world) as simulation, backend.build(World([bar()])) as other:
@@ -127,7 +127,7 @@ def test_a_snapshot_of_another_world_is_refused(case, bar):
         np.testing.assert_array_equal(simulation.positions(), before)
 
 
-def test_a_world_that_exploded_goes_on_after_restore(case):
+def test_a_diverged_world_can_be_restored(case):
     engine, world = case
     with plugins.resolve("backend", engine).build(world) as simulation:
         state = simulation.snapshot()

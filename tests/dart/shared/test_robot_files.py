@@ -145,12 +145,12 @@ def test_joints_are_in_the_order_of_the_tree(backend, write_urdf):
         assert simulation.velocities().tolist() == [5, 6, 7, 8]
 
 
-def test_robots_of_one_name_are_refused(bar):
+def test_duplicate_names_of_robots_are_rejected(bar):
     with pytest.raises(ConfigError, match="differ"):
         World([bar(), bar()])
 
 
-def test_the_package_of_robots_is_asked_for_by_its_pip_line(monkeypatch):
+def test_a_missing_package_of_robots_is_named_with_its_pip_line(monkeypatch):
     def missing(name):
         raise importlib.metadata.PackageNotFoundError(name)
 

@@ -50,7 +50,7 @@ def test_own_floating_robots_rest_on_the_ground(backend, name, height):
         assert 0.05 < simulation.positions()[2] < height
 
 
-def test_the_catalog_says_what_each_robot_is(backend):
+def test_the_catalog_describes_each_robot(backend):
     found = {info.name: info for info in backend.robots()}
     for name, (joints, collisions) in OWN.items():
         info = found[name]

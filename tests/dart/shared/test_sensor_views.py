@@ -32,7 +32,7 @@ def kinds(joints, **options):
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-9])
-def test_views_stay_and_kinds_stand_together(backend, world, noise):
+def test_views_are_permanent_and_kinds_are_grouped(backend, world, noise):
     with backend.build(world) as simulation:
         joints = simulation.layout.joints
         rng = np.random.default_rng(0)
@@ -70,7 +70,7 @@ def pickled(thing):
 
 
 @pytest.mark.parametrize("clone", [copy.deepcopy, pickled])
-def test_a_copy_has_memory_of_its_own(backend, world, clone):
+def test_a_copy_has_its_own_memory(backend, world, clone):
     with backend.build(world) as simulation:
         sensors = Sensors(simulation, world, kinds(simulation.layout.joints))
         sensors.update(simulation)
@@ -116,7 +116,7 @@ def test_sensors_of_one_kind_may_have_different_periods(backend, world):
         ]
 
 
-def test_attached_motors_and_sensors_do_the_same_as_called_ones(backend, world):
+def test_attached_motors_and_sensors_equal_called_ones(backend, world):
     """Attached, they run at their periods only, and the steps between are one block."""
     with backend.build(world) as one, backend.build(world) as other:
         joints = one.layout.joints

@@ -146,7 +146,7 @@ def test_accelerations_are_the_change_of_the_velocities(backend, example):
         np.testing.assert_allclose(felt + world.gravity, (after - before) / 1e-5, atol=2e-3)
 
 
-def test_at_rest_an_imu_has_the_norm_of_gravity_and_contacts_the_weight(backend):
+def test_at_rest_an_imu_measures_gravity_and_contacts_the_weight(backend):
     world = World(
         objects=[Box(name="box", size=(0.4, 0.3, 0.2), mass=3.0, position=(0, 0, 0.1))],
         ground=Ground(),
@@ -174,7 +174,7 @@ def test_at_rest_an_imu_has_the_norm_of_gravity_and_contacts_the_weight(backend)
             np.testing.assert_allclose(read[name]["force"], [0, 0, sign * 3 * 9.81], atol=1e-4)
 
 
-def test_effort_and_encoder_see_what_the_motor_does(backend, bar):
+def test_effort_sensor_and_encoder_measure_the_motor(backend, bar):
     world = World([bar()])
     with backend.build(world) as simulation:
         motors = Motors(simulation, world, [Motor(joint="hinge", max_torque=2, reduction=3)])
@@ -198,7 +198,7 @@ def test_effort_and_encoder_see_what_the_motor_does(backend, bar):
         assert read["shaft"]["velocity"] == 3 * read["joint"]["velocity"]
 
 
-def test_noise_delay_and_walk_are_the_same_again_after_restore_and_in_a_copy(backend, bar):
+def test_noise_delay_and_walk_repeat_after_restore_and_in_a_copy(backend, bar):
     world = World([bar()])
 
     def make(simulation):
@@ -256,7 +256,7 @@ def test_everything_is_the_same_bit_for_bit_in_a_new_process(backend, bar):
     assert first == second
 
 
-def test_a_hinge_carries_weight_motion_and_contact(backend, bar):
+def test_a_hinge_carries_weight_motion_and_contact_forces(backend, bar):
     world = World([bar()])
     with backend.build(world) as simulation:
         sensors = Sensors(simulation, world, [ForceTorqueSensor(name="w", joint="hinge")])
@@ -283,7 +283,7 @@ def carrying(backend):
     return make
 
 
-def test_a_joint_carries_what_pushes_its_link(carrying, bar):
+def test_a_joint_carries_the_wrench_on_its_link(carrying, bar):
     """The same motion with and without a push differs by the push alone."""
     simulation, sensors = carrying(World([bar()]), "hinge")
     with simulation:
@@ -313,7 +313,7 @@ def test_a_standing_robot_carries_its_head(carrying, write_urdf):
         np.testing.assert_allclose(sensors["w"]["torque"], [0, 0, 0.1 * 3 * 9.81], atol=1e-5)
 
 
-def test_contacts_on_the_link_behind_a_joint_are_carried_too(carrying, write_urdf):
+def test_contacts_on_the_child_link_are_carried_too(carrying, write_urdf):
     """The same robot on its head, which the ground holds: the neck carries the foot."""
     box = '<collision><geometry><box size="0.4 0.2 0.4"/></geometry></collision>'
     text = TOWER.replace('<link name="head">', f'<link name="head">{box}')
@@ -339,7 +339,7 @@ def test_contacts_on_the_link_behind_a_joint_are_carried_too(carrying, write_urd
         np.testing.assert_allclose(force, -2 * 9.81, atol=0.02)
 
 
-def test_the_part_along_the_axis_is_the_torque_of_the_joint(carrying, example):
+def test_the_component_along_the_axis_is_the_joint_torque(carrying, example):
     path = example("panda_description/urdf/panda.urdf")
     robot = Robot(path, joints={"panda_joint3": JointSettings(damping=0, friction=0)})
     simulation, sensors = carrying(World([robot]), "panda_joint3")

@@ -25,7 +25,7 @@ def test_both_plugins_are_found_without_importing_an_engine():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
-def test_free_fall_is_that_of_semi_implicit_euler(backend, brick):
+def test_free_fall_follows_semi_implicit_euler(backend, brick):
     with backend.build(brick) as simulation:
         q, v = simulation.positions(), simulation.velocities()
         # The frame's origin falls as the center of mass does while nothing turns.
@@ -46,7 +46,7 @@ def test_gravity_of_the_world_is_used(backend, brick):
         np.testing.assert_allclose(simulation.velocities()[:3], [1e-3, 0, 0], atol=1e-15)
 
 
-def test_pendulum_keeps_its_energy(backend, bar):
+def test_a_pendulum_conserves_its_energy(backend, bar):
     with backend.build(World([bar()], period=1e-4)) as simulation:
         simulation.set_state([1.0], [0.0])
         worst, weight = 0.0, 2 * 9.81 * 0.5
@@ -98,7 +98,7 @@ def test_position_and_velocity_limits_stop_the_joint(backend, bar):
         np.testing.assert_allclose(simulation.positions(), [-0.3], atol=1e-9)
 
 
-def test_a_joint_outside_its_limits_comes_back(backend, bar):
+def test_a_joint_outside_its_limits_returns(backend, bar):
     robot = bar('<limit lower="-0.3" upper="0.5" velocity="1" effort="50"/>', "revolute")
     with backend.build(World([robot])) as simulation:
         simulation.set_state([0.505], [0.0])
@@ -106,7 +106,7 @@ def test_a_joint_outside_its_limits_comes_back(backend, bar):
         np.testing.assert_allclose(simulation.positions(), [0.5], atol=1e-8)
 
 
-def test_torques_are_cut_at_the_effort_limit(backend, bar):
+def test_torques_are_clipped_at_the_effort_limit(backend, bar):
     limit = '<limit lower="0" upper="0" velocity="0" effort="4"/>'
     with backend.build(World([bar(limit, "revolute")], gravity=(0, 0, 0))) as simulation:
         assert simulation.layout.max_torque.tolist() == [4.0]
@@ -126,7 +126,7 @@ def test_torques_are_held_until_changed(backend, bar):
         np.testing.assert_allclose(simulation.velocities(), [0.005], rtol=1e-8)
 
 
-def test_a_continuous_joint_is_one_angle_that_counts_turns(backend, bar):
+def test_a_continuous_joint_is_one_unwrapped_angle(backend, bar):
     with backend.build(World([bar()], gravity=(0, 0, 0))) as simulation:
         assert simulation.layout.nq == simulation.layout.nv == 1
         simulation.set_state([3.0], [10.0])
@@ -197,7 +197,7 @@ def test_poses_of_links_behind_fixed_joints(backend, bar):
 
 
 @pytest.mark.parametrize("fixed_base", [True, False])
-def test_restore_goes_on_bit_for_bit(backend, example, fixed_base):
+def test_restore_continues_bit_for_bit(backend, example, fixed_base):
     world = World([Robot(example("solo_description/robots/solo12.urdf"), fixed_base=fixed_base)])
     rng = np.random.default_rng(1)
     with backend.build(world) as simulation, backend.build(world) as other:
@@ -219,7 +219,7 @@ def test_restore_goes_on_bit_for_bit(backend, example, fixed_base):
         assert first[-1] == 237
 
 
-def test_a_snapshot_goes_to_the_other_engine(dart, pinocchio, brick):
+def test_a_snapshot_can_be_restored_in_the_other_engine(dart, pinocchio, brick):
     with dart.build(brick) as one, pinocchio.build(brick) as other:
         one.set_state([1, 2, 3, 0.5, 0.5, -0.5, 0.5], np.arange(6.0))
         one.step(10)
@@ -290,13 +290,13 @@ def test_out_is_filled(backend):
         (lambda s: s.step(-1), "negative"),
     ],
 )
-def test_what_does_not_fit_is_named(backend, call, words):
+def test_invalid_arguments_are_named(backend, call, words):
     simulation = backend.build(World([Robot(URDF)]))
     with simulation, pytest.raises(SimulationError, match=words):
         call(simulation)
 
 
-def test_a_quaternion_that_is_none_is_named(backend, brick):
+def test_an_invalid_quaternion_is_named(backend, brick):
     simulation = backend.build(brick)
     with simulation, pytest.raises(SimulationError, match="quaternion.*length 0, not 1"):
         simulation.set_state(np.zeros(7), np.zeros(6))

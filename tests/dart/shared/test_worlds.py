@@ -49,9 +49,7 @@ def brick_mesh(tmp_path):
 
 
 @pytest.mark.parametrize(("collisions", "height"), [("boxes", 0.0), ("capsules", None)])
-def test_meshes_are_replaced_where_that_is_asked_for(
-    backend, write_urdf, brick_mesh, collisions, height
-):
+def test_meshes_are_replaced_if_asked(backend, write_urdf, brick_mesh, collisions, height):
     path = write_urdf(MESH_ROBOT)
     robot = Robot(path, fixed_base=False, collisions=collisions, position=(0, 0, 0.13))
     with backend.build(World([robot], ground=Ground())) as simulation:
@@ -61,7 +59,9 @@ def test_meshes_are_replaced_where_that_is_asked_for(
         np.testing.assert_allclose(simulation.positions()[2], height, atol=2e-3)
 
 
-def test_meshes_touch_in_dart_and_are_refused_by_pinocchio(dart, pinocchio, write_urdf, brick_mesh):
+def test_meshes_collide_in_dart_and_are_rejected_by_pinocchio(
+    dart, pinocchio, write_urdf, brick_mesh
+):
     robot = Robot(write_urdf(MESH_ROBOT), fixed_base=False)
     thing = Mesh(name="brick", path=brick_mesh, scale=0.5, position=(2, 0, 0.05), mass=3.0)
     world = World([robot], objects=[thing], ground=Ground(), contacts="static")
@@ -72,7 +72,7 @@ def test_meshes_touch_in_dart_and_are_refused_by_pinocchio(dart, pinocchio, writ
         pinocchio.build(world)
 
 
-def test_bounding_shapes_hold_all_vertices():
+def test_bounding_shapes_contain_all_vertices():
     rng = np.random.default_rng(0)
     for _ in range(20):
         vertices = rng.normal(size=(50, 3)) * rng.uniform(0.1, 3, 3)
@@ -87,7 +87,7 @@ def test_bounding_shapes_hold_all_vertices():
         np.testing.assert_allclose(np.linalg.det(axes), 1.0)
 
 
-def test_feet_touch_instead_of_a_link_s_own_shapes(backend, write_urdf, brick_mesh):
+def test_feet_replace_the_shapes_of_their_links(backend, write_urdf, brick_mesh):
     path = write_urdf(MESH_ROBOT)
     robot = Robot(path, fixed_base=False, feet={"body": 0.07}, position=(0, 0, 0.08))
     with backend.build(World([robot], ground=Ground())) as simulation:
@@ -99,7 +99,7 @@ def test_feet_touch_instead_of_a_link_s_own_shapes(backend, write_urdf, brick_me
 
 
 @pytest.mark.parametrize("fixed_base", [True, False])
-def test_a_robot_begins_where_it_is_put(backend, bar, fixed_base):
+def test_a_robot_starts_at_its_pose(backend, bar, fixed_base):
     half = np.sqrt(0.5)
     robot = bar(fixed_base=fixed_base, position=(1, 2, 3), orientation=(0, 0, half, half))
     with backend.build(World([robot])) as simulation:
@@ -175,7 +175,7 @@ def test_broken_mesh_files_are_named(backend, tmp_path, name, content, words):
         backend.build(World(objects=[Mesh(name="m", path=path)], ground=Ground()))
 
 
-def test_two_bodies_of_one_name_are_refused(backend, bar):
+def test_duplicate_names_of_bodies_are_rejected(backend, bar):
     with pytest.raises(ModelError, match='same name "tip"'):
         backend.build(World([bar()], objects=[Sphere(name="tip", radius=0.1)]))
 
@@ -217,7 +217,7 @@ def test_two_bodies_of_one_name_are_refused(backend, bar):
         (lambda: Wrench("b", frame="moon"), "body, world"),
     ],
 )
-def test_descriptions_that_make_no_sense_are_refused(make, words):
+def test_invalid_descriptions_are_rejected(make, words):
     with pytest.raises(ConfigError, match=words):
         make()
 

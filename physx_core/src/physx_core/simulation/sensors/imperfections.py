@@ -179,6 +179,6 @@ class Errors:
         found[components.shifted] += error[components.shifts]
         if components.orientations.size:
             turns = from_rotation_vector_rows(error[components.turns])
-            at = components.orientations
-            found[at] = multiply_rows(seen[at], turns)
+            orientations = components.orientations
+            found[orientations] = multiply_rows(seen[orientations], turns)
         return found
