@@ -37,8 +37,8 @@ Each robot floats freely (or is fixed, if its root link has no mass), is loaded 
 shapes, and simulated for {steps} steps of 1 ms without torques from its neutral configuration.
 *Agreement* is the largest difference between the engines' accelerations in {states} random states,
 relative to the largest acceleration of the state. *dof* counts the joints' degrees of freedom,
-*mass* is in kg, *load* is the CPU time in ms, the minimum of {loads} loads. With meshes as *collisions*,
-`Robot(collisions="boxes")` or `"capsules"` is many times faster.
+*mass* is in kg, *load* is the CPU time in ms, the minimum of {loads} loads. With meshes as
+*collisions*, `Robot(collisions="boxes")` or `"capsules"` is many times faster.
 
 | robot | dof | mass | collisions | load dart, pinocchio | steps dart, pinocchio | agreement |
 |---|---|---|---|---|---|---|
