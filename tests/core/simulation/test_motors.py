@@ -112,7 +112,7 @@ def test_invalid_commands_are_rejected_as_a_whole():
 def test_invalid_values_are_rejected():
     with pytest.raises(ComponentNotFoundError, match='no joint "d".*It has: a, b, c'):
         Motors(Held(), WORLD, [Motor(joint="d")])
-    with pytest.raises(ConfigError, match='2 of motor on joint "a"'):
+    with pytest.raises(ConfigError, match='2 motors on joint "a"'):
         Motors(Held(), WORLD, [Motor(joint="a"), Motor(joint="a")])
     with pytest.raises(ConfigError, match='mode "servo"'):
         Motors(Held(("force", "servo", "force")), WORLD, [Motor(joint="b")])

@@ -199,14 +199,14 @@ def test_invalid_values_are_rejected():
         make(ContactSensor(name="x", body="body"))
     with pytest.raises(ConfigError, match="multiple of the physics' period"):
         make(Encoder(name="x", joint="a", period=1.5e-3))
-    with pytest.raises(ConfigError, match='2 of sensor "x"'):
+    with pytest.raises(ConfigError, match='2 sensors "x"'):
         make(Encoder(name="x", joint="a"), Encoder(name="x", joint="b"))
-    with pytest.raises(ConfigError, match="no sensor"):
+    with pytest.raises(ConfigError, match="no sensors"):
         make()
     with pytest.raises(ConfigError, match="default_rng"):
         make(Encoder(name="x", joint="a", noise=0.1))
     sensors = make(Encoder(name="x", joint="a"))
-    with pytest.raises(SimulationError, match="nothing yet"):
+    with pytest.raises(SimulationError, match="not measured yet"):
         sensors.read()
     with pytest.raises(ComponentNotFoundError, match='no sensor "y"'):
         sensors["y"]

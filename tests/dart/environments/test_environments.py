@@ -149,8 +149,8 @@ def test_invalid_predictions_are_named(drive):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"task": "dance"}, '"excite", "track"'),
-        ({"feedforward": "magic"}, '"network"'),
+        ({"task": "dance"}, "excite, track"),
+        ({"feedforward": "magic"}, "network"),
         ({"steps_per_sample": 0}, "steps_per_sample is 0"),
         ({"stiffness": [1.0, 2.0]}, "stiffness needs 9"),
         ({"frequencies": [2.0, 1.0]}, "frequencies"),

@@ -15,7 +15,7 @@ from physx_core import (
     Box, Ground, HeightField, JointSettings, Robot, Sphere, World, Wrench, plugins
 )
 from physx_core.errors import PhysxError
-from physx_core.simulation.backend import State
+from physx_core.simulation import State
 from physx_dart.environments.double_pendulum import URDF
 
 engine, seed, calls = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])

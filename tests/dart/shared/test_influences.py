@@ -125,7 +125,7 @@ def test_hooks_are_called_at_their_frames(backend, bar):
         simulation.remove_hook(hooks[1])
         simulation.step(6)
         assert frames == {1: [3, 4, 5, 6, 7, 8], 4: [4, 8, 12]}
-        with pytest.raises(SimulationError, match="is not a hook|not callable"):
+        with pytest.raises(SimulationError, match="is not a hook"):
             simulation.remove_hook(hooks[1])
 
 
@@ -135,7 +135,7 @@ def test_a_hook_may_set_commands_but_not_step_or_close(backend, bar):
         simulation.step(3)
         np.testing.assert_allclose(simulation.velocities(), [-1e-3], rtol=1e-8)
         simulation.add_hook(lambda s: s.step())
-        with pytest.raises(SimulationError, match="hook cannot call step"):
+        with pytest.raises(SimulationError, match="hook must not call step"):
             simulation.step()
     simulation = backend.build(World([bar()]))
     simulation.add_hook(lambda s: s.close())

@@ -163,7 +163,7 @@ def test_broken_inertias_are_named(backend, write_urdf, inertial):
     [
         ("bad.obj", "garbage", "cannot be read"),
         ("bad.stl", "", "cannot be read"),
-        ("bad.ply", "ply", "none of the formats"),
+        ("bad.ply", "ply", "not in one of the formats"),
         (None, None, "no mesh file"),
     ],
 )
@@ -176,16 +176,16 @@ def test_broken_mesh_files_are_named(backend, tmp_path, name, content, words):
 
 
 def test_duplicate_names_of_bodies_are_rejected(backend, bar):
-    with pytest.raises(ModelError, match='same name "tip"'):
+    with pytest.raises(ModelError, match='share the name "tip"'):
         backend.build(World([bar()], objects=[Sphere(name="tip", radius=0.1)]))
 
 
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: World(), "needs a robot, or an object"),
+        (lambda: World(), "needs a robot or a moving object"),
         (lambda: World(objects=[Sphere(name="s", radius=1, static=True)]), "needs a robot"),
-        (lambda: World(objects=[Sphere(name="ground", radius=1)]), '"ground" is taken'),
+        (lambda: World(objects=[Sphere(name="ground", radius=1)]), '"ground" is reserved'),
         (lambda: World(["robot.urdf"]), "is not a Robot"),
         (lambda: World(objects=[Sphere(name="s", radius=1)], period=0), "period"),
         (lambda: World(objects=[Sphere(name="s", radius=1)], gravity=(0, 1)), "gravity"),
@@ -204,7 +204,7 @@ def test_duplicate_names_of_bodies_are_rejected(backend, bar):
         (lambda: Robot("r.urdf", joints={"a": 3}), "JointSettings"),
         (lambda: JointSettings(mode="torque"), "force, position, servo, velocity"),
         (lambda: JointSettings(stiffness=-1), "stiffness"),
-        (lambda: Ground(normal=(0, 0, 0)), "no direction"),
+        (lambda: Ground(normal=(0, 0, 0)), "must not be 0"),
         (lambda: Stairs(steps=0), "steps"),
         (lambda: Stairs(rise=0), "rise"),
         (lambda: HeightField([[0.0, 1.0]]), "two axes"),
@@ -212,7 +212,7 @@ def test_duplicate_names_of_bodies_are_rejected(backend, bar):
         (lambda: HeightField(np.zeros((2, 2)), spacing=(1, 0)), "spacing"),
         (lambda: Wrench("b", force=(1, 2)), "shape"),
         (lambda: Wrench("b", duration=0), "duration"),
-        (lambda: Wrench("b", times=[0, 0]), "growing"),
+        (lambda: Wrench("b", times=[0, 0]), "increasing"),
         (lambda: Wrench("b", force=(np.inf, 0, 0)), "finite"),
         (lambda: Wrench("b", frame="moon"), "body, world"),
     ],

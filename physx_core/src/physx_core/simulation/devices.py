@@ -67,7 +67,7 @@ def check_unique(kind: str, names: Sequence[str]) -> None:
         ConfigError: If two names are equal, or there are none.
     """
     if not names:
-        raise ConfigError(f"There must be at least one {kind}.")
+        raise ConfigError(f"There are no {kind.split()[0]}.")
     for name in names:
         if names.count(name) > 1:
-            raise ConfigError(f'{names.count(name)} of the {kind}s have the name "{name}".')
+            raise ConfigError(f'There are {names.count(name)} {kind} "{name}".')

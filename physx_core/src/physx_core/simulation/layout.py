@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from physx_core.simulation.description import Wrench
+from physx_core.simulation.description.wrench import Wrench
 from physx_core.typing import Vector
 
 CONTACT = np.dtype(

@@ -69,13 +69,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
     lacks: ClassVar[frozenset[str]] = frozenset({"armature", "rk4"})
 
     def __init__(self, world: World) -> None:
-        """Build the world.
-
-        Raises:
-            ModelError: If a robot or mesh cannot be loaded; the message says why.
-            FeatureNotSupportedError: If the world needs a feature that DART does not have.
-            UnknownOptionError: If there is no detector or solver of that name.
-        """
+        """Build the world; errors are those of the backend's `build`."""
         detector, solver = world.detector or "dart", world.solver or "dantzig"
         for option, name, known in (
             ("detector", detector, tuple(_DETECTORS)),

@@ -14,7 +14,7 @@ import numpy as np
 
 from physx_core import Field, plugins
 from physx_core.components import Environment
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, UnknownOptionError
 from physx_core.simulation import Robot, Simulation, World
 from physx_core.typing import Sample, Vector
 from physx_dart.environments.trajectories import SmoothTrajectory
@@ -95,8 +95,12 @@ class ArmEnvironment(Environment):
             ConfigError: If an option is out of range.
         """
         super().__init__(**kwargs)
-        _check_choice("task", task, ("excite", "track"))
-        _check_choice("feedforward", feedforward, ("network", "none", "model", "gravity"))
+        for option, value, known in (
+            ("task", task, ("excite", "track")),
+            ("feedforward", feedforward, ("network", "none", "model", "gravity")),
+        ):
+            if value not in known:
+                raise UnknownOptionError(option, [str(value)], known)
         for name, count in (
             ("steps_per_sample", steps_per_sample),
             ("episode_steps", episode_steps),
@@ -320,12 +324,6 @@ class PinocchioArm(ArmEnvironment):
 def _package_dirs() -> dict[str, str]:
     folder = example_data_dir()
     return {} if folder is None else {EXAMPLE_DATA: str(folder)}
-
-
-def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    if value not in choices:
-        known = ", ".join(f'"{choice}"' for choice in choices)
-        raise ConfigError(f"{name} is {value!r} but must be one of {known}.")
 
 
 def _gains(name: str, given: Sequence[float]) -> Vector:

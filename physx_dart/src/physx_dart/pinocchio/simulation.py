@@ -55,13 +55,7 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
     )
 
     def __init__(self, world: World) -> None:
-        """Build the world.
-
-        Raises:
-            ModelError: If a robot or mesh cannot be loaded; the message says why.
-            FeatureNotSupportedError: If the world needs a feature that the engine does not have.
-            UnknownOptionError: If there is no solver of that name.
-        """
+        """Build the world; errors are those of the backend's `build`."""
         solver = ImpulseSolver(world.solver or "pgs")
         parts = read_parts(world)
         self._check_features(parts)

@@ -28,11 +28,6 @@ class Ground:
     normal: tuple[float, ...] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Check the values and scale the normal to length 1.
-
-        Raises:
-            ConfigError: If a value is out of range.
-        """
         checks.options(checks.not_negative, "Ground.", self, "friction", "restitution")
         checks.finite("Ground.height", self.height)
         normal = checks.vector("Ground.normal", self.normal, 3)
@@ -67,11 +62,6 @@ class Stairs:
     restitution: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ConfigError: If a value is out of range.
-        """
         checks.options(checks.not_negative, "Stairs.", self, "friction", "restitution")
         if not isinstance(self.steps, int) or self.steps < 1:
             raise ConfigError(f"Stairs.steps is {self.steps!r} but must be an integer from 1.")
@@ -112,11 +102,6 @@ class HeightField:
     restitution: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values and copy the heights.
-
-        Raises:
-            ConfigError: If a value is out of range.
-        """
         checks.options(checks.not_negative, "HeightField.", self, "friction", "restitution")
         try:
             heights = np.array(self.heights, np.float64)

@@ -36,11 +36,6 @@ class WorldObject:
     restitution: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ConfigError: If a value is out of range.
-        """
         kind = type(self).__name__
         checks.name(kind.lower(), self.name)
         where = f'{kind} "{self.name}": '
@@ -62,11 +57,6 @@ class Box(WorldObject):
     size: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ConfigError: If a value is out of range.
-        """
         super().__post_init__()
         size = checks.vector(f'Box "{self.name}": size', self.size, 3)
         for length in size:
@@ -128,11 +118,6 @@ class Mesh(WorldObject):
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ConfigError: If a value is out of range.
-        """
         super().__post_init__()
         if not isinstance(self.path, (str, Path)):
             raise ConfigError(f'Mesh "{self.name}": path is {self.path!r} but must be a path.')

@@ -41,11 +41,6 @@ class JointSettings:
     armature: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ConfigError: If the mode does not exist or a value is out of range.
-        """
         if self.mode not in get_args(Mode):
             raise UnknownOptionError("JointSettings.mode", [str(self.mode)], get_args(Mode))
         checks.positive("JointSettings.gain", self.gain)
@@ -58,7 +53,7 @@ class JointSettings:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot from a URDF file.
+    """A robot from a URDF file; links and joints of its options must exist there to build a world.
 
     Attributes:
         urdf: Path of the URDF file.
@@ -92,11 +87,6 @@ class Robot:
     joints: Mapping[str, JointSettings] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check the values; names of links and joints are checked when a simulation is built.
-
-        Raises:
-            ConfigError: If a value is out of range.
-        """
         checks.name("robot", self.name)
         where = f'Robot "{self.name}": '
         if not isinstance(self.urdf, (str, Path)):

@@ -45,11 +45,6 @@ class World:
     solver: str | None = None
 
     def __post_init__(self) -> None:
-        """Check the description.
-
-        Raises:
-            ConfigError: If nothing can move, two things share a name, or a value is out of range.
-        """
         kinds: tuple[tuple[type, Sequence[object]], ...]
         kinds = ((Robot, self.robots), (WorldObject, self.objects))
         for kind, things in kinds:

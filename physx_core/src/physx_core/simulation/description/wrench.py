@@ -41,11 +41,6 @@ class Wrench:
     times: NDArray[np.float64] | tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Check the values and copy the arrays.
-
-        Raises:
-            ConfigError: If a value is out of range.
-        """
         where = f"Wrench on {self.body!r}: "
         if not isinstance(self.body, str):
             raise ConfigError(f"{where}body must be a name.")

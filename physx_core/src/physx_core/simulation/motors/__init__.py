@@ -1,8 +1,4 @@
-"""Motors, which turn commands into joint torques, the same on every engine."""
+"""Motors, which turn commands into joint torques, the same on every engine.
 
-from __future__ import annotations
-
-from physx_core.simulation.motors.motor import Motor, with_rotors
-from physx_core.simulation.motors.motors import Motors, MotorState
-
-__all__ = ["Motor", "MotorState", "Motors", "with_rotors"]
+A value out of range is a `ConfigError` as soon as a motor is described.
+"""

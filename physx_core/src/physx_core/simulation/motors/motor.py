@@ -10,7 +10,8 @@ from typing import Any
 
 from physx_core import checks
 from physx_core.errors import ConfigError
-from physx_core.simulation.description import JointSettings, World
+from physx_core.simulation.description.robot import JointSettings
+from physx_core.simulation.description.world import World
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,11 +65,6 @@ class Motor:
     period: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ConfigError: If a value is out of range.
-        """
         where = f'Motor of "{self.joint}": '
         if not isinstance(self.joint, str):
             raise ConfigError(f"{where}joint must be a name.")

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from physx_core.errors import ConfigError, FeatureNotSupportedError, SimulationError
 from physx_core.simulation.backend import Simulation
-from physx_core.simulation.description import World
+from physx_core.simulation.description.world import World
 from physx_core.simulation.devices import as_slice, check_unique, places_of, steps_of
 from physx_core.simulation.motors.motor import Motor, armature_in
 from physx_core.simulation.motors.shaft import Friction, Rotors, TorqueLimits, column
@@ -80,7 +80,7 @@ class Motors:
         self.motors = tuple(motors)
         self.joints = tuple(motor.joint for motor in motors)
         layout, period = simulation.layout, simulation.period
-        check_unique("motor on joint", self.joints)
+        check_unique("motors on joint", self.joints)
         self._places = places_of("joint", self.joints, layout.joints)
         self._q = places_of("joint", self.joints, layout.position_index)
         self._v = places_of("joint", self.joints, layout.velocity_index)

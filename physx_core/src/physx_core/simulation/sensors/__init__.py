@@ -1,24 +1,4 @@
-"""Sensors of a robot, with their imperfections, the same on every engine."""
+"""Sensors of a robot, with their imperfections, the same on every engine.
 
-from __future__ import annotations
-
-from physx_core.simulation.sensors.sensor import (
-    ContactSensor,
-    EffortSensor,
-    Encoder,
-    ForceTorqueSensor,
-    Imu,
-    Sensor,
-)
-from physx_core.simulation.sensors.sensors import Sensors, SensorState
-
-__all__ = [
-    "ContactSensor",
-    "EffortSensor",
-    "Encoder",
-    "ForceTorqueSensor",
-    "Imu",
-    "Sensor",
-    "SensorState",
-    "Sensors",
-]
+A value out of range is a `ConfigError` as soon as a sensor is described.
+"""

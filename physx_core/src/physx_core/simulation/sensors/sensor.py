@@ -53,11 +53,6 @@ class Sensor:
     interpolation: int = 0
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ConfigError: If a value is out of range.
-        """
         kind = type(self).__name__
         if not self.quantities:
             raise ConfigError(f"{kind} is not a kind of sensor; use one of its subclasses.")
@@ -121,11 +116,6 @@ class Encoder(Sensor):
     reduction: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ConfigError: If a value is out of range.
-        """
         super().__post_init__()
         if not checks.finite(f'Encoder "{self.name}": reduction', self.reduction):
             raise ConfigError(f'Encoder "{self.name}": reduction must not be 0.')
@@ -156,11 +146,6 @@ class Imu(Sensor):
     rotation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ConfigError: If a value is out of range.
-        """
         super().__post_init__()
         where = f'Imu "{self.name}": '
         object.__setattr__(self, "position", checks.vector(f"{where}position", self.position, 3))

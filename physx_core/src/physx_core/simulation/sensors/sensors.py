@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from physx_core.errors import ComponentNotFoundError, ConfigError, SimulationError
 from physx_core.simulation.backend import Simulation
-from physx_core.simulation.description import World
+from physx_core.simulation.description.world import World
 from physx_core.simulation.devices import check_unique, steps_of
+from physx_core.simulation.sensors.ideal import groups_of
 from physx_core.simulation.sensors.imperfections import Components, Delays, Errors, Mask
 from physx_core.simulation.sensors.sensor import Sensor
-from physx_core.simulation.sensors.sensor_groups import groups_of
 from physx_core.typing import Vector
 
 
@@ -95,7 +95,7 @@ class Sensors:
         kinds = list(dict.fromkeys(type(sensor) for sensor in sensors))
         sensors = sorted(sensors, key=lambda sensor: kinds.index(type(sensor)))
         self.sensors = tuple(sensors)
-        check_unique("sensor", [sensor.name for sensor in sensors])
+        check_unique("sensors", [sensor.name for sensor in sensors])
         every = [
             steps_of(f'{type(each).__name__} "{each.name}": period', each.period, simulation.period)
             for each in sensors
