@@ -163,7 +163,7 @@ def test_an_interrupted_batch_leaves_no_answer_for_the_next(build, monkeypatch, 
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("physx_dart.batch.processes.computed", interrupt)
+        patch.setattr("physx_dart.batch.processes.compute", interrupt)
         with pytest.raises(KeyboardInterrupt):
             dynamics(*states)
     assert not any(map(there, started))

@@ -39,7 +39,7 @@ def chain(kind="continuous", extra=""):
         (chain("revolute", '<limit lower="0" upper="x" effort="1" velocity="1"/>'), 'upper="x"'),
         (chain("revolute", '<limit effort="-1" velocity="1"/>'), 'effort="-1"'),
         (chain("continuous", '<axis xyz="0 0 0"/>'), 'axis "0 0 0"'),
-        (chain("fixed"), "no joint that moves"),
+        (chain("fixed"), "no movable joint"),
         (
             robot(
                 *(LINK.format(name) for name in "abc"),

@@ -20,7 +20,6 @@ import numpy as np
 from physx_core import Closeable
 from physx_core.errors import SimulationError
 from physx_core.typing import Vector
-from physx_dart.batch.batches import BatchDynamics
 from physx_dart.batch.worker import (
     DONE,
     FORWARD,
@@ -30,6 +29,7 @@ from physx_dart.batch.worker import (
     compute,
     describe_models,
 )
+from physx_dart.shared.algorithms import Algorithms
 
 _LEAST_ROWS = 16
 """Least number of rows for which using a process pays off."""
@@ -37,7 +37,7 @@ _PATIENCE = 5.0
 """Time in s that a process which closed its connection may take to exit."""
 
 
-class ParallelBatchDynamics(Closeable):
+class ParallelDynamics(Closeable):
     """Batches of which this process computes some rows and other processes the rest.
 
     The other processes start when they are first needed. They end when this is closed or garbage
@@ -45,8 +45,8 @@ class ParallelBatchDynamics(Closeable):
     computes all rows itself.
     """
 
-    def __init__(self, batches: BatchDynamics) -> None:
-        self._batches = batches
+    def __init__(self, algorithms: Algorithms) -> None:
+        self._algorithms = algorithms
         self._owner = os.getpid()
         self._workers: list[_Worker] = []
         self._memory: SharedRows | None = None
@@ -79,7 +79,7 @@ class ParallelBatchDynamics(Closeable):
     def _compute(self, kind: int, states: tuple[Vector, ...], processes: int) -> Vector:
         shares = min(processes, len(states[0]) // _LEAST_ROWS)
         if shares < 2 or os.getpid() != self._owner:
-            return compute(self._batches, kind, states)
+            return compute(self._algorithms, kind, states)
         try:
             return self._compute_shared(kind, states, shares)
         except BaseException:  # there may be pending replies that nobody waits for
@@ -98,7 +98,7 @@ class ParallelBatchDynamics(Closeable):
         for worker, begin, end in zip(workers, ends[:-1], ends[1:], strict=True):
             worker.ask(REQUEST.pack(kind, rows, begin, end))
         found = np.empty(results.shape)
-        found[..., :mine, :] = compute(self._batches, kind, tuple(x[:mine] for x in states))
+        found[..., :mine, :] = compute(self._algorithms, kind, tuple(x[:mine] for x in states))
         for worker in workers:
             worker.wait()
         found[..., mine:, :] = results[..., mine:, :]
@@ -108,10 +108,10 @@ class ParallelBatchDynamics(Closeable):
         """Return `count` other processes, and the memory that they share."""
         if self._memory is None:
             file = self._held.enter_context(_anonymous_file())
-            self._memory = SharedRows(file.fileno(), self._batches.nq, self._batches.nv)
+            self._memory = SharedRows(file.fileno(), self._algorithms.nq, self._algorithms.nv)
         new = [_Worker(self._memory.file, self._held) for _ in range(count - len(self._workers))]
         for worker in new:
-            worker.ask(describe_models(self._batches))
+            worker.ask(describe_models(self._algorithms))
         self._workers += new
         return self._workers[:count], self._memory
 

@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio
 
 from physx_core.typing import Vector
-from physx_dart.batch.batches import BatchDynamics, MoverBatchDynamics
+from physx_dart.shared.algorithms import Algorithms, MoverAlgorithms
 from physx_dart.shared.resistance import Resistance
 
 FORWARD, GRADIENTS = range(2)
@@ -61,27 +61,28 @@ class SharedRows:
         return (positions, *others[:3]), others[3:]
 
 
-def compute(batches: BatchDynamics, kind: int, states: tuple[Vector, ...]) -> Vector:
+def compute(algorithms: Algorithms, kind: int, states: tuple[Vector, ...]) -> Vector:
     """Return the accelerations, shape (n, nv), or the gradients, shape (3, n, nv), of states."""
-    return (batches.forward if kind == FORWARD else batches.gradients)(*states)
+    call = algorithms.forward_batch if kind == FORWARD else algorithms.gradients_batch
+    return call(*states)
 
 
-def describe_models(batches: BatchDynamics) -> bytes:
-    """Return a line of text from which `batches_of` rebuilds the batches; it contains no code."""
+def describe_models(algorithms: Algorithms) -> bytes:
+    """Return a line of text from which `algorithms_of` rebuilds them; it contains no code."""
     movers = [
-        (each.model.saveToString(), each.resistance.table.tolist()) for each in batches.movers
+        (each.model.saveToString(), each.resistance.table.tolist()) for each in algorithms.movers
     ]
     return json.dumps(movers).encode("ascii") + b"\n"
 
 
-def batches_of(line: bytes) -> BatchDynamics:
-    """Return the batches that a line of `describe_models` describes."""
+def algorithms_of(line: bytes) -> Algorithms:
+    """Return the algorithms, without bodies, that a line of `describe_models` describes."""
     movers = []
     for text, table in json.loads(line):
         model = pinocchio.Model()
         model.loadFromString(text)
-        movers.append(MoverBatchDynamics(model, Resistance(np.array(table).reshape(5, model.nv))))
-    return BatchDynamics(movers)
+        movers.append(MoverAlgorithms(model, Resistance(np.array(table).reshape(5, model.nv))))
+    return Algorithms(movers, np.zeros((0, 7)))
 
 
 def serve(link: socket.socket, file: int) -> None:
@@ -95,13 +96,13 @@ def serve(link: socket.socket, file: int) -> None:
         line = requests.readline()
         if not line.endswith(b"\n"):
             return
-        batches = batches_of(line)
-        memory = SharedRows(file, batches.nq, batches.nv)
+        algorithms = algorithms_of(line)
+        memory = SharedRows(file, algorithms.nq, algorithms.nv)
         while len(request := requests.read(REQUEST.size)) == REQUEST.size:
             kind, rows, begin, end = REQUEST.unpack(request)
             states, found = memory.arrays(kind, rows)
             mine = tuple(each[begin:end] for each in states)
-            found[..., begin:end, :] = compute(batches, kind, mine)
+            found[..., begin:end, :] = compute(algorithms, kind, mine)
             link.sendall(DONE)
 
 

@@ -32,12 +32,21 @@ class MoverAlgorithms:
         resistance: Resistance of its joints; part of the dynamics.
     """
 
-    def __init__(self, mover: Mover, gravity: tuple[float, ...]) -> None:
-        self.resistance = Resistance.of(mover)
-        self.model = load_model(mover, gravity, armature=self.resistance.armature)
-        self.data = self.model.createData()
-        self.frames = frames_of(self.model, mover)
-        self._first = 1 if mover.fixed_base else 2
+    def __init__(self, model: Any, resistance: Resistance, frames: Sequence[int] = ()) -> None:
+        self.model, self.resistance, self.frames = model, resistance, frames
+        self.data, self._pool = model.createData(), pinocchio.ModelPool(model, 1)
+        self._first = 1 if model.nq == model.nv else 2  # a floating base is a joint, too
+
+    @classmethod
+    def load(cls, mover: Mover, gravity: tuple[float, ...]) -> Self:
+        """Return the algorithms of a robot or object.
+
+        Raises:
+            ModelError: If Pinocchio cannot load it.
+        """
+        resistance = Resistance.of(mover)
+        model = load_model(mover, gravity, armature=resistance.armature)
+        return cls(model, resistance, frames_of(model, mover))
 
     def write_motion(self, frame: int, out: Vector) -> None:
         """Write pose, velocity, and acceleration of a frame, after `pinocchio.forwardKinematics`.
@@ -117,6 +126,41 @@ class MoverAlgorithms:
         by_v -= inverse * self.resistance.damping
         return by_q, by_v, inverse
 
+    def forward_batch(self, q: Vector, v: Vector, tau: Vector) -> Vector:
+        """Return `forward` of many states, shape (n, nv); each row is a state."""
+        out = np.zeros((self.model.nv, len(q)), order="F")
+        if out.size:
+            resisted = tau - self.resistance.torques(q, v)
+            columns = [np.ascontiguousarray(rows).T for rows in (q, v, resisted)]
+            pinocchio.abaInParallel(1, self._pool, *columns, out)
+        return out.T
+
+    def gradients_batch(self, q: Vector, v: Vector, a: Vector, weights: Vector) -> Vector:
+        """Return gradients of ``weights @ accelerations`` of many states, shape (3, n, nv).
+
+        With r(q, v, a) the torques of the inverse dynamics and M its derivative by a, they are
+        x = weights / M by the torques, -x dr/dq by the positions and -x dr/dv by the velocities.
+        The derivatives of the inverse dynamics take two thirds of the time of those of the forward
+        dynamics, and yield M as well.
+        """
+        model, data, resistance = self.model, self.data, self.resistance
+        derive, dot = pinocchio.computeRNEADerivatives, np.dot
+        decompose, solve = pinocchio.cholesky.decompose, pinocchio.cholesky.solve
+        found = np.empty((3, *weights.shape))
+        by_q, by_v, by_tau = found
+        for q_i, v_i, a_i, given, to_q, to_v, to_tau in zip(
+            q, v, a, weights, by_q, by_v, by_tau, strict=True
+        ):
+            r_by_q, r_by_v, _ = derive(model, data, q_i, v_i, a_i)
+            decompose(model, data)
+            to_tau[:] = solve(model, data, given)
+            dot(to_tau, r_by_q, out=to_q)
+            dot(to_tau, r_by_v, out=to_v)
+        by_q += by_tau * resistance.stiffness
+        by_v += by_tau * resistance.damping
+        np.negative(found[:2], out=found[:2])
+        return found
+
 
 class Algorithms:
     """Pinocchio's algorithms for a world; arrays are not validated.
@@ -125,19 +169,23 @@ class Algorithms:
 
     Attributes:
         movers: Algorithms of each robot, then of each moving object.
+        nq: Length of the positions.
+        nv: Length of the velocities.
     """
 
-    def __init__(self, parts: Parts) -> None:
-        self.movers = tuple(MoverAlgorithms(each, parts.world.gravity) for each in parts.movers)
+    def __init__(self, movers: Sequence[MoverAlgorithms], statics: Vector) -> None:
+        """Combine movers with static things, whose poses have the shape (statics, 7)."""
+        self.movers = tuple(movers)
         self._slices: list[tuple[MoverAlgorithms, slice, slice]] = []
         nq = nv = 0
         for each in self.movers:
             ends = nq + each.model.nq, nv + each.model.nv
             self._slices.append((each, slice(nq, ends[0]), slice(nv, ends[1])))
             nq, nv = ends
+        self.nq, self.nv = nq, nv
         self._links = [(i, frame) for i, each in enumerate(self.movers) for frame in each.frames]
-        self._still = np.zeros((len(parts.statics), 19))
-        self._still[:, :7] = static_poses(parts)
+        self._still = np.zeros((len(statics), 19))
+        self._still[:, :7] = statics
 
     @classmethod
     def of(cls, world: World) -> Self:
@@ -146,7 +194,17 @@ class Algorithms:
         Raises:
             ModelError: If a robot cannot be loaded; the message says why.
         """
-        return cls(read_parts(world))
+        return cls.of_parts(read_parts(world))
+
+    @classmethod
+    def of_parts(cls, parts: Parts) -> Self:
+        """Return the algorithms of the parts of a world.
+
+        Raises:
+            ModelError: If Pinocchio cannot load a robot.
+        """
+        movers = [MoverAlgorithms.load(each, parts.world.gravity) for each in parts.movers]
+        return cls(movers, static_poses(parts))
 
     def body_poses(self, q: Vector, bodies: Sequence[int]) -> Vector:
         """Return the poses of bodies, shape (bodies, 7), by their places in `Layout.names`."""
@@ -225,7 +283,7 @@ class Algorithms:
 
     def jacobian(self, body: int, q: Vector, point: Vector) -> Vector:
         """Return the Jacobian, shape (6, nv), of a point of a body, by its place in the layout."""
-        whole = np.zeros((6, sum(each.model.nv for each in self.movers)))
+        whole = np.zeros((6, self.nv))
         for each, a, b in self._slices:
             if body < len(each.frames):
                 whole[:, b] = each.jacobian(body, q[a], point)
@@ -241,11 +299,23 @@ class Algorithms:
         by_q, by_v, by_tau = (self._diagonal(blocks) for blocks in zip(*found, strict=True))
         return by_q, by_v, by_tau
 
+    def forward_batch(self, q: Vector, v: Vector, tau: Vector) -> Vector:
+        """Return `forward_dynamics` of many states, shape (n, nv); each row is a state."""
+        found = [x.forward_batch(q[:, a], v[:, b], tau[:, b]) for x, a, b in self._slices]
+        return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
+
+    def gradients_batch(self, q: Vector, v: Vector, a: Vector, weights: Vector) -> Vector:
+        """Return gradients of weighted sums of the accelerations, shape (3, n, nv)."""
+        found = np.empty((3, *weights.shape))
+        for each, i, j in self._slices:
+            found[:, :, j] = each.gradients_batch(q[:, i], v[:, j], a[:, j], weights[:, j])
+        return found
+
     def _diagonal(self, blocks: Any) -> Vector:
         """Return a matrix with square blocks along its diagonal."""
         if len(self.movers) == 1:
             return blocks[0]
-        whole = np.zeros((sum(map(len, blocks)),) * 2)
+        whole = np.zeros((self.nv, self.nv))
         begin = 0
         for block in blocks:
             end = begin + len(block)

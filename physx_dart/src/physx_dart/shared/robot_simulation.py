@@ -32,7 +32,7 @@ from physx_dart.shared.parts import Parts, layout_of
 from physx_dart.shared.reach import Reach
 
 if TYPE_CHECKING:
-    from physx_dart.batch.processes import ParallelBatchDynamics
+    from physx_dart.batch.processes import ParallelDynamics
     from physx_dart.shared.algorithms import Algorithms
 
 _FASTEST = 1e8
@@ -76,7 +76,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._joints = [place.joints for place in places]
         self._links = [(robot, link) for robot in robots for link in range(len(robot.model.links))]
         self._made_algorithms: Algorithms | None = None
-        self._made_batches: ParallelBatchDynamics | None = None
+        self._made_batches: ParallelDynamics | None = None
         self._reaches: dict[int, Reach] = {}
         for robot in robots:
             robot.write(robot.neutral(), np.zeros(robot.nv))
@@ -525,13 +525,11 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return q, check("velocities", velocities), check(name, values)
 
     @property
-    def _batches(self) -> ParallelBatchDynamics:
+    def _batches(self) -> ParallelDynamics:
         if self._made_batches is None:
-            from physx_dart.batch.batches import BatchDynamics, MoverBatchDynamics
-            from physx_dart.batch.processes import ParallelBatchDynamics
+            from physx_dart.batch.processes import ParallelDynamics
 
-            movers = [MoverBatchDynamics(x.model, x.resistance) for x in self._algorithms.movers]
-            self._made_batches = ParallelBatchDynamics(BatchDynamics(movers))
+            self._made_batches = ParallelDynamics(self._algorithms)
         return self._made_batches
 
     @property
@@ -539,7 +537,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         if self._made_algorithms is None:
             from physx_dart.shared.algorithms import Algorithms  # its library loads slowly
 
-            self._made_algorithms = Algorithms(self.parts)
+            self._made_algorithms = Algorithms.of_parts(self.parts)
         return self._made_algorithms
 
     def _check_open(self) -> None:

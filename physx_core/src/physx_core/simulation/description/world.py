@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from physx_core import checks
 from physx_core.errors import ConfigError, UnknownOptionError
@@ -65,10 +65,7 @@ class World:
             )
         checks.positive("World.period", self.period)
         object.__setattr__(self, "gravity", checks.vector("World.gravity", self.gravity, 3))
-        for option, known in (
-            ("contacts", ("all", "static", "none")),
-            ("integrator", ("euler", "rk4")),
-        ):
-            value = getattr(self, option)
+        for option, kind in (("contacts", Contacts), ("integrator", Integrator)):
+            value, known = getattr(self, option), get_args(kind)
             if value not in known:
                 raise UnknownOptionError(f"World.{option}", [str(value)], known)
