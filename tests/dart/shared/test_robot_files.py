@@ -146,7 +146,7 @@ def test_joints_are_in_the_order_of_the_tree(backend, write_urdf):
 
 
 def test_duplicate_names_of_robots_are_rejected(bar):
-    with pytest.raises(ConfigError, match="differ"):
+    with pytest.raises(ConfigError, match="distinct names"):
         World([bar(), bar()])
 
 
