@@ -1,4 +1,4 @@
-"""Descriptions of motors, their torque limits, and what is refused."""
+"""Descriptions of motors, their torque limits, and rejected values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensors on signals that are known: delay, jitter, noise, periods; and what is refused."""
+"""Sensors on known signals: delay, jitter, noise, periods, and rejected values."""
 
 from __future__ import annotations
 

@@ -47,6 +47,6 @@ def test_without_backends_it_names_the_package_to_install(only, capsys):
 
 def test_it_takes_no_options(capsys):
     assert main(["robots", "--fast"]) == 1
-    assert "takes no options" in capsys.readouterr().err
+    assert "takes no arguments" in capsys.readouterr().err
     assert main(["robots", "--help"]) == 0
     assert "usage: physx robots" in capsys.readouterr().out

@@ -106,7 +106,7 @@ def test_feed_forward_makes_the_arm_follow(arm, drive):
 
 def test_predictions_act_in_their_own_period(drive):
     model = drive(DartArm, 100, task="track", feedforward="model")
-    # A network that is exact gives the same motion, bit for bit, whatever its field is called.
+    # An exact network gives the same motion, bit for bit, whatever the name of its field.
     for field in ("torque", "prediction"):
         network = drive(
             DartArm, 100, predict=lambda sample, f=field: {f: sample["torque"]}, task="track"

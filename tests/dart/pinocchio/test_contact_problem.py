@@ -1,4 +1,4 @@
-"""Impulses of contacts and of rows with bounds, by the conditions that define them."""
+"""Impulses of contacts and of rows with bounds against the conditions that define them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from physx_dart.pinocchio.solver import ImpulseSolver
 
 
 def random_problem(rng, points, limits, bounded, spare):
-    """Return a problem of so many points and rows, of a body with few or many directions."""
+    """Return a problem of some points and rows, of a body with few or many directions."""
     size = 3 * points + limits + bounded
     root = rng.normal(size=(size, size + spare))
     friction = rng.uniform(0.0, 1.0, points)

@@ -1,4 +1,4 @@
-"""The solver of limits and friction, by the conditions that define its solution."""
+"""The solver of limits and friction against the conditions that define its solution."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How links and objects move: poses, velocities and accelerations of the last step."""
+"""Motions of links and objects: poses, velocities, and accelerations of the last step."""
 
 from __future__ import annotations
 

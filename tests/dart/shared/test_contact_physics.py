@@ -1,4 +1,4 @@
-"""Contacts by known physics: rest, friction, bounce, on every detector and solver."""
+"""Contacts against known physics: rest, friction, restitution, on every detector and solver."""
 
 from __future__ import annotations
 

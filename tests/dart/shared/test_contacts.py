@@ -1,4 +1,4 @@
-"""The records of contacts and rays, and what an engine lacks."""
+"""Records of contacts and rays, and features that an engine lacks."""
 
 from __future__ import annotations
 

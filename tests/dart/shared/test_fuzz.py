@@ -1,4 +1,4 @@
-"""Thousands of random calls, most of them wrong: each returns or raises an error of physx."""
+"""Thousands of random calls, most of them invalid: each returns or raises an error of physx."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def world():
     return World([arm], objects=things, ground=ground, contacts=contacts, detector=detector)
 
 
-counts = {"returned": 0, "refused": 0, "built": 0}
+counts = {"returned": 0, "rejected": 0, "built": 0}
 simulation, kept = None, []
 for _ in range(calls):
     if simulation is None or rng.random() < 0.004:
@@ -127,7 +127,7 @@ for _ in range(calls):
         counts["returned"] += 1
     except PhysxError as error:
         assert len(str(error)) > 10, error
-        counts["refused"] += 1
+        counts["rejected"] += 1
     if rng.random() < 0.01:
         kept.clear()
         gc.collect()
@@ -150,8 +150,8 @@ def campaign(engine, seed, calls):
     assert done.returncode == 0, done.stderr[-3000:]
     counts = json.loads(done.stdout.splitlines()[-1])
     assert counts["built"] > calls / 500
-    assert counts["returned"] + counts["refused"] > 0.9 * calls
-    assert min(counts["returned"], counts["refused"]) > calls / 5
+    assert counts["returned"] + counts["rejected"] > 0.9 * calls
+    assert min(counts["returned"], counts["rejected"]) > calls / 5
 
 
 @pytest.mark.parametrize("engine", ["dart", "pinocchio"])

@@ -1,4 +1,4 @@
-"""Wrenches, hooks, actuators and springs; velocities of bodies and derivatives."""
+"""Wrenches, hooks, actuators, and springs; velocities of bodies, and derivatives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The same calls give the same bits, in a new process and after restore."""
+"""Reproducibility bit for bit, in a new process and after restore."""
 
 from __future__ import annotations
 

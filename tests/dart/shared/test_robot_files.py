@@ -1,4 +1,4 @@
-"""What the loader takes, and what it says where it does not."""
+"""Loading of URDF files: errors of broken ones, meshes, and the order of joints."""
 
 from __future__ import annotations
 

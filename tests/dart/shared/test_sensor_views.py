@@ -1,4 +1,4 @@
-"""Measurements and torques in memory that stays, and what runs between the steps."""
+"""Permanent views of measurements and torques, and hooks that run between the steps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One engine at a time: physics that is known by hand, and what goes wrong."""
+"""A single engine: physics with known solutions, and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a world may be made of: shapes of robots and objects, and what is refused and why."""
+"""Descriptions of worlds: shapes of robots and objects, and errors of invalid ones."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ FEATURES = {
     "body_contacts": "contacts between moving things",
     "contacts": "contacts with static things",
     "derivatives": "derivatives of the forward dynamics",
-    "exact_restore": "restore goes on bit for bit",
+    "exact_restore": "restore continues bit for bit",
     "forward_dynamics": "forward dynamics of any state",
     "hooks": "functions called before physics steps",
     "inverse_dynamics": "inverse dynamics of any state",
@@ -27,4 +27,4 @@ FEATURES = {
     "springs": "springs and damping in joints",
     "wrenches": "external forces",
 }
-"""Every feature that a simulation's `features` may name, and what it means."""
+"""Every feature that a simulation may have, with its meaning."""

@@ -11,8 +11,8 @@ from physx_core.simulation import RobotInfo
 _HELP = """usage: physx robots
 
 Lists the robots that can be given by name, as in Robot("cartpole"), with the degrees of freedom of
-their joints (a floating base has 6 more), their mass, and what of them touches other things. Where
-meshes do, Robot(collisions="boxes") or "capsules" is many times faster."""
+their joints (a floating base has 6 more), their mass, and the kind of their collision shapes. With
+meshes, Robot(collisions="boxes") or "capsules" is many times faster."""
 
 
 def run(words: Sequence[str]) -> None:
@@ -25,7 +25,7 @@ def run(words: Sequence[str]) -> None:
         print(_HELP)
         return
     if words:
-        raise UsageError(f"physx robots takes no options, not {' '.join(words)}.")
+        raise UsageError(f"physx robots takes no arguments but got {' '.join(words)}.")
     robots = {info.path: info for info in _robots()}
     if not robots:
         print("No installed backend knows robots by name. To install one: pip install physx-dart")
@@ -34,7 +34,7 @@ def run(words: Sequence[str]) -> None:
 
 
 def _robots() -> Iterator[RobotInfo]:
-    """Return the robots of all backends; of one that is broken just its error is printed."""
+    """Return the robots of all backends; print the error of a broken backend."""
     for name in plugins.available():
         try:
             backends = plugins.load(name).components.get("backend", {})

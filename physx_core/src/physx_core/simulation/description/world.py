@@ -65,7 +65,10 @@ class World:
             )
         checks.positive("World.period", self.period)
         object.__setattr__(self, "gravity", checks.vector("World.gravity", self.gravity, 3))
-        for option, kind in (("contacts", Contacts), ("integrator", Integrator)):
-            value, known = getattr(self, option), get_args(kind)
+        for option, known in (
+            ("contacts", get_args(Contacts)),
+            ("integrator", get_args(Integrator)),
+        ):
+            value = getattr(self, option)
             if value not in known:
                 raise UnknownOptionError(f"World.{option}", [str(value)], known)
