@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import importlib.util
 import os
 import sys
@@ -35,15 +34,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
-    if not words or words[0] in ("-h", "--help"):
-        print(_overview())
-        return 0
-    if words[0] == "--version":
-        from physx_core import __version__
-
-        print(f"physx {__version__}")
-        return 0
     try:
+        if not words or words[0] in ("-h", "--help"):
+            print(_overview())
+            return 0
+        if words[0] == "--version":
+            from physx_core import __version__
+
+            print(f"physx {__version__}")
+            return 0
         return _run(words[0], words[1:])
     except PhysxError as error:
         if debug:
@@ -106,10 +105,10 @@ def _summary(entries: list[EntryPoint]) -> str:
             return f"(broken: there is no module {package})"
         folders = spec.submodule_search_locations or []
         path = Path(folders[0], *module).with_suffix(".py") if module else Path(spec.origin or "")
-        text = ast.get_docstring(ast.parse(path.read_text())) or ""
-    except (ImportError, OSError, IndexError, SyntaxError, ValueError) as error:
+        line = path.read_text().lstrip().partition("\n")[0]
+    except (ImportError, OSError, IndexError, ValueError) as error:
         return f"(broken: {error})"  # a broken package breaks its own command only
-    return text.partition("\n")[0].partition(": ")[2].rstrip(".")
+    return line.partition(": ")[2].rstrip('."') if line.startswith('"""') else ""
 
 
 def _message(error: PhysxError, debug: bool) -> str:

@@ -48,11 +48,13 @@ def _read_entries(
     """Read the metadata of all packages, which takes some ms; cached until one is installed."""
     from importlib.metadata import entry_points
 
-    # An editable package can be listed twice by its own metadata: one owner counts once.
-    found: dict[str, dict[str, EntryPoint]] = {}
-    for entry in entry_points(group=group):
-        found.setdefault(entry.name, {}).setdefault(owner_of(entry), entry)
-    return {name: list(owners.values()) for name, owners in sorted(found.items())}
+    found: dict[str, list[EntryPoint]] = {}
+    for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):
+        found.setdefault(entry.name, []).append(entry)
+    for name, entries in found.items():
+        if len(entries) > 1:  # an editable package can be listed twice by its own metadata
+            found[name] = list({owner_of(entry): entry for entry in entries}.values())
+    return found
 
 
 def owner_of(entry: EntryPoint) -> str:
