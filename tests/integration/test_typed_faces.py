@@ -20,7 +20,6 @@ CALLS = {
     'connect_vector("host:1")': "PhysxVectorEnv",
     'connect_vector("host:1", "godot-rl")': "GodotRLVectorEnv",
     'serve("gym/CartPole-v1").token': "str",
-    'serve("script.py:Scene", "godot-gym").environment': "RLEnvironment",
     'serve("gym/CartPole-v1", "godot-rl")': "Service",
     'Dataset.open("folder")': "Dataset",
     'Dataset.open("folder")["training"]["x"][0:2]': "ndarray[tuple[Any, ...], dtype[Any]]",

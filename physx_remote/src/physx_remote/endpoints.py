@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from physx_remote.godot_gym.client import GodotGymEnv
     from physx_remote.godot_gym.environment import RLEnvironment
-    from physx_remote.godot_gym.protocol import GodotGymService
     from physx_remote.godot_rl.client import GodotRLEnv, GodotRLVectorEnv
     from physx_remote.physx.client import PhysxEnv
     from physx_remote.physx.service import PhysxService
@@ -37,19 +36,6 @@ def serve(
     env_kwargs: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> PhysxService: ...
-
-
-@overload
-def serve(
-    environment: Any,
-    protocol: Literal["godot-gym"],
-    *,
-    address: str = "127.0.0.1",
-    port: int = 0,
-    num_worlds: int = 1,
-    env_kwargs: Mapping[str, Any] | None = None,
-    **options: Any,
-) -> GodotGymService: ...
 
 
 @overload

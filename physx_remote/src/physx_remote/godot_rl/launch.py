@@ -10,7 +10,6 @@ import shlex
 import sys
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -43,48 +42,31 @@ the trainer ends. ENVIRONMENT: "gym/CartPole-v1", "toy/spring", "script.py:Class
 
 _WITHOUT_EFFECT = ("headless", "disable-render-loop", "fixed-fps", "speedup")
 _NUMBERS = {
-    "port": int,
-    "env_seed": int,
-    "action_repeat": int,
-    "num_worlds": int,
-    "timeout": float,
-    "fixed-fps": float,
-    "speedup": float,
+    "port": ("port", int),
+    "env_seed": ("seed", int),
+    "action_repeat": ("action_repeat", int),
+    "num_worlds": ("num_worlds", int),
+    "timeout": ("timeout", float),
+    "fixed-fps": ("fixed-fps", float),
+    "speedup": ("speedup", float),
 }
+"""Flags with a number: the option of `serve` and its type."""
 
 
-@dataclass(frozen=True)
-class Launch:
-    """The flags of a launch.
-
-    Attributes:
-        port: Port where the trainer listens.
-        seed: Seed of the first episodes; None: unseeded.
-        action_repeat: Steps of the environment in one step of the trainer.
-        num_worlds: Number of agents.
-        timeout: How long to keep trying to reach the trainer, in s.
-        env_kwargs: Arguments of the environment.
-    """
-
-    port: int = PORT
-    seed: int | None = None
-    action_repeat: int = 1
-    num_worlds: int = 1
-    timeout: float = 60.0
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
-
-
-def parse_flags(words: Sequence[str]) -> Launch:
+def parse_flags(words: Sequence[str]) -> dict[str, Any]:
     """Parse the flags that godot-rl passes to an application; the last of each name counts.
 
     Args:
         words: ``--name=value``, ``--name value`` for a known name, or ``--name``.
 
+    Returns:
+        Keyword arguments of `serve`.
+
     Raises:
         UsageError: If a word is not a flag, or the value of a number is not valid.
     """
-    given: dict[str, Any] = {}
     env_kwargs: dict[str, Any] = {}
+    given: dict[str, Any] = {"env_kwargs": env_kwargs}
     rest = list(words)
     while rest:
         word = rest.pop(0)
@@ -94,21 +76,18 @@ def parse_flags(words: Sequence[str]) -> Launch:
                 f'"{word}" is not a flag: flags are --name=value. See {COMMAND} --help.'
             )
         if name in _NUMBERS:
+            option, convert = _NUMBERS[name]
             if not equals:
                 text = rest.pop(0) if rest else ""
-            given[name] = _number(name, text)
+            try:
+                given[option] = convert(text)
+            except ValueError:
+                raise UsageError(f'--{name} takes a number, not "{text}".') from None
         elif name not in _WITHOUT_EFFECT:
             env_kwargs[name] = _value(text) if equals else True
-    seed = given.pop("env_seed", None)
-    known = {name: value for name, value in given.items() if name not in _WITHOUT_EFFECT}
-    return Launch(seed=seed, env_kwargs=env_kwargs, **known)
-
-
-def _number(name: str, text: str) -> Any:
-    try:
-        return _NUMBERS[name](text)
-    except ValueError:
-        raise UsageError(f'--{name} takes a number, not "{text}".') from None
+    for option in _WITHOUT_EFFECT:
+        given.pop(option, None)
+    return given
 
 
 def _value(text: str) -> Any:
@@ -173,17 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(USAGE, end="")  # noqa: T201 - it is a command
         return 0
     try:
-        launch = parse_flags(words[1:])
-        with serve(
-            words[0],
-            GodotRL,
-            port=launch.port,
-            num_worlds=launch.num_worlds,
-            env_kwargs=launch.env_kwargs,
-            action_repeat=launch.action_repeat,
-            seed=launch.seed,
-            timeout=launch.timeout,
-        ) as service:
+        with serve(words[0], GodotRL, **parse_flags(words[1:])) as service:
             while service.poll(None):
                 continue
     except PhysxError as error:

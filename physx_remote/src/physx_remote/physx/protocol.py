@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 from typing import Any, ClassVar
 
+from physx_core.checks import positive
 from physx_core.errors import ConfigError, UsageError
 from physx_core.net import MAX_PAYLOAD, checked_token, given_token
 from physx_remote.physx.client import PhysxClient, PhysxEnv
@@ -54,8 +55,7 @@ class Physx(Protocol):
             UnknownOptionError: If the protocol does not have an option.
         """
         super().__init__(**options)
-        if not handshake_timeout > 0:
-            raise ConfigError(f"handshake_timeout is {handshake_timeout} but must be positive.")
+        positive("handshake_timeout", handshake_timeout)
         if not 1 <= max_request <= MAX_PAYLOAD:
             raise ConfigError(f"max_request is {max_request} but must be in 1 .. {MAX_PAYLOAD}.")
         for option, value in (("max_clients", max_clients), ("max_snapshots", max_snapshots)):
