@@ -235,7 +235,7 @@ def test_minari_says_how_many_rows_are_in_no_episode(folder, tmp_path, minari):
         (ExportOptions(actions=["state"]), "No field is left"),
     ],
 )
-def test_unfit_roles_are_refused(folder, tmp_path, minari, options, message):
+def test_unfit_roles_are_rejected(folder, tmp_path, minari, options, message):
     arrays = {"state": values("f8", (4,))}
     with make(folder, {"training": arrays}) as dataset, pytest.raises(ConfigError, match=message):
         export(dataset, "minari", tmp_path / "x-v0", options=options)
@@ -250,7 +250,7 @@ LIBRARIES = {
 }
 
 
-# What is refused --------------------------------------------------------------------------------
+# What is rejected --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -264,7 +264,7 @@ def test_a_missing_library_is_named_with_its_extra(everything, tmp_path, monkeyp
     assert [p.name for p in tmp_path.iterdir()] == ["data"]
 
 
-def test_unfit_exports_are_refused(everything, tmp_path):
+def test_unfit_exports_are_rejected(everything, tmp_path):
     out = tmp_path / "out"
     with pytest.raises(ConfigError, match='Did you mean "parquet"'):
         export(everything, "parket", out)

@@ -151,7 +151,7 @@ IMPOSSIBLE = [
 
 
 @pytest.mark.parametrize(("path", "value"), IMPOSSIBLE)
-def test_impossible_values_are_refused(folder, plain, path, value):
+def test_impossible_values_are_rejected(folder, plain, path, value):
     change(plain, path, value)
     store(folder, plain)
     with pytest.raises(DatasetError, match=r"dataset\.json"):
@@ -160,7 +160,7 @@ def test_impossible_values_are_refused(folder, plain, path, value):
         Dataset.open(folder, writable=True)
 
 
-def test_a_partition_that_is_listed_twice_is_refused(folder, plain):
+def test_a_partition_that_is_listed_twice_is_rejected(folder, plain):
     partitions = plain["modes"]["training"]["partitions"]
     partitions.append(partitions[0])
     store(folder, plain)
@@ -197,7 +197,7 @@ def test_a_huge_manifest_is_not_read(folder, plain):
 
 
 @pytest.mark.parametrize("text", ["[" * 10**5, '{"a":' * 10**5, "9" * 10**5, '"' + "a" * 10**6])
-def test_text_that_is_hard_to_read_is_refused(folder, plain, text):
+def test_text_that_is_hard_to_read_is_rejected(folder, plain, text):
     (folder / "dataset.json").write_text(text)
     with pytest.raises(DatasetError, match=r"dataset\.json"):
         Dataset.open(folder)
@@ -328,7 +328,7 @@ HOSTILE_FILES = {
 
 
 @pytest.mark.parametrize("kind", HOSTILE_FILES)
-def test_hostile_partitions_are_refused(folder, plain, kind):
+def test_hostile_partitions_are_rejected(folder, plain, kind):
     path, _ = unsealed(folder, plain)
     rewrite(path, HOSTILE_FILES[kind])
     fails(folder)
@@ -339,7 +339,7 @@ def test_hostile_partitions_are_refused(folder, plain, kind):
     [{"format_version": 2}, {"format": "x"}, {"role": "root"}, {"field": "../x"},
      {"partition": "many"}, {"unit": np.ones(3)}, {"mode": h5py.Empty("f8")}],
 )  # fmt: skip
-def test_hostile_attributes_are_refused(folder, plain, changes):
+def test_hostile_attributes_are_rejected(folder, plain, changes):
     path, _ = unsealed(folder, plain)
     rewrite(path, fill_with(), **changes)
     with Dataset.open(folder) as dataset:

@@ -163,18 +163,18 @@ def test_a_changed_byte_never_becomes_another_number(folder, tmp_path):
     path, x = tmp_path / "a.npz", np.random.default_rng(0).normal(size=(999, 9))
     np.savez(path, x=x)
     content = path.read_bytes()
-    refused = 0
+    rejected = 0
     for place in (*range(0, 300, 7), *range(300, len(content), 5009), len(content) - 30):
         path.write_bytes(content[:place] + bytes([content[place] ^ 0x40]) + content[place + 1 :])
         try:
             import_file(path, folder)
         except ExchangeError:
-            refused += 1
+            rejected += 1
             continue
         with Dataset.open(folder) as dataset:
             assert_array_equal(next(iter(dataset["training"].items()))[1][:], x)
         shutil.rmtree(folder)
-    assert refused > 30
+    assert rejected > 30
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def test_not_found_says_what_is_there(tmp_path):
         Dataset.open(tmp_path / "missing")
 
 
-def test_two_writers_are_refused_and_readers_are_not(dataset, folder):
+def test_two_writers_are_rejected_and_readers_are_not(dataset, folder):
     dataset.append("training", {"x": np.arange(3.0)})
     with pytest.raises(DatasetLockedError, match=f"Process {os.getpid()}"):
         Dataset.open(folder, writable=True)

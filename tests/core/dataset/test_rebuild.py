@@ -35,7 +35,7 @@ def test_a_sound_dataset_needs_no_repair(folder, thousand):
         Dataset.repair(folder)
 
 
-def test_a_manifest_edited_by_hand_is_refused_and_then_checked(folder, thousand):
+def test_a_manifest_edited_by_hand_is_rejected_and_then_checked(folder, thousand):
     thousand.write(folder, info={"note": "first"})
     path = folder / "dataset.json"
     text = path.read_text()
@@ -157,7 +157,7 @@ def test_version_1_is_read(folder):
             dataset.update_info(seed=1)
 
 
-def test_a_newer_version_is_refused(folder, thousand):
+def test_a_newer_version_is_rejected(folder, thousand):
     thousand.write(folder)
     path = folder / "dataset.json"
     plain = json.loads(path.read_text()) | {"format_version": 2}

@@ -20,9 +20,9 @@ WALK = f"{__file__}:Walk"
 class Walk(Environment):
     """Counts up; begins anew after each `length` steps, told before or after the step's data."""
 
-    def __init__(self, *, length=5, late=False, refuse=(), **kwargs):
+    def __init__(self, *, length=5, late=False, reject=(), **kwargs):
         super().__init__(**kwargs)
-        self.length, self.late, self.refuse = length, late, refuse
+        self.length, self.late, self.reject = length, late, reject
 
     def create(self):
         self.place = 0.0
@@ -41,7 +41,7 @@ class Walk(Environment):
             self.new_episode()
 
     def check_sample(self):
-        return self.step_index not in self.refuse
+        return self.step_index not in self.reject
 
 
 def store(folder, source):
@@ -97,8 +97,8 @@ def test_clients_keep_the_same_numbers(walks, clients):
         assert_array_equal(dataset["training"]["episode"][:], source.batch(40)["episode"])
 
 
-def test_a_refused_sample_ends_a_trajectory(walks):
-    with walks(length=100, refuse=[7]) as dataset:
+def test_a_rejected_sample_ends_a_trajectory(walks):
+    with walks(length=100, reject=[7]) as dataset:
         lengths = [len(e.rows) for e in dataset.episodes("training") if e.env_id == 1]
         assert lengths == [7, 13]
         assert dataset["training"]["episode"][:].max() == 0
@@ -172,7 +172,7 @@ def test_trajectories_of_unequal_length_come_near_to_the_shares(folder):
         (dict.fromkeys(map(str, range(61)), 1 / 61), "episode", "60 trajectories"),
     ],
 )
-def test_unfit_splits_are_refused(dataset, shares, by, message):
+def test_unfit_splits_are_rejected(dataset, shares, by, message):
     with pytest.raises(ConfigError, match=message):
         dataset.split("training", shares, by=by)
 

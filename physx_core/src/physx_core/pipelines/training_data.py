@@ -9,7 +9,7 @@ import numpy as np
 
 from physx_core.config import DatasetConfig, EnvironmentConfig
 from physx_core.dataset import Dataset, Subset
-from physx_core.dataset.write.definitions import compare_fields
+from physx_core.dataset.store.definitions import compare_fields
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import RESERVED, Field
 from physx_core.pipelines.storage import record_rejected

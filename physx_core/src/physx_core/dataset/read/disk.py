@@ -21,7 +21,8 @@ class DiskColumn:
     """A field on the disk; close it after use.
 
     Rows are read with system calls, not through mapped memory: a file that becomes shorter raises
-    an error instead of killing the process, and the memory of the process does not grow.
+    an error instead of killing the process, and the memory of the process does not grow. Reading
+    raises a `DatasetError` if a partition is missing, truncated or damaged, or the disk fails.
 
     Attributes:
         shape: (rows, *field shape).
@@ -49,11 +50,7 @@ class DiskColumn:
         self._opened: dict[int, tuple[FileIO, int]] = {}
 
     def announce(self, start: int, count: int = 1) -> None:
-        """Tell the system that `count` rows from `start` on will be read soon.
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged.
-        """
+        """Tell the system that `count` rows from `start` on will be read soon."""
         size = self.row_nbytes
         if not size or not hasattr(os, "posix_fadvise"):
             return
@@ -64,11 +61,7 @@ class DiskColumn:
             start, count = start + part, count - part
 
     def gather(self, index: Index, out: Array) -> None:
-        """Copy single rows into a contiguous array, shape (rows, *field shape).
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged, or the disk fails.
-        """
+        """Copy single rows into a contiguous array, shape (rows, *field shape)."""
         size, rows = self.row_nbytes, self._target(out)
         view = files.as_bytes(rows)
         for number, row in enumerate(index.tolist()):
@@ -77,11 +70,7 @@ class DiskColumn:
             out[...] = rows
 
     def slice(self, start: int, out: Array) -> None:
-        """Copy consecutive rows into a contiguous array, shape (rows, *field shape).
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged, or the disk fails.
-        """
+        """Copy consecutive rows into a contiguous array, shape (rows, *field shape)."""
         rows = self._target(out)
         self._read(start, len(rows), files.as_bytes(rows))
         if rows is not out:

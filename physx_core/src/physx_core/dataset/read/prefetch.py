@@ -42,9 +42,6 @@ class ExactEpoch:
             dtype: Type that floating fields are converted to; None: each keeps its own.
             random: Draws the permutation.
             subset: The only rows to read; None: all.
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged.
         """
         self._order = random.permutation(columns.reader.rows(mode) if subset is None else subset)
         self.rows = len(self._order)
@@ -61,11 +58,7 @@ class ExactEpoch:
         self._announced = 0
 
     def fill(self, start: int, batch: Batch) -> None:
-        """Copy the next rows: see `Epoch`.
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged, or the disk fails.
-        """
+        """Copy the next rows: see `Epoch`."""
         outs = list(batch.values())
         stop = start + len(outs[0])
         for first in range(start, stop, self._ahead):

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
-from physx_core.dataset.store.checksums import crc32
 from physx_core.dataset.store.manifest import Manifest, Mode
 from physx_core.dataset.store.segment import BLOCK, Segment, rows_per_block
 from physx_core.errors import DatasetError, listed, nearest
@@ -18,6 +18,8 @@ from physx_core.typing import Array
 
 class Reader:
     """Reads the committed rows that a manifest lists.
+
+    Reading raises a `DatasetError` if a partition is missing, truncated or damaged.
 
     Attributes:
         directory: The dataset's folder.
@@ -72,11 +74,7 @@ class Reader:
         return found
 
     def read(self, mode: str, name: str, start: int, stop: int) -> Array:
-        """Return rows as a new array, shape (stop - start, *field shape).
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged.
-        """
+        """Return rows as a new array, shape (stop - start, *field shape)."""
         field = self.field(mode, name)
         if (stop - start) * field.nbytes > BLOCK:
             self.check(mode, name, start, stop)
@@ -85,11 +83,7 @@ class Reader:
         return out
 
     def check(self, mode: str, name: str, start: int = 0, stop: int | None = None) -> None:
-        """Check that the files are long enough, before memory is allocated for their rows.
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged.
-        """
+        """Check that the files are long enough, before memory is allocated for their rows."""
         for segment in self.segments(mode, name):
             if start < segment.start + segment.rows and (stop is None or segment.start < stop):
                 segment.open()[0].close()
@@ -112,9 +106,6 @@ class Reader:
             name: Name of the field.
             start: First row.
             sums: Checksums of partitions that are read in several calls, kept from one to the next.
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged.
         """
         size, stop = self.field(mode, name).nbytes, start + len(out)
         if not size:
@@ -141,9 +132,6 @@ class Reader:
             name: Name of the field.
             start: First row.
             stop: Row before which to stop; None: after the last row that is committed now.
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged.
         """
         field, end = self.field(mode, name), self.rows(mode) if stop is None else stop
         count = rows_per_block(field.nbytes)

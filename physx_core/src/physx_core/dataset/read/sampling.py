@@ -53,21 +53,9 @@ class BatchReader:
         normalize: bool | Mapping[str, Normalization] = False,
         strategy: Choice = "auto",
     ) -> None:
-        """Check the options, which are those of `Dataset.batches`.
+        """Check the options, which are those of `Dataset.batches`; `subset` is ascending.
 
-        Args:
-            columns: Columns in memory, and the reader of the others.
-            mode: Name of the mode.
-            batch_size: Rows of a batch.
-            subset: The only rows to read, ascending; None: all.
-            shuffle: See `Dataset.batches`, as for the options below.
-            seed: See there.
-            epochs: See there.
-            fields: See there.
-            dtype: See there.
-            reuse: See there.
-            normalize: The normalization to use, by field; False: none.
-            strategy: See there.
+        Here `normalize` is the normalization to use, by field, or False.
 
         Raises:
             ConfigError: If an option is out of range, or no field is asked for.
@@ -145,7 +133,7 @@ class BatchReader:
 
 
 class Epoch(Protocol):
-    """One pass over all rows.
+    """One pass over all rows; it raises a `DatasetError` if a partition cannot be read.
 
     Attributes:
         rows: How many rows there are.

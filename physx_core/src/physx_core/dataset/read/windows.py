@@ -36,9 +36,6 @@ class WindowedEpoch:
             columns: The fields.
             random: Draws the order; None: that of writing.
             subset: The only rows to read, ascending; None: all.
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged.
         """
         self._total = columns[0].shape[0]
         self.rows = self._total if subset is None else len(subset)
@@ -58,11 +55,7 @@ class WindowedEpoch:
         self._announce()
 
     def fill(self, start: int, batch: Batch) -> None:
-        """Copy the next rows: see `Epoch`.
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged, or the disk fails.
-        """
+        """Copy the next rows: see `Epoch`."""
         outs = list(batch.values())
         done, count = 0, len(outs[0])
         while done < count:

@@ -9,6 +9,7 @@ from itertools import chain
 from pathlib import Path
 
 from physx_core.dataset.store import manifest_file
+from physx_core.dataset.store.definitions import compare_fields
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition_format import (
     FORMAT,
@@ -18,7 +19,6 @@ from physx_core.dataset.store.partition_format import (
     open_partition,
 )
 from physx_core.dataset.store.sealing import remove_files, scan, seal, sync_files
-from physx_core.dataset.write.definitions import compare_fields
 from physx_core.errors import DatasetError, DatasetNotFoundError, FieldsMismatchError, listed
 from physx_core.fields import Field
 

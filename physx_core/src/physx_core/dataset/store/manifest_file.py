@@ -12,8 +12,9 @@ import re
 from pathlib import Path
 from typing import Any
 
+from zlib_ng.zlib_ng import crc32
+
 from physx_core import files
-from physx_core.dataset.store.checksums import crc32
 from physx_core.dataset.store.manifest import Manifest
 from physx_core.dataset.store.manifest_parsing import parse_manifest, whole
 from physx_core.errors import ConfigError, DatasetError

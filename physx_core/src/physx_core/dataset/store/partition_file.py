@@ -6,8 +6,9 @@ import errno
 import os
 from pathlib import Path
 
+from zlib_ng.zlib_ng import crc32
+
 from physx_core import files
-from physx_core.dataset.store.checksums import crc32
 from physx_core.dataset.store.partition_format import Header, Identity, make_header
 from physx_core.typing import Array
 

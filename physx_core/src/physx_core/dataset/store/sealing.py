@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from zlib_ng.zlib_ng import crc32
+
 from physx_core import files
-from physx_core.dataset.store.checksums import crc32
 from physx_core.dataset.store.manifest import Partition, has_statistics
 from physx_core.dataset.store.partition_file import rewrite
 from physx_core.fields import Field
