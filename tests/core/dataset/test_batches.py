@@ -54,7 +54,7 @@ def test_each_epoch_is_a_new_permutation_and_the_seed_gives_them(dataset):
     assert not np.array_equal(*drawn)
 
 
-def test_without_end(dataset):
+def test_endless_epochs(dataset):
     batches = dataset.batches("training", 500, epochs=None)
     sizes = [len(batch["id"]) for batch in itertools.islice(batches, 7)]
     assert sizes == [500, 500, 3, 500, 500, 3, 500]
@@ -75,7 +75,7 @@ def test_arrays_are_reused_only_when_asked(dataset):
     assert_array_equal(np.concatenate(own)[:, 0], np.arange(N))
 
 
-def test_a_later_epoch_has_the_rows_that_came_meanwhile(dataset):
+def test_a_later_epoch_includes_rows_added_meanwhile(dataset):
     batches = dataset.batches("training", 2000, epochs=3, reuse=True)
     assert len(next(batches)["id"]) == N
     new = {"x": np.full((2, 2), 0.0), "y": np.zeros(2), "id": np.array([N, N + 1])}
@@ -110,7 +110,3 @@ def test_nothing_to_read(dataset):
     dataset.append("validation", {"x": np.empty((0, 2))})
     with pytest.raises(DatasetError, match="no samples"):
         dataset.batches("validation", 4)
-
-
-def test_memory_is_known():
-    assert memory.available_memory() > 2**20

@@ -31,7 +31,7 @@ def expected(count, first=0):
 
 
 def kill(tmp_path, work, durability, seed, kills):
-    """Kill writers, have what they leave checked, and return the counts."""
+    """Kill writers, check what they leave, and return the counts."""
     arguments = [str(KILLS), str(tmp_path / "data"), work, durability, str(seed), str(kills)]
     done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -256,7 +256,7 @@ def test_a_full_disk_in_this_process_and_space_again(small_disk):
 
 
 def fill_up(folder, free):
-    """Fill a disk that has so many bytes left, in one way after the other; lose nothing."""
+    """Fill a disk with so many bytes left in several ways; lose nothing."""
     ballast = folder.parent / "ballast"
     ballast.write_bytes(b"")
     left = os.statvfs(folder.parent)

@@ -33,7 +33,7 @@ def places(tmp_path_factory):
 
 @pytest.fixture(params=["closed", "killed"])
 def copy(request, places, tmp_path):
-    """Return a function that gives a fresh copy of a dataset."""
+    """Return a function that makes a fresh copy of a dataset."""
 
     def make():
         shutil.rmtree(tmp_path / request.param, ignore_errors=True)
@@ -83,7 +83,7 @@ def examine(folder):
 
 
 def repaired(folder):
-    """Repair a dataset, and check that the rows that are left are right."""
+    """Repair a dataset, and check that the remaining rows are right."""
     done = Dataset.repair(folder)
     with Dataset.open(folder) as dataset:
         assert dataset.verify() == []
@@ -98,7 +98,7 @@ def repaired(folder):
 
 
 def damages(content, step, guarded):
-    """Yield what may become of a file: each length, and then other bytes.
+    """Yield possible damages of a file: each length, and then other bytes.
 
     What was never sealed has no checksum: other bytes in the place of its rows are not tried.
     """

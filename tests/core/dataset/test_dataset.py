@@ -1,4 +1,4 @@
-"""What a dataset gives back of what was written: rows, views of them, their normalization."""
+"""Reading back what was written: rows, views of them, their normalization."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def test_round_trip(folder):
         assert dataset.verify() == []
 
 
-def test_modes_are_apart(dataset, folder):
+def test_modes_are_independent(dataset, folder):
     dataset.append("training", {"x": np.ones((3, 2))})
     dataset.append("validation", {"x": np.zeros((4, 1)), "z": np.ones(4)})
     dataset.append("training", {"x": np.full((1, 2), 2.0)})
@@ -121,7 +121,7 @@ def test_an_empty_dataset_opens(folder):
 # Views ----------------------------------------------------------------------------------------
 
 
-def test_rows_are_taken_as_from_an_array(dataset):
+def test_views_are_indexed_like_arrays(dataset):
     values = np.arange(60.0).reshape(20, 3)
     dataset.append("training", {"x": values, "s": np.arange(20)})
     field = dataset["training"]["x"]
@@ -166,7 +166,7 @@ def test_a_view_sees_rows_that_are_added_later(dataset):
     assert_array_equal(field[[4, 0, 3]], [4, 0, 3])
 
 
-def test_unknown_names_say_what_there_is(dataset):
+def test_unknown_names_list_the_known_ones(dataset):
     dataset.append("training", {"position": np.zeros(1)})
     with pytest.raises(DatasetError, match='Did you mean "training"'):
         dataset["trainin"]
@@ -205,7 +205,7 @@ def test_normalization_of_floating_fields(folder):
         assert_allclose(again.std, before.std, rtol=1e-12)
 
 
-def test_normalization_goes_on_in_another_session(folder):
+def test_normalization_continues_in_another_session(folder):
     first, second = rows(300, 1), rows(200, 2)
     with Dataset.create(folder, "one") as dataset:
         dataset.append("training", first)

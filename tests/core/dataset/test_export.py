@@ -66,7 +66,7 @@ ARCHIVES = [("npz", "none"), ("npz", "deflate"), ("hdf5-single", "none"), ("hdf5
 
 
 @pytest.mark.parametrize(("to", "compression"), ARCHIVES)
-def test_there_and_back_is_the_same(everything, tmp_path, to, compression):
+def test_a_round_trip_keeps_every_bit(everything, tmp_path, to, compression):
     out = tmp_path / ("out.npz" if to == "npz" else "out.h5")
     options = ExportOptions(compression=compression)
     assert export(everything, to, out, options=options) == {"training": ROWS}
@@ -78,7 +78,7 @@ def test_there_and_back_is_the_same(everything, tmp_path, to, compression):
 
 
 @pytest.mark.parametrize("to", ["npz", "hdf5-single"])
-def test_several_modes_come_back(folder, tmp_path, to):
+def test_several_modes_round_trip(folder, tmp_path, to):
     modes = {"training": table(["f8"]), "test": table(["i4"]), "validation": table(["f4"])}
     out = tmp_path / ("out.npz" if to == "npz" else "out.h5")
     with make(folder, modes) as dataset:
@@ -109,7 +109,7 @@ def test_an_archive_is_what_numpy_loads(everything, tmp_path):
             assert_array_equal(archive[name], field[:])
 
 
-def test_one_hdf5_file_says_units_and_can_be_mapped(everything, tmp_path):
+def test_a_single_hdf5_file_has_units_and_can_be_mapped(everything, tmp_path):
     export(everything, "hdf5-single", tmp_path / "out.h5")
     with h5py.File(tmp_path / "out.h5") as file:
         field = file["training/f8_1"]
@@ -216,7 +216,7 @@ def test_minari_with_actions_and_rewards_loses_nothing(folder, tmp_path, minari,
             assert episode.actions.dtype == "f4"
 
 
-def test_minari_says_how_many_rows_are_in_no_episode(folder, tmp_path, minari):
+def test_minari_reports_rows_in_no_episode(folder, tmp_path, minari):
     with Dataset.create(folder) as dataset:
         dataset.append("training", {"x": np.zeros(6), "step": [0, 2, 3, 4, 8, 9]})
         assert export(dataset, "minari", tmp_path / "x-v0") == {"training": 5}
@@ -235,7 +235,7 @@ def test_minari_says_how_many_rows_are_in_no_episode(folder, tmp_path, minari):
         (ExportOptions(actions=["state"]), "No field is left"),
     ],
 )
-def test_unfit_roles_are_rejected(folder, tmp_path, minari, options, message):
+def test_invalid_roles_are_rejected(folder, tmp_path, minari, options, message):
     arrays = {"state": values("f8", (4,))}
     with make(folder, {"training": arrays}) as dataset, pytest.raises(ConfigError, match=message):
         export(dataset, "minari", tmp_path / "x-v0", options=options)
@@ -264,7 +264,7 @@ def test_a_missing_library_is_named_with_its_extra(everything, tmp_path, monkeyp
     assert [p.name for p in tmp_path.iterdir()] == ["data"]
 
 
-def test_unfit_exports_are_rejected(everything, tmp_path):
+def test_invalid_exports_are_rejected(everything, tmp_path):
     out = tmp_path / "out"
     with pytest.raises(ConfigError, match='Did you mean "parquet"'):
         export(everything, "parket", out)
@@ -320,7 +320,7 @@ sys.exit(main(["export", {folder!r}, {out!r}, "--to", {to!r}]))
 
 @pytest.mark.parametrize("to", ["npz", "parquet", "zarr", "hdf5-single"])
 def test_a_full_disk_is_an_error(folder, tmp_path, to):
-    """A limit of the file size stands for the disk: writing fails in the same way."""
+    """A limit of the file size simulates the disk: writing fails in the same way."""
     pytest.importorskip(LIBRARIES[to])
     with Dataset.create(folder) as dataset:
         random = np.random.default_rng(0)
@@ -333,7 +333,7 @@ def test_a_full_disk_is_an_error(folder, tmp_path, to):
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
-def test_minari_asks_for_room_before_it_begins(folder, tmp_path, minari, monkeypatch):
+def test_minari_checks_for_space_first(folder, tmp_path, minari, monkeypatch):
     usage = type(shutil.disk_usage(tmp_path))(10**6, 10**6 - 10**4, 10**4)
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
     message, modes = "the disk has 0.0 MB left", {"training": table(["f8"])}

@@ -93,7 +93,7 @@ def test_h5py_reads_the_partitions_and_the_index(folder):
     assert plain["modes"]["training"]["normalization"]["x"]["count"] == N
 
 
-def test_partitions_keep_to_their_size(folder):
+def test_partitions_respect_their_size(folder):
     write(folder)
     sizes = [p.stat().st_size for p in folder.glob("run_training_*.h5")]
     assert max(sizes) <= 30000
@@ -145,7 +145,7 @@ def test_durable_commits(folder):
     check(folder)
 
 
-def test_sessions_go_on_where_the_last_one_ended(folder):
+def test_a_session_continues_where_the_last_one_ended(folder):
     half = {name: values[:500] for name, values in ROWS.items()}
     with Dataset.create(folder, "one") as dataset:
         dataset.define_fields("training", FIELDS)
@@ -214,7 +214,7 @@ def test_a_stale_manifest_hides_no_row(folder, tmp_path):
     assert all(p["sealed"] for p in partitions(folder))
 
 
-def test_a_commit_that_not_all_fields_made_is_none(folder, tmp_path):
+def test_a_commit_counts_only_if_all_fields_made_it(folder, tmp_path):
     live = write(folder, close=False)
     killed = abandoned(folder, tmp_path / "killed")
     live.close()

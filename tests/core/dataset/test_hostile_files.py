@@ -1,4 +1,4 @@
-"""Datasets from strangers: whatever they hold, there is an error, and nothing else is touched."""
+"""Untrusted datasets: any content leads to an error, and nothing else is touched."""
 
 import json
 import os
@@ -35,7 +35,7 @@ def plain(sound, folder):
 
 
 def store(folder, plain, **options):
-    """Write a manifest with the checksum that it ought to have."""
+    """Write a manifest with a valid checksum."""
     plain = {name: value for name, value in plain.items() if name != "crc32"}
     body = json.dumps(plain, indent=1, **options).encode()[:-2]
     (folder / "dataset.json").write_bytes(body + b',\n "crc32": "%08x"\n}' % zlib.crc32(body))
@@ -170,7 +170,7 @@ def test_a_partition_that_is_listed_twice_is_rejected(folder, plain):
 
 @pytest.mark.parametrize("value", [10**9, 2**40, 2**50])
 @pytest.mark.parametrize("key", ["rows", "offset"])
-def test_no_memory_is_taken_for_rows_that_are_not_there(folder, plain, key, value):
+def test_no_memory_is_allocated_for_missing_rows(folder, plain, key, value):
     first = plain["modes"]["training"]["partitions"][0]
     if key == "rows":
         first["rows"] = value
@@ -249,7 +249,7 @@ def test_writing_follows_no_link(folder, plain, tmp_path, name):
         assert_array_equal(dataset["training"]["n"][:N], ROWS["n"])
 
 
-def test_making_a_dataset_follows_no_link(folder, tmp_path):
+def test_creating_a_dataset_follows_no_link(folder, tmp_path):
     target = tmp_path / "precious"
     target.write_text("keep me")
     folder.mkdir()
@@ -264,7 +264,7 @@ def test_making_a_dataset_follows_no_link(folder, tmp_path):
 
 
 def unsealed(folder, plain):
-    """Make the first partition one that only its files describe."""
+    """Turn the first partition into one that only its files describe."""
     first = plain["modes"]["training"]["partitions"][0]
     first["sealed"] = False
     store(folder, plain)
@@ -272,7 +272,7 @@ def unsealed(folder, plain):
 
 
 def rewrite(path, fill, **changes):
-    """Replace a partition file by one that h5py makes."""
+    """Replace a partition file by one made with h5py."""
     with h5py.File(path) as file:
         attributes = dict(file.attrs) | changes
     path.unlink()
@@ -346,7 +346,7 @@ def test_hostile_attributes_are_rejected(folder, plain, changes):
         assert dataset.verify()
 
 
-def test_a_count_beyond_the_capacity_is_cut(folder, plain):
+def test_a_count_beyond_the_capacity_is_clipped(folder, plain):
     path, _ = unsealed(folder, plain)
     with h5py.File(path, "r+") as file:
         file["rows"][()] = 2**60

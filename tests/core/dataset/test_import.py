@@ -65,7 +65,7 @@ def test_the_index_of_a_dataset_is_read_too(folder, tmp_path):
         assert_array_equal(back["training"]["x"][:], np.arange(500.0))
 
 
-def test_rows_are_added_to_a_dataset_that_is_there(folder, tmp_path):
+def test_rows_are_added_to_an_existing_dataset(folder, tmp_path):
     np.savez(tmp_path / "a.npz", x=X)
     np.savez(tmp_path / "b.npz", y=X)
     import_file(tmp_path / "a.npz", folder)
@@ -111,7 +111,7 @@ def test_a_folder_of_other_things_is_left_alone(folder, tmp_path):
     assert [path.name for path in folder.iterdir()] == ["thesis.txt"]
 
 
-def test_what_is_no_file_to_import(folder, tmp_path):
+def test_files_that_cannot_be_imported(folder, tmp_path):
     (tmp_path / "empty").touch()
     (tmp_path / "a.csv").write_text("x, y\n1, 2\n")
     (tmp_path / "a.npz").write_bytes(b"PK but no zip")
@@ -147,7 +147,7 @@ def test_nothing_is_unpickled(folder, tmp_path):
 
 @pytest.mark.parametrize("compress", [False, True])
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
-def test_a_cut_archive_is_an_error(folder, tmp_path, compress, share):
+def test_a_truncated_archive_is_an_error(folder, tmp_path, compress, share):
     path = tmp_path / "a.npz"
     (np.savez_compressed if compress else np.savez)(
         path, x=np.random.default_rng(0).normal(size=(999, 9))
@@ -189,7 +189,7 @@ def test_a_header_that_promises_too_much_is_an_error(folder, tmp_path, shape):
         import_file(tmp_path / "a.npz", folder)
 
 
-def test_a_note_of_a_stranger_is_only_a_note(folder, tmp_path):
+def test_untrusted_notes_do_no_harm(folder, tmp_path):
     np.savez(tmp_path / "a.npz", x=X)
     for comment in (b'{"format": "physx export", "modes": {"../up": 3}}', b"\xff\xfe", b"[1]"):
         with zipfile.ZipFile(tmp_path / "a.npz", "a") as archive:
@@ -234,7 +234,7 @@ def test_links_out_of_an_hdf5_file_are_not_followed(folder, tmp_path):
 
 
 @pytest.mark.parametrize("form", ["npz", "hdf5-single"])
-def test_a_file_is_known_by_its_content_not_by_its_name(folder, tmp_path, form):
+def test_a_file_is_recognized_by_its_content_not_its_name(folder, tmp_path, form):
     with Dataset.create(folder) as dataset:
         dataset.append("training", {"x": X})
         export(dataset, form, tmp_path / "rows")

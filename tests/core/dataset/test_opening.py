@@ -1,4 +1,4 @@
-"""Creating, opening and closing: folders, locks, options, and what is kept about a dataset."""
+"""Creating, opening and closing: folders, locks, options, and a dataset's info."""
 
 import os
 from pathlib import Path
@@ -19,18 +19,18 @@ from physx_core.errors import (
 ROWS = {"x": np.ones((2, 3)), "n": np.array([1, 2], "int32")}
 
 
-def test_there_is_a_dataset_already(dataset, folder):
+def test_creating_over_an_existing_dataset_is_an_error(dataset, folder):
     dataset.close()
     with pytest.raises(DatasetError, match="already"):
         Dataset.create(folder)
 
 
-def test_a_session_folder_will_do(tmp_path):
+def test_a_session_folder_is_accepted(tmp_path):
     Dataset.create(tmp_path / "session" / "dataset").close()
     Dataset.open(tmp_path / "session").close()
 
 
-def test_not_found_says_what_is_there(tmp_path):
+def test_not_found_lists_what_is_there(tmp_path):
     (tmp_path / "notes.txt").touch()
     with pytest.raises(DatasetNotFoundError, match=r"notes\.txt"):
         Dataset.open(tmp_path)

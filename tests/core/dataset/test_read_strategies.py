@@ -61,14 +61,12 @@ def test_what_fits_is_read_into_memory(tmp_path):
         (511, None, "disk exact"),  # 4096 bytes and 4
     ],
 )
-def test_what_does_not_fit_is_read_as_its_rows_are_large(
-    tmp_path, no_memory, width, names, strategy
-):
+def test_row_size_decides_how_large_fields_are_read(tmp_path, no_memory, width, names, strategy):
     with stored(tmp_path, 100, width) as dataset:
         assert dataset.reading_strategy("training", names) == strategy
 
 
-def test_memory_that_is_taken_already_counts_as_there(tmp_path, monkeypatch):
+def test_fields_in_memory_need_no_more_of_it(tmp_path, monkeypatch):
     with stored(tmp_path, 100, 3) as dataset:
         list(dataset.batches("training", 10))
         monkeypatch.setattr(memory, "available_memory", lambda: 0)
@@ -154,7 +152,7 @@ def wide(tmp_path_factory):
     return folder
 
 
-def test_windows_give_every_row_once_from_all_over(wide):
+def test_windows_yield_every_row_once_from_all_over(wide):
     with Dataset.open(wide) as dataset:
         ids, count = np.empty(5_000_000, np.int64), 0
         batches = dataset.batches(

@@ -33,7 +33,7 @@ print(first)
 
 
 def stored(folder, rows, partition_rows=None):
-    """Store rows of fields by name, in partitions of so many rows."""
+    """Store rows of fields by name, in partitions of the given number of rows."""
     count = len(next(iter(rows.values())))
     row_nbytes = max(1, max(values[0].nbytes for values in rows.values()))
     nbytes = row_nbytes * (partition_rows or count) + 2**14 + row_nbytes // 2
@@ -69,7 +69,7 @@ def test_what_is_returned_may_be_changed(tmp_path):
         assert_array_equal(dataset["training"]["x"][[5, 50]], [5, 50])
 
 
-def test_addresses_that_do_not_suffice(tmp_path):
+def test_too_small_an_address_space(tmp_path):
     with stored(tmp_path, {"x": np.zeros((12, 2**23), np.uint8)}, 4):
         pass
     code = (
@@ -138,7 +138,7 @@ def test_a_file_that_is_cut_between_two_readings_by_index(large_rows):
 # Others write -----------------------------------------------------------------------------------
 
 
-def test_rows_that_come_are_seen_after_refresh(tmp_path):
+def test_new_rows_are_seen_after_refresh(tmp_path):
     with Dataset.create(tmp_path, max_file_size=3e-5) as writer:
         writer.define_fields("training", [Field("id", (), "int64"), Field("x", (2,))])
         with Dataset.open(tmp_path) as reader:
@@ -183,7 +183,7 @@ def test_reading_while_another_process_writes(tmp_path, seconds, large):
 
 
 def check_all_rows(dataset, rng):
-    """See what is new and read it in every way."""
+    """Refresh and read what is new in every way."""
     before = dataset.num_samples("training")
     dataset.refresh()
     count = dataset.num_samples("training")

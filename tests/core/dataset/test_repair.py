@@ -1,8 +1,174 @@
-"""Repairs that must not lose sound rows."""
+"""Repairing and rebuilding datasets, and reading older versions."""
 
+import json
+import os
+import shutil
+from pathlib import Path
+
+import h5py
 import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
 
-from physx_core import Dataset
+from physx_core import Dataset, Field
+from physx_core.errors import (
+    DatasetError,
+    DatasetLockedError,
+    DatasetNotFoundError,
+)
+
+OLD = Path(__file__).parents[2] / "data" / "dataset_v1"
+
+
+# Repairing --------------------------------------------------------------------------------------
+
+
+def test_a_sound_dataset_needs_no_repair(folder, thousand):
+    thousand.write(folder)
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    assert Dataset.repair(folder) == []
+    now = {p.name: p.read_bytes() for p in folder.iterdir()}
+    assert {**now, "dataset.lock": b""} == {**before, "dataset.lock": b""}
+    with pytest.raises(DatasetNotFoundError):
+        Dataset.repair(folder / "nowhere")
+    with Dataset.open(folder, writable=True), pytest.raises(DatasetLockedError):
+        Dataset.repair(folder)
+
+
+def test_a_manifest_edited_by_hand_is_rejected_and_then_checked(folder, thousand):
+    thousand.write(folder, info={"note": "first"})
+    path = folder / "dataset.json"
+    text = path.read_text()
+    path.write_text(text.replace('"first"', '"second"'))
+    with pytest.raises(DatasetError, match=r"dataset\.json.*edited by hand.*repair"):
+        Dataset.open(folder)
+    assert "it matches the files and is kept" in Dataset.repair(folder)[0]
+    with Dataset.open(folder) as dataset:
+        assert dataset.info == {"note": "second"}
+    thousand.check(folder, thousand.rows)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [('"<f8"', '"<f4"'), ("12288", "12296"), ('"rows": 340', '"rows": 330'), ('"x"', '"z"'),
+     ('"index": 1', '"index": 0')],
+)  # fmt: skip
+def test_a_wrong_edit_is_undone(folder, old, new, thousand):
+    thousand.write(folder)
+    path = folder / "dataset.json"
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    done = Dataset.repair(folder)
+    assert any("dataset.json.1" in each for each in done)
+    thousand.check(folder, thousand.rows)
+    assert new in (folder / "dataset.json.1").read_text()
+
+
+@pytest.mark.parametrize("text", [None, b"", b"{", b"[]", b"\xff", b"null", b"[" * 100_000])
+def test_a_lost_or_damaged_manifest_is_rebuilt(folder, text, thousand):
+    thousand.write(folder)
+    (folder / "dataset.json").unlink()
+    if text is not None:
+        (folder / "dataset.json").write_bytes(text)
+        with pytest.raises(DatasetError, match=r"dataset\.json.*repair"):
+            Dataset.open(folder)
+    assert Dataset.repair(folder)
+    thousand.check(folder, thousand.rows)
+    assert Dataset.repair(folder) == []
+
+
+@pytest.mark.parametrize("lost", [False, True])
+@pytest.mark.parametrize("damage", ["missing", "cut", "garbage", "flipped", "link"])
+def test_a_partition_that_cannot_be_used_is_set_aside(folder, tmp_path, damage, lost, thousand):
+    thousand.write(folder)
+    path = folder / "run_training_x_1.h5"
+    content = path.read_bytes()
+    if damage == "cut":
+        path.write_bytes(content[:9000])
+    elif damage == "garbage":
+        path.write_bytes(bytes(len(content)))
+    elif damage == "flipped":
+        path.write_bytes(content[:-100] + bytes([content[-100] ^ 4]) + content[-99:])
+    elif damage == "link":
+        path.rename(tmp_path / path.name)
+        path.symlink_to(tmp_path / path.name)
+    else:
+        path.unlink()
+    if lost:
+        (folder / "dataset.json").unlink()
+        if damage in ("flipped", "missing"):
+            return  # nothing tells that anything is wrong, or the whole partition has to go
+    done = "".join(Dataset.repair(folder))
+    assert "run_training_x_1.h5" in done and "damaged" in done
+    if not lost:
+        assert "340 rows" in done
+        thousand.check(folder, thousand.stacked((0, 340), (680, 1000)))
+        assert (folder / "damaged" / "run_training_n_1.h5").exists()
+        assert Dataset.repair(folder) == []
+        assert damage == "missing" or os.path.lexists(folder / "damaged" / path.name)
+
+
+def test_sound_rows_get_a_new_header(folder, thousand):
+    thousand.write(folder)
+    path = folder / "run_training_x_1.h5"
+    content = bytearray(path.read_bytes())
+    content[100:600] = bytes(500)
+    path.write_bytes(content)
+    with Dataset.open(folder) as dataset:
+        assert len(dataset.verify()) == 1
+    assert "new header" in Dataset.repair(folder)[0]
+    thousand.check(folder, thousand.rows)
+    with h5py.File(path) as file:
+        assert_array_equal(file["data"][:], thousand.rows["x"][340:680])
+
+
+def test_a_rebuilt_manifest_keeps_the_old_one(folder, thousand):
+    thousand.write(folder, info={"a": 1})
+    before = (folder / "dataset.json").read_bytes()
+    Dataset.rebuild(folder)
+    thousand.check(folder, thousand.rows)
+    assert (folder / "dataset.json.1").read_bytes() == before
+    with Dataset.open(folder) as dataset:
+        assert dataset.info == {}
+        assert dataset.fields("training") == {field.name: field for field in thousand.fields}
+
+
+# Versions ---------------------------------------------------------------------------------------
+
+
+def test_version_1_is_read(folder):
+    shutil.copytree(OLD, folder)
+    x = np.arange(30.0).reshape(10, 3) / 7
+    for _ in range(2):
+        with Dataset.open(folder) as dataset:
+            assert dataset.verify() == [] and dataset.info == {"seed": 1}
+            view = dataset["training"]
+            assert_array_equal(view["x"][:], [*x, -x[0]])
+            assert_array_equal(view["flag"][:], [*(x[:, 0] > 2), True])
+            wave = (x[:, :2] * (1 + 2j)).astype("complex64")
+            assert_array_equal(view["wave"][:], [*wave, np.ones(2)])
+            assert_array_equal(view["step"][:], [*range(10), 99])
+            assert view["x"].field == Field("x", (3,), unit="m")
+            assert_array_equal(dataset["validation"]["x"][:], x[:2].astype("float32"))
+            mean = dataset.normalization["x"].mean
+            np.testing.assert_allclose(mean, np.mean([*x, -x[0]], axis=0))
+        Dataset.rebuild(folder)
+        with Dataset.open(folder, writable=True) as dataset:
+            dataset.update_info(seed=1)
+
+
+def test_a_newer_version_is_rejected(folder, thousand):
+    thousand.write(folder)
+    path = folder / "dataset.json"
+    plain = json.loads(path.read_text()) | {"format_version": 2}
+    path.write_text(json.dumps(plain))
+    with pytest.raises(
+        DatasetError, match=r"version 2 of the dataset's format, but this physx reads version 1"
+    ):
+        Dataset.open(folder)
+
+
+# Losing no sound row ---------------------------------------------------------------------------
 
 
 def make(folder):
@@ -30,7 +196,7 @@ def test_a_missing_file_costs_its_own_partition_only(tmp_path):
     assert np.array_equal(missing, np.arange(missing[0], missing[-1] + 1))
 
 
-def test_numbers_stand_in_one_line_of_the_manifest(tmp_path):
+def test_numbers_are_on_one_line_of_the_manifest(tmp_path):
     make(tmp_path / "data")
     text = (tmp_path / "data/dataset.json").read_text()
     assert '"shape": [3]' in text

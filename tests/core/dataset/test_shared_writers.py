@@ -1,4 +1,4 @@
-"""Several processes that write to one dataset at the same time."""
+"""Several processes write to one dataset at the same time."""
 
 import json
 import shutil
@@ -104,7 +104,7 @@ def test_two_writers_of_100_000_rows_lose_nothing(tmp_path, folder, sessions):
 
 
 @pytest.mark.parametrize("victims", [1, 3])
-def test_a_killed_writer_does_not_hold_up_the_others(tmp_path, folder, victims):
+def test_a_killed_writer_does_not_block_the_others(tmp_path, folder, victims):
     Dataset.create(folder).close()
     writers = [start(tmp_path, folder, number, 10**9) for number in range(3)]
     totals = [0, 0, 0]

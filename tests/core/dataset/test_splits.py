@@ -147,7 +147,7 @@ def test_no_trajectory_is_in_two_parts(dataset):
         assert set(shares) <= {0.0, 1.0} and sum(shares) <= 1
 
 
-def test_trajectories_of_unequal_length_come_near_to_the_shares(folder):
+def test_trajectories_of_unequal_length_approximate_the_shares(folder):
     lengths = [400, 1, 1, 1, 97]
     step = np.concatenate([np.arange(length) for length in lengths])
     with Dataset.create(folder) as dataset:
@@ -172,7 +172,7 @@ def test_trajectories_of_unequal_length_come_near_to_the_shares(folder):
         (dict.fromkeys(map(str, range(61)), 1 / 61), "episode", "60 trajectories"),
     ],
 )
-def test_unfit_splits_are_rejected(dataset, shares, by, message):
+def test_invalid_splits_are_rejected(dataset, shares, by, message):
     with pytest.raises(ConfigError, match=message):
         dataset.split("training", shares, by=by)
 
@@ -221,7 +221,7 @@ def test_a_part_of_many_blocks_on_the_disk(folder):
     assert all((b["x"] == b["number"][:, None]).all() for b in batches)
 
 
-def test_rows_that_come_later_are_in_no_part(folder):
+def test_rows_added_later_are_in_no_part(folder):
     with Dataset.create(folder) as dataset:
         dataset.append("training", {"x": np.arange(100.0)})
         part = dataset.split("training", {"a": 1})["a"]
@@ -319,7 +319,7 @@ def test_a_validation_mode_is_used_in_place_of_a_split(numbered):
     assert training.held == [1, 1, 1] and len(training.learned) == 200
 
 
-def test_samples_that_are_made_cannot_be_held_back(folder):
+def test_generated_samples_cannot_be_held_back(folder):
     environment = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)
     with pytest.raises(ConfigError, match="Make the samples first"):
         numbered_training(folder, environment=environment, validation_split=0.2).execute()

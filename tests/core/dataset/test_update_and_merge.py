@@ -59,7 +59,7 @@ def test_rows_of_the_open_partition_are_updated_too(folder, thousand):
         assert_array_equal(dataset["training"]["x"][:], rows["x"])
 
 
-def test_waiting_samples_are_updated(folder, thousand):
+def test_pending_samples_are_updated(folder, thousand):
     with Dataset.create(folder, durable=True) as dataset:
         for row in range(10):
             dataset.append_sample(
@@ -70,7 +70,7 @@ def test_waiting_samples_are_updated(folder, thousand):
         assert_array_equal(dataset["training"]["x"][8], thousand.rows["x"][8])
 
 
-def test_an_update_that_is_not_possible_changes_nothing(folder, thousand):
+def test_an_invalid_update_changes_nothing(folder, thousand):
     thousand.write(folder)
     with Dataset.open(folder, writable=True) as dataset:
         for index, rows in [
@@ -92,7 +92,7 @@ def test_an_update_that_is_not_possible_changes_nothing(folder, thousand):
         dataset.update("training", 0, {"x": np.full(5, np.inf)})
 
 
-def test_an_update_that_was_cut_short_is_completed(folder, tmp_path, thousand):
+def test_an_interrupted_update_is_completed(folder, tmp_path, thousand):
     thousand.write(folder)
     rows = thousand.stacked(thousand.rows)
     rows["x"][:400] = 1
@@ -140,7 +140,7 @@ def test_a_merged_dataset_holds_the_rows_of_both(folder, tmp_path, shared, thous
 ORDER = np.r_[0:400, 1000:1010, 400:1000]
 
 
-def test_merging_brings_modes_and_what_a_killed_writer_left(folder, tmp_path, thousand):
+def test_merging_adds_modes_and_what_a_killed_writer_left(folder, tmp_path, thousand):
     live = Dataset.create(tmp_path / "live", max_file_size=thousand.size)
     live.append("training", thousand.rows)
     live.append("validation", {"y": [1.0, 2.0]})
@@ -153,7 +153,7 @@ def test_merging_brings_modes_and_what_a_killed_writer_left(folder, tmp_path, th
     thousand.check(folder, thousand.stacked(thousand.rows, thousand.rows))
 
 
-def test_statistics_are_merged_and_not_computed_again(folder, tmp_path, thousand):
+def test_statistics_are_merged_and_not_recomputed(folder, tmp_path, thousand):
     thousand.write(folder)
     thousand.write(tmp_path / "other")
     place = tmp_path / "other" / "dataset.json"
@@ -170,7 +170,7 @@ def test_statistics_are_merged_and_not_computed_again(folder, tmp_path, thousand
 
 
 def write_manifest(path, plain):
-    """Write a manifest with the checksum that physx looks for."""
+    """Write a manifest with a valid checksum."""
     import zlib
 
     plain = {name: value for name, value in plain.items() if name != "crc32"}
@@ -178,7 +178,7 @@ def write_manifest(path, plain):
     path.write_bytes(body + b',\n "crc32": "%08x"\n}' % zlib.crc32(body))
 
 
-def test_a_merge_that_is_not_possible_changes_nothing(folder, tmp_path, thousand):
+def test_an_invalid_merge_changes_nothing(folder, tmp_path, thousand):
     thousand.write(folder)
     thousand.write(tmp_path / "other")
     with Dataset.create(tmp_path / "fields") as dataset:
@@ -225,7 +225,7 @@ def test_a_removed_partition_is_gone(folder, thousand):
     thousand.check(folder, rows)
 
 
-def test_a_partition_that_is_not_there_is_not_removed(folder, thousand):
+def test_a_missing_partition_cannot_be_removed(folder, thousand):
     thousand.write(folder)
     with Dataset.open(folder, writable=True, session="b") as dataset:
         dataset.append("training", thousand.part(0, 10))
@@ -239,7 +239,7 @@ def test_a_partition_that_is_not_there_is_not_removed(folder, thousand):
     thousand.check(folder, thousand.stacked(thousand.rows, (0, 10)))
 
 
-def test_a_removal_that_was_cut_short_is_completed(folder, thousand):
+def test_an_interrupted_removal_is_completed(folder, thousand):
     thousand.write(folder)
     plain = json.loads((folder / "dataset.json").read_text())
     mode = plain["modes"]["training"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, TypeAlias, cast, get_args
 
 from physx_core.dataset.read import memory
 from physx_core.errors import ConfigError, listed
@@ -52,8 +52,7 @@ def check_strategy(choice: str) -> Strategy | None:
     """
     if choice == "auto":
         return None
-    for known in get_args(Strategy):
-        if choice == known:
-            return known  # type: ignore[no-any-return]
+    if choice in get_args(Strategy):
+        return cast(Strategy, choice)
     names = listed(["auto", *get_args(Strategy)])
     raise ConfigError(f'There is no reading strategy "{choice}". Strategies: {names}.')

@@ -14,7 +14,7 @@ from physx_core.dataset.repair import recovery
 from physx_core.dataset.repair.report import find_problem, find_problems
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
-from physx_core.dataset.store.partition_file import rewrite
+from physx_core.dataset.store.partition_file import copy
 from physx_core.dataset.store.virtual_index import write_index
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
@@ -118,8 +118,8 @@ def _repair_partition(folder: Path, mode: Mode, partition: Partition) -> list[st
             paths = [partition.path(folder, each) for each in mode.fields]
             return [_set_aside(folder, paths, problem, partition.rows)]
         path, identity = partition.path(folder, name), partition.identity(field)
-        offset = partition.offsets[name]
-        partition.offsets[name] = rewrite(path, identity, partition.rows, offset)
+        offset, rows = partition.offsets[name], partition.rows
+        partition.offsets[name], _ = copy(path, offset, path, identity, rows)
         done.append(f"{problem} Its rows are sound and have a new header.")
     return done
 

@@ -23,6 +23,7 @@ class PartitionFile:
     Attributes:
         identity: What the file is part of.
         data_offset: Offset of the first row.
+        descriptor: The open file; -1 if it is closed.
     """
 
     def __init__(self, path: Path, identity: Identity, header: Header, descriptor: int) -> None:
@@ -33,7 +34,7 @@ class PartitionFile:
         self._rows_offset = header.rows_offset
         self._size = header.size
         self._reserved = len(header.content)
-        self._descriptor = descriptor
+        self.descriptor = descriptor
 
     @classmethod
     def create(cls, directory: Path, identity: Identity, capacity: int) -> PartitionFile:
@@ -91,65 +92,42 @@ class PartitionFile:
         """
         if self._row_nbytes:
             offset = self.data_offset + row * self._row_nbytes
-            files.write_at(self._descriptor, files.as_bytes(block), offset)
+            files.write_at(self.descriptor, files.as_bytes(block), offset)
 
     def commit(self, rows: int) -> None:
         """Make the first `rows` rows part of the dataset."""
-        files.write_at(self._descriptor, rows.to_bytes(8, "little"), self._rows_offset)
-
-    @property
-    def descriptor(self) -> int:
-        """The open file."""
-        return self._descriptor
+        files.write_at(self.descriptor, rows.to_bytes(8, "little"), self._rows_offset)
 
     def sync(self) -> None:
         """Wait until everything written is on the disk."""
-        os.fdatasync(self._descriptor)
+        os.fdatasync(self.descriptor)
 
     def close(self) -> None:
         """Close the file; calling it again does nothing."""
-        if self._descriptor >= 0:
+        if self.descriptor >= 0:
             os.close(self.hand_over())
 
     def hand_over(self) -> int:
         """Return the open file to the caller, who closes it."""
-        descriptor, self._descriptor = self._descriptor, -1
+        descriptor, self.descriptor = self.descriptor, -1
         return descriptor
 
     def _allocate(self, end: int) -> None:
-        os.posix_fallocate(self._descriptor, self._reserved, end - self._reserved)
+        os.posix_fallocate(self.descriptor, self._reserved, end - self._reserved)
         self._reserved = end
-
-
-def rewrite(path: Path, identity: Identity, rows: int, data_offset: int) -> int:
-    """Replace a partition file by one that holds exactly its first `rows` rows.
-
-    Args:
-        path: The file.
-        identity: What it is part of.
-        rows: How many rows it keeps.
-        data_offset: Offset of the first one in the present file.
-
-    Returns:
-        Offset of the first row in the new file.
-
-    Raises:
-        OSError: If the new file cannot be written; the present one is left as it is.
-    """
-    return copy(path, data_offset, path, identity, rows)[0]
 
 
 def copy(
     source: Path, source_offset: int, path: Path, identity: Identity, rows: int
 ) -> tuple[int, int]:
-    """Copy the rows of a partition file to a new one, which gets its name when it is complete.
+    """Copy rows of a partition file to a new one, which gets its name when it is complete.
 
     Args:
         source: The other file.
         source_offset: Offset of its first row.
-        path: The new file; an existing one is replaced.
+        path: The new file; an existing one is replaced, even the source itself.
         identity: What it is part of.
-        rows: How many rows it gets.
+        rows: How many of the first rows it gets.
 
     Returns:
         Offset of the first row in the new file, and the CRC-32 of the rows.

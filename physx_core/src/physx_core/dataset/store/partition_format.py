@@ -99,14 +99,12 @@ class Inspection:
         identity: What it is part of.
         capacity: How many rows fit in.
         rows: How many rows are committed.
-        rows_offset: Offset of the row count.
         data_offset: Offset of the first row.
     """
 
     identity: Identity
     capacity: int
     rows: int
-    rows_offset: int
     data_offset: int
 
 
@@ -245,8 +243,8 @@ def _inspection(content: Any) -> Inspection:
     )
     if np.dtype(field.dtype) != data.dtype or field.role not in ("training", "additional"):
         raise ValueError(f"{data.dtype} and {field.role!r} are not the type and role of a field")
-    rows_offset, data_offset = counter.id.get_offset(), data.id.get_offset()
-    if rows_offset is None or (data_offset is None and data.size * field.nbytes):
+    data_offset = data.id.get_offset()
+    if counter.id.get_offset() is None or (data_offset is None and data.size * field.nbytes):
         raise ValueError("it has no space allocated for rows")
     identity = Identity(
         str(attributes["session"]),
@@ -259,7 +257,6 @@ def _inspection(content: Any) -> Inspection:
         identity,
         capacity=data.shape[0],
         rows=min(int(counter[()]), data.shape[0]),
-        rows_offset=rows_offset,
         data_offset=data_offset or 0,
     )
 

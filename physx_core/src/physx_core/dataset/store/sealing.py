@@ -11,7 +11,7 @@ from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
 from physx_core.dataset.store.manifest import Partition, has_statistics
-from physx_core.dataset.store.partition_file import rewrite
+from physx_core.dataset.store.partition_file import copy
 from physx_core.fields import Field
 from physx_core.statistics import RunningStatistics
 
@@ -39,7 +39,7 @@ def seal(directory: Path, fields: Mapping[str, Field], partition: Partition) -> 
         offsets[name] = found.data_offset
         if found.capacity != partition.rows or found.rows != partition.rows:
             path, identity = partition.path(directory, name), partition.identity(field)
-            offsets[name] = rewrite(path, identity, partition.rows, found.data_offset)
+            offsets[name], _ = copy(path, found.data_offset, path, identity, partition.rows)
     files.sync_folder(directory)
     sealed = replace(partition, offsets=offsets, sealed=True, writing=False)
     return scan(directory, fields, sealed)
