@@ -153,3 +153,17 @@ def test_large_finite_values_are_fine(dataset):
     assert dataset.num_samples("training") == 4
     with pytest.raises(NotFiniteError):
         dataset.append("training", {"x": values, "y": np.full(3, 1e300)})
+
+
+def test_checked_rows_are_still_of_the_fields_names_shapes_and_types(dataset):
+    dataset.define_fields("training", [Field("x", (), "float32")])
+    dataset.append("training", {"x": np.ones(2, "float32")}, checked=True)
+    for error, rows in (
+        (UnknownFieldError, {"x": np.ones(1, "float32"), "y": [1]}),
+        (FieldShapeError, {"x": np.ones((1, 2), "float32")}),
+        (FieldTypeError, {"x": [1j]}),
+        (NotFiniteError, {"x": [1e300]}),
+    ):
+        with pytest.raises(error):
+            dataset.append("training", rows, checked=True)
+    assert dataset.num_samples("training") == 2
