@@ -128,7 +128,9 @@ class SampleError(PhysxError):
         self.field, self.instance_id, self.step = field, instance_id, step
         if instance_id:
             message = f"Instance {instance_id}, step {step}: {message}"
-        super().__init__(message[:1].upper() + message[1:])
+        elif field:
+            message = message[:1].upper() + message[1:]
+        super().__init__(message)
 
 
 class MissingFieldError(SampleError):
