@@ -61,7 +61,7 @@ LAYERS_OF_BLOCKS = LAYERS[:2]
 
 
 class Recording(RobotEnv):
-    """Notes its options."""
+    """Remembers its options."""
 
     def __init__(self, simulator, step_dt, tags=(), **kwargs):
         super().__init__(simulator, step_dt, **kwargs)
@@ -115,7 +115,7 @@ def test_toml_json_and_code_are_the_same(tmp_path):
     assert type(build_pipeline(ENVIRONMENT)()) is RobotEnv
 
 
-def test_rewards_and_terminations_are_parts_too():
+def test_rewards_and_terminations_are_described_by_tables():
     env = build_pipeline(ENVIRONMENT, LAYERS)()
     assert isinstance(env, ComposedEnv)
     env.reset(seed=0)
@@ -133,7 +133,7 @@ class Rewarded(ControlledEnv):
         return 7.0
 
 
-def test_a_layer_of_ones_own_and_options_of_the_environment():
+def test_a_custom_layer_and_options_of_the_environment():
     rewarded = {**LAYERS[1], "wrapper": {"cls": Rewarded}}
     env = build_pipeline(ENVIRONMENT, [LAYERS[0], rewarded])(step_dt=0.01)
     assert env.step_dt == 0.01
@@ -171,7 +171,7 @@ def test_options_do_not_stick():
     assert layered().tags == ["a"]
 
 
-def test_what_it_was_made_of_may_change_later():
+def test_tables_may_change_after_the_pipeline_is_built():
     layers = [{"wrapper": {"cls": "ComposedEnv", "kwargs": {}}}]
     made = build_pipeline(RECORDING, layers)
     layers[0]["wrapper"]["cls"] = "nothing"
@@ -192,7 +192,7 @@ def test_pipeline_and_environment_are_pickled(layers):
     np.testing.assert_array_equal(flat(env.step(action)[0]), flat(other.step(action)[0]))
 
 
-def test_wrappers_of_gymnasium_and_scripts(tmp_path):
+def test_gymnasium_wrappers_and_classes_in_scripts(tmp_path):
     (tmp_path / "own.py").write_text(
         "from physx_gym import RobotEnv\nclass Own(RobotEnv):\n    mine = True\n",
         encoding="utf-8",
@@ -205,7 +205,7 @@ def test_wrappers_of_gymnasium_and_scripts(tmp_path):
     assert observed.shape == env.observation_space.shape
 
 
-def test_an_id_of_gymnasium():
+def test_a_gymnasium_id():
     env = build_pipeline({"cls": "CartPole-v1"})()
     assert type(env).__name__ == "CartPoleEnv"
     assert env.reset(seed=0)[0].shape == (4,)
