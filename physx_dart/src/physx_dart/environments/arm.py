@@ -33,8 +33,6 @@ _FADE = 2.0
 _SETTLING = 0.2
 """Time, in s, for which each new motion runs before it is sampled."""
 
-Reference = tuple[Vector, Vector, Vector]
-
 
 class ArmEnvironment(Environment):
     """A seven-joint arm with two fingers, in one of two tasks.

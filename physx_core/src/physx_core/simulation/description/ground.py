@@ -128,6 +128,3 @@ class HeightField:
         """Return x and y of the point ``heights[0, 0]``, in m."""
         x, y = self.origin or (0.0, 0.0)
         return x, y
-
-
-Terrain = Ground | Stairs | HeightField
