@@ -2,6 +2,7 @@
 
 from .backend import Backend as Backend
 from .backend import Hook as Hook
+from .backend import RobotInfo as RobotInfo
 from .backend import Simulation as Simulation
 from .description.ground import Ground as Ground
 from .description.ground import HeightField as HeightField
@@ -28,7 +29,6 @@ from .motors.motor import Motor as Motor
 from .motors.motor import with_rotors as with_rotors
 from .motors.motors import Motors as Motors
 from .motors.motors import MotorState as MotorState
-from .robot_info import RobotInfo as RobotInfo
 from .sensors.sensor import ContactSensor as ContactSensor
 from .sensors.sensor import EffortSensor as EffortSensor
 from .sensors.sensor import Encoder as Encoder

@@ -83,7 +83,9 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._wrenches, self._hooks = Wrenches(self.period), Hooks()
         self._set_command_limits()
         self._watch()
-        self._hold(self._neutral_commands())
+        commands = np.zeros(self._joint_count)
+        commands[self._positioned] = self.positions()[self._positioned_q]
+        self._hold(commands)
 
     def _set_command_limits(self) -> None:
         layout = self.layout
@@ -101,14 +103,11 @@ class RobotSimulation(Simulation, Generic[Engine]):
         # Square of a norm up to which no command has to be clipped.
         self._tame = tame**2 if tame > 0 else -1.0
         self._positioned = np.flatnonzero(modes == "position")
-
-    def _neutral_commands(self) -> Vector:
-        commands = np.zeros(len(self.layout.joints))
-        for robot, part in zip(self._robots, self._joints, strict=True):
-            at_rest = robot.neutral()[robot.nq - len(robot.model.joints) :]
-            settings = [joint.settings.mode == "position" for joint in robot.model.joints]
-            commands[part] = np.where(settings, at_rest, 0.0)
-        return commands
+        joints = [joint for mover in self.parts.movers for joint in mover.model.joints]
+        gains = np.array([min(joint.settings.gain, 1 / self.period) for joint in joints])
+        self._gains = gains[self._positioned]
+        places = np.array(list(layout.position_index.values()), np.intp)
+        self._positioned_q = places[self._positioned]
 
     # Running --------------------------------------------------------------------------------
 
@@ -219,19 +218,13 @@ class RobotSimulation(Simulation, Generic[Engine]):
 
     def _steer(self) -> None:
         """Update the velocities of servos that approach position commands."""
-        if not len(self._positioned):
+        at = self._positioned
+        if not len(at):
             return
-        commands = self._commands.copy()
+        commands, most = self._commands.copy(), self.layout.max_velocity[at]
+        errors = commands[at] - self.positions()[self._positioned_q]
+        commands[at] = np.clip(self._gains * errors, -most, most)
         for robot, part in zip(self._robots, self._joints, strict=True):
-            joints = robot.model.joints
-            q = robot.positions()[robot.nq - len(joints) :]
-            for i, joint in enumerate(joints):
-                if joint.settings.mode == "position":
-                    gain = min(joint.settings.gain, 1 / self.period)
-                    speed = gain * (commands[part][i] - q[i])
-                    commands[part.start + i] = np.clip(
-                        speed, -joint.max_velocity, joint.max_velocity
-                    )
             robot.hold(commands[part])
 
     def _check_finite(self) -> None:
