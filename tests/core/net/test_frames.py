@@ -18,7 +18,7 @@ from physx_core.errors import (
     UnknownOptionError,
 )
 from physx_core.net import HEADER, FrameReader, Kind, decode_error, encode_error, pack
-from physx_core.workers.client.link import Link
+from physx_core.workers.client.link import WorkerLink
 
 # Frames -----------------------------------------------------------------------------------------
 
@@ -120,7 +120,7 @@ def test_a_bad_header_is_refused_before_anything_is_allocated(header):
     here, there = socket.socketpair()
     with here, there:
         here.sendall(HEADER.pack(*header))
-        with pytest.raises(ConnectionRefusedByPeerError, match="no message of physx"):
+        with pytest.raises(ConnectionRefusedByPeerError, match="not a physx message"):
             FrameReader(10).read(there)
 
 
@@ -164,7 +164,7 @@ def test_a_message_in_many_parts_arrives_whole():
 
     here, there = socket.socketpair()
     with there:
-        link = Link(here, FrameReader(100))
+        link = WorkerLink(here, FrameReader(100))
         thread = threading.Thread(target=receive)
         thread.start()
         link.send_parts(parts)

@@ -125,7 +125,7 @@ def test_a_launcher_that_forgets_its_handles_is_named(clients):
 @pytest.mark.parametrize(
     ("settings", "error", "text"),
     [
-        ({"launcher": NoLauncher}, ConfigError, "NoLauncher is no Launcher"),
+        ({"launcher": NoLauncher}, ConfigError, "NoLauncher is not a Launcher"),
         ({"launcher_kwargs": {"speed": 3}}, ConfigError, "unexpected keyword argument 'speed'"),
         ({"launcher": "physx/manuel"}, ComponentNotFoundError, 'Did you mean "manual"'),
     ],

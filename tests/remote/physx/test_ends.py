@@ -20,7 +20,7 @@ from physx_core.errors import (
     RemoteTimeoutError,
     UsageError,
 )
-from physx_core.net import FrameReader, Kind, ServerHandshake, header, pack, pack_value
+from physx_core.net import FrameReader, Kind, ServerHandshake, pack, pack_header, pack_value
 from physx_remote import PhysxObserver, RLEnvironment, connect, serve
 from physx_remote.physx.link import PhysxLink
 from physx_remote.physx.wire import ACT, SERVICE, VERSION
@@ -125,7 +125,7 @@ def impostor(answer):
 
 @pytest.mark.parametrize(
     "said",
-    [b"\xff" * 64, header(Kind.CHALLENGE, 1 << 30), b"", pack(Kind.CHALLENGE, b"x" * 76)],
+    [b"\xff" * 64, pack_header(Kind.CHALLENGE, 1 << 30), b"", pack(Kind.CHALLENGE, b"x" * 76)],
     ids=["noise", "1GB", "nothing", "lie"],
 )
 def test_what_is_no_service(said):
@@ -150,8 +150,8 @@ def test_what_is_no_service(said):
             pack_value(Kind.ANSWER, {"a": np.zeros(2)}, "", 1),
             "without the arrays of worlds",
         ),
-        (NOTHING, pack_value(Kind.REFUSAL, {"classes": 1}, "", 1), "describes none"),
-        (NOTHING, struct.pack("<IHHQ", 1 << 30, Kind.ANSWER, 0, 1), "no message of physx"),
+        (NOTHING, pack_value(Kind.REFUSAL, {"classes": 1}, "", 1), "does not describe one"),
+        (NOTHING, struct.pack("<IHHQ", 1 << 30, Kind.ANSWER, 0, 1), "not a physx message"),
         (NOTHING, pack(Kind.ANSWER, b"\xff" * 40, 1), "damaged"),
     ],
 )

@@ -19,7 +19,7 @@ from physx_core.errors import (
     RemoteTimeoutError,
     RequestError,
 )
-from physx_core.net import HEADER, Kind, decode_error, header, pack, pack_value
+from physx_core.net import HEADER, Kind, decode_error, pack, pack_header, pack_value
 from physx_remote import PhysxObserver, connect, connect_vector
 from physx_remote.physx.link import PhysxLink
 from physx_remote.physx.wire import ACT
@@ -111,7 +111,7 @@ def _is_closed(stranger):
     [
         b"GET / HTTP/1.1\r\nHost: physx.example\r\n\r\n",
         bytes(range(256)) * 8,
-        header(Kind.HELLO, 1 << 30),
+        pack_header(Kind.HELLO, 1 << 30),
         struct.pack("<IHHQ", 257, Kind.HELLO, 0, 0),
         HELLO + HELLO,
         HELLO + pack(Kind.PROOF, bytes(32), ACT),
@@ -191,7 +191,7 @@ def test_too_many_clients(serving, env):
     "said",
     [
         b"\xff" * 40,
-        header(Kind.ACTIONS, 1 << 30),
+        pack_header(Kind.ACTIONS, 1 << 30),
         struct.pack("<IHHQ", 10, 999, 0, 0),
         struct.pack("<IHHQ", 10, Kind.REQUEST, 5, 0),
         pack(Kind.ACTIONS, b"\xff" * 40, 1),

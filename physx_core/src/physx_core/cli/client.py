@@ -14,7 +14,7 @@ import tyro
 
 from physx_core.errors import ConfigError
 from physx_core.net.handshake import TOKEN_VARIABLE
-from physx_core.net.tokens import given_token
+from physx_core.net.tokens import find_token
 from physx_core.workers.client.client import run_client
 from physx_core.workers.client.joining import PATIENCE
 from physx_core.workers.processes.descendants import kill_descendants
@@ -47,7 +47,7 @@ def run(words: Sequence[str]) -> None:
         SystemExit: If the environment fails or the server is gone, which the client has printed.
     """
     options = tyro.cli(Client, args=words, prog="physx client")
-    token = given_token(options.token_file)
+    token = find_token(options.token_file)
     if token is None:
         raise ConfigError(
             f"A client needs the token of the run: set {TOKEN_VARIABLE}, or name a file that "

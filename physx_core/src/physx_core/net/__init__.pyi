@@ -6,14 +6,14 @@ from .addresses import parse_address as parse_address
 from .addresses import retry as retry
 from .connection import Connection as Connection
 from .connection import Reader as Reader
-from .flat import flat_prefix as flat_prefix
+from .flat import describe_flat as describe_flat
 from .frames import HEADER as HEADER
 from .frames import MAX_PAYLOAD as MAX_PAYLOAD
 from .frames import Frame as Frame
 from .frames import FrameReader as FrameReader
 from .frames import Kind as Kind
-from .frames import header as header
 from .frames import pack as pack
+from .frames import pack_header as pack_header
 from .handshake import HANDSHAKE_LIMIT as HANDSHAKE_LIMIT
 from .handshake import TOKEN_VARIABLE as TOKEN_VARIABLE
 from .handshake import ServerHandshake as ServerHandshake
@@ -23,8 +23,7 @@ from .remote_errors import decode_error as decode_error
 from .remote_errors import encode_error as encode_error
 from .spin_wait import yield_core as yield_core
 from .strangers import Strangers as Strangers
-from .tokens import checked_token as checked_token
-from .tokens import given_token as given_token
+from .tokens import find_token as find_token
 from .values import decode as decode
 from .values import encode as encode
 from .values import pack_value as pack_value

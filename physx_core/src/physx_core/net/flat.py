@@ -1,8 +1,8 @@
-"""Flat dictionaries: names to arrays, whose layout as bytes is worked out only once.
+"""Flat dictionaries of arrays, encoded with a layout that is worked out only once.
 
-A sample or prediction has the same names, types and shapes again and again. So the JSON text in
-front of its raw bytes, and where each array lies in them, are kept and found again. The bytes say
-everything: neither side needs to have seen any before.
+Samples and predictions have the same names, types and shapes again and again. So the JSON text in
+front of the raw bytes, and the place of each array in them, are cached. Each message is complete:
+neither side needs to have seen an earlier one.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ LENGTH = struct.Struct("<I")
 """Length of the JSON text that follows."""
 
 OPENING = b'{"flat":'
-"""Begin of the JSON text of a flat dictionary."""
+"""Start of the JSON text of a flat dictionary."""
 
 LONGEST_TEXT = 4096
-"""Longest JSON text in bytes that a flat dictionary has."""
+"""Longest JSON text of a flat dictionary in bytes."""
 
 _MOST_KEPT = 256
 _ALIGNMENT = 16
@@ -42,11 +42,11 @@ _Place: TypeAlias = tuple[str, np.dtype[Any], tuple[int, ...], int]
 _Finish: TypeAlias = tuple[str, Callable[[Array], Any]]
 
 
-def flat_prefix(value: dict[Any, Any]) -> tuple[bytes, int]:
-    """Return what stands in front of a dictionary's arrays, and how long it is with them.
+def describe_flat(value: dict[Any, Any]) -> tuple[bytes, int]:
+    """Return the bytes in front of a dictionary's arrays, and the length of all bytes.
 
     Args:
-        value: Flat if all keys are ASCII texts, and all values arrays of numbers or NumPy's
+        value: Flat if all keys are ASCII strings, and all values arrays of numbers or NumPy's
             numbers; otherwise the prefix is empty.
     """
     try:
@@ -55,7 +55,7 @@ def flat_prefix(value: dict[Any, Any]) -> tuple[bytes, int]:
         return b"", 0
 
 
-def flat_bytes(prefix: bytes, value: dict[str, Any]) -> bytes:
+def pack_flat(prefix: bytes, value: dict[str, Any]) -> bytes:
     """Return a flat dictionary as bytes behind its prefix."""
     try:
         return b"".join((prefix, *value.values()))
@@ -66,7 +66,7 @@ def flat_bytes(prefix: bytes, value: dict[str, Any]) -> bytes:
 
 @lru_cache(_MOST_KEPT)
 def _prefix(keys: tuple[Any, ...], layouts: tuple[_Layout, ...]) -> tuple[bytes, int]:
-    """Return the text with its length in front, and the length of all bytes; no text: not flat.
+    """Return the JSON text behind its length, and the length of all bytes; no text: not flat.
 
     Args:
         keys: The keys, and then their types.
@@ -90,15 +90,15 @@ def _prefix(keys: tuple[Any, ...], layouts: tuple[_Layout, ...]) -> tuple[bytes,
     return prefix, len(prefix) + length
 
 
-def flat_value(text: bytes, payload: bytearray) -> dict[str, Any]:
-    """Return the dictionary that `flat_bytes` was given.
+def unpack_flat(text: bytes, payload: bytearray) -> dict[str, Any]:
+    """Return the dictionary that was given to `pack_flat`.
 
     Args:
         text: The JSON text, not longer than `LONGEST_TEXT`.
         payload: All bytes, those of the text among them; the arrays are views of them.
 
     Raises:
-        ValueError: Text or bytes are damaged; or another exception of damaged JSON.
+        ValueError: If text or bytes are damaged; damaged JSON may raise other exceptions.
     """
     places, finishes, length = _places(text)
     if len(payload) != length:
@@ -113,17 +113,17 @@ def flat_value(text: bytes, payload: bytearray) -> dict[str, Any]:
 
 @lru_cache(_MOST_KEPT)
 def _places(text: bytes) -> tuple[list[_Place], list[_Finish], int]:
-    """Return where the arrays lie, what remains to be done with some, and the length of all."""
+    """Return the places of the arrays, functions to apply to some of them, and the length."""
     offset = LENGTH.size + len(text)
     places: list[_Place] = []
     finishes: list[_Finish] = []
     for name, kind, sizes in json.loads(text)["flat"]:
-        dtype = plain_dtype(kind)
-        shape = () if sizes == _SCALAR else plain_shape(sizes)
+        dtype = parse_dtype(kind)
+        shape = () if sizes == _SCALAR else parse_shape(sizes)
         if not isinstance(name, str) or dtype.kind not in _NUMBERS:
             raise ValueError(f"an entry is damaged: {str(name)[:50]!r}")
         if dtype.kind == "b":
-            finishes.append((name, checked))
+            finishes.append((name, check_array))
         if sizes == _SCALAR:
             finishes.append((name, _scalar))
         elif offset % dtype.alignment:
@@ -137,11 +137,11 @@ def _scalar(array: Array) -> Any:
     return array[()]
 
 
-def checked(array: Array) -> Array:
-    """Return an array that was received.
+def check_array(array: Array) -> Array:
+    """Return an array that was received, after checking its bytes.
 
     Raises:
-        ValueError: Its bytes stand for no truth values or no characters.
+        ValueError: If they are not valid truth values or characters.
     """
     kind, order = array.dtype.kind, array.dtype.byteorder
     if kind == "b" and (array.view(np.uint8) > 1).any():
@@ -149,28 +149,28 @@ def checked(array: Array) -> Array:
     if kind == "U" and array.size and array.dtype.itemsize:
         codes = array.reshape(-1).view(np.dtype(np.uint32).newbyteorder(order))
         if (codes > _LAST_CHARACTER).any():
-            raise ValueError("characters are none")
+            raise ValueError("there are invalid characters")
     return array
 
 
-def plain_dtype(text: Any) -> np.dtype[Any]:
-    """Return the NumPy type of a text that was received.
+def parse_dtype(text: Any) -> np.dtype[Any]:
+    """Return the NumPy type of a string that was received.
 
     Raises:
-        ValueError: It is none whose elements have a fixed plain layout.
-        TypeError: The same.
+        ValueError: If it does not name a type whose elements have a fixed plain layout.
+        TypeError: If NumPy does not know the type.
     """
     if not isinstance(text, str) or not _DTYPE.fullmatch(text):
-        raise ValueError(f"{str(text)[:50]!r} is no plain type")
+        raise ValueError(f"{str(text)[:50]!r} is not a plain type")
     return np.dtype(text)
 
 
-def plain_shape(sizes: Any) -> tuple[int, ...]:
-    """Return the shape of a list that was received.
+def parse_shape(sizes: Any) -> tuple[int, ...]:
+    """Return the shape in a list that was received.
 
     Raises:
-        ValueError: It is none.
+        ValueError: If it is not a shape.
     """
     if not isinstance(sizes, list) or not all(type(n) is int and 0 <= n < 1 << 60 for n in sizes):
-        raise ValueError(f"{str(sizes)[:50]!r} is no shape")
+        raise ValueError(f"{str(sizes)[:50]!r} is not a shape")
     return tuple(sizes)

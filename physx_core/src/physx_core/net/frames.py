@@ -1,4 +1,4 @@
-"""Frames: every message is a fixed header and a payload whose size is checked before it is read."""
+"""Frames: messages with a fixed header and a payload whose size is checked before it is read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from physx_core.errors import ConnectionRefusedByPeerError, UsageError
 from physx_core.net.connection import Reader
 
 HEADER = struct.Struct("<IHHQ")
-"""Length of the payload in bytes, kind, spare (0), number."""
+"""Length of the payload in bytes, kind, reserved (0), number."""
 
 _BUFFER = 1 << 17
 _DIRECT = 1 << 14
@@ -22,58 +22,58 @@ MAX_PAYLOAD = 1 << 30
 
 
 class Kind(enum.IntEnum):
-    """What a frame says; `number` is named in brackets where it has a meaning."""
+    """Kind of a frame; the meaning of `number` is in brackets where it has one."""
 
     HELLO = 1
     """Client: magic, version, challenge."""
     CHALLENGE = 2
     """Server: magic, version, challenge, proof."""
     PROOF = 3
-    """Client: proof [instance it wants to run, 0: any]."""
+    """Client: proof [number of the instance to run, 0: any]."""
     SETUP = 4
-    """Server: what the instance is made from."""
+    """Server: the arguments of the instance."""
     READY = 5
-    """Client: the environment lives; its fields, shapes may be open."""
+    """Client: the environment is ready; its fields, whose shapes may still be open."""
     FIELDS = 6
-    """Client: the fields as the first sample has them."""
+    """Client: the fields with the shapes of the first sample."""
     CREDIT = 7
-    """Server: rows may be made [how many since the beginning]."""
+    """Server: rows may be made [their total number since the start]."""
     ROWS = 8
-    """Client: a block of rows, column by column [how many]."""
+    """Client: a block of rows, column by column [number of rows]."""
     PREDICT = 9
-    """Client: wants a prediction for one sample [number of the request]."""
+    """Client: request for the prediction of one sample [number of the request]."""
     SAVE = 10
-    """Client: wants parameters to be kept [number of the request]."""
+    """Client: request to keep parameters [number of the request]."""
     LOAD = 11
-    """Client: wants the parameters that were kept [number of the request]."""
+    """Client: request for the parameters that were kept [number of the request]."""
     ANSWER = 12
-    """Server: answers a request [its number]."""
+    """Server: answer to a request [number of the request]."""
     REFUSAL = 13
-    """Server: a request failed, with the error [its number]."""
+    """Server: error of a request that failed [number of the request]."""
     SHOW = 14
     """Client: drawing events [step]."""
     APPLY = 15
-    """Server: predictions for the environment [how many]."""
+    """Server: predictions for the environment [number of rows]."""
     ERROR = 16
-    """Either: an error that ends the client [row that could not be made, 0: none concerned]."""
+    """Either: an error that ends the client [row that could not be made, 0: no row]."""
     CLOSE = 17
-    """Server: close the environment and end."""
+    """Server: order to close the environment and exit."""
     BYE = 18
     """Client: the environment is closed."""
     STORED = 19
-    """Server: stored rows that the next rows shall be made of [how many]."""
+    """Server: stored rows from which to make the next rows [number of rows]."""
     WRONG = 20
     """Client: rows that `check_sample` rejected, sent before the next accepted ones [how many]."""
     AGAIN = 21
-    """Client: makes rows again that the server has from a client before it [how many so far]."""
+    """Client: repeats rows that the server has from its predecessor [number of rows so far]."""
     REQUEST = 22
-    """Client of an environment that is served: what is to be done [number of the request]."""
+    """Client of a served environment: a request [number of the request]."""
     ACTIONS = 23
-    """Client of an environment that is served: actions of its worlds [number of the request]."""
+    """Client of a served environment: actions of its worlds [number of the request]."""
     NOTES = 24
-    """Server: what goes with the next message and has no fixed layout [as there]."""
+    """Server: values of no fixed layout that belong to the next message [as there]."""
     SEEN = 25
-    """Server: what became of a request, for clients that watch [how many there were so far]."""
+    """Server: the result of a request, for observing clients [number of results so far]."""
 
 
 _KINDS = {int(kind): kind for kind in Kind}
@@ -83,9 +83,9 @@ class Frame(NamedTuple):
     """One message.
 
     Attributes:
-        kind: What it says.
+        kind: Its kind.
         number: A number whose meaning depends on the kind.
-        payload: Its content; nobody else holds this buffer.
+        payload: Its content, a buffer of its own.
     """
 
     kind: Kind
@@ -97,16 +97,16 @@ def pack(kind: Kind, payload: bytes = b"", number: int = 0) -> bytes:
     """Return a message as the bytes to send.
 
     Raises:
-        UsageError: The payload is longer than a frame may be.
+        UsageError: If the payload is longer than a frame may be.
     """
-    return header(kind, len(payload), number) + payload
+    return pack_header(kind, len(payload), number) + payload
 
 
-def header(kind: Kind, length: int, number: int = 0) -> bytes:
+def pack_header(kind: Kind, length: int, number: int = 0) -> bytes:
     """Return the header of a message whose payload has `length` bytes.
 
     Raises:
-        UsageError: The payload is longer than a frame may be.
+        UsageError: If the payload is longer than a frame may be.
     """
     if length > MAX_PAYLOAD:
         raise UsageError(
@@ -120,16 +120,16 @@ def header(kind: Kind, length: int, number: int = 0) -> bytes:
 class FrameReader(Reader):
     """Reads frames from a socket, blocking or not.
 
-    Frames come several to a system call through a buffer; what a long one still lacks then goes
-    straight to its place, which grows as its bytes arrive: a peer that announces much and sends
-    little takes little memory.
+    One system call may read several frames into a buffer. The missing bytes of a long frame are
+    read directly into its payload, which grows as they arrive, so that a peer that announces much
+    and sends little takes little memory.
     """
 
     def __init__(self, limit: int) -> None:
-        """Begin in front of a header.
+        """Start in front of a header.
 
         Args:
-            limit: Longest payload in bytes that is taken.
+            limit: Longest payload in bytes that is accepted.
         """
         self._limit = limit
         self._socket_may_have_more = False
@@ -141,7 +141,7 @@ class FrameReader(Reader):
 
     @property
     def limit(self) -> int:
-        """Longest payload in bytes that is taken."""
+        """Longest payload in bytes that is accepted."""
         return self._limit
 
     @limit.setter
@@ -155,7 +155,7 @@ class FrameReader(Reader):
 
     @property
     def has_buffered(self) -> bool:
-        """Whether a whole frame that was received waits to be read."""
+        """Whether a whole frame has been received and not read."""
         waiting = self._end - self._start - HEADER.size
         if waiting < 0 or self._large is not None:
             return False
@@ -163,12 +163,12 @@ class FrameReader(Reader):
 
     @property
     def arrived(self) -> int:
-        """How many bytes of a long frame that is on its way have arrived; 0 where none is."""
+        """How many bytes of an unfinished long frame have arrived; 0 if there is none."""
         return 0 if self._large is None else self._large.received
 
     @property
     def may_have_more(self) -> bool:
-        """Whether another `read` may find something at once; False is certain."""
+        """Whether another `read` may find something at once; False means that it does not."""
         return self._socket_may_have_more or self.has_buffered
 
     def read(self, connection: socket.socket) -> Frame | None:
@@ -235,7 +235,7 @@ class FrameReader(Reader):
         return self._end - self._start < len(self._bytes)
 
     def _buffered(self) -> Frame | None:
-        """Return the frame at the begin of the buffer if it is whole; make room for a long one."""
+        """Return the frame at the start of the buffer if it is whole; begin a long one."""
         start = self._start + HEADER.size
         if start > self._end:
             return None
@@ -243,8 +243,8 @@ class FrameReader(Reader):
         known = _KINDS.get(kind)
         if length > self._limit or spare or known is None:
             raise ConnectionRefusedByPeerError(
-                "The other side of a connection sent what is no message of physx, or one longer "
-                f"than the {self._limit} bytes that are taken here."
+                "The other side of a connection sent something that is not a physx message, or one "
+                f"longer than the {self._limit} bytes that are accepted here."
             )
         end = start + length
         if end <= self._end:
@@ -265,18 +265,18 @@ class FrameReader(Reader):
             if waiting:
                 self._bytes[:waiting] = self._bytes[self._start : self._end]
             self._start, self._end = 0, waiting
-        if self._after_large:  # after a long frame comes another: leave its bulk where it is
+        if self._after_large:  # another long frame is likely: read little more than its header
             return self._buffer[waiting : max(_DIRECT, waiting + HEADER.size)]
         return self._buffer[waiting:] if waiting else self._buffer
 
 
 class _LargeFrame:
-    """A long frame while it arrives.
+    """A long frame that has not arrived completely.
 
     Attributes:
         frame: The frame.
         received: How many bytes of its payload have arrived.
-        missing: How many have not.
+        missing: How many have not arrived.
     """
 
     def __init__(self, kind: Kind, number: int, length: int) -> None:
@@ -285,20 +285,20 @@ class _LargeFrame:
         self.received = 0
 
     def put(self, data: memoryview) -> None:
-        """Add bytes that were received elsewhere."""
+        """Append bytes that were received into another buffer."""
         self.frame.payload[: len(data)] = data
         self.received += len(data)
         self.missing -= len(data)
 
     def room(self) -> memoryview:
-        """Return where the next bytes belong."""
+        """Return where the next bytes go."""
         payload = self.frame.payload
         if self.received == len(payload):
             payload += bytes(min(self.missing, len(payload)))
         return memoryview(payload)[self.received :]
 
     def filled(self, room: memoryview, count: int) -> None:
-        """Note how many bytes were put into the room."""
+        """Count the bytes that were received into `room`."""
         room.release()
         self.received += count
         self.missing -= count

@@ -1,4 +1,4 @@
-"""Handshake: both sides prove that they know the token before anything else is read.
+"""Handshake: both sides prove that they know the token before any other message is read.
 
 Each side sends 32 random bytes; the other answers with their HMAC-SHA256 under the token. The
 token itself never travels. What follows is neither encrypted nor signed: across a network that
@@ -20,10 +20,10 @@ TOKEN_VARIABLE = "PHYSX_TOKEN"
 """Environment variable that holds the token of a run."""
 
 VERSION = 1
-"""Version of what client and server say to each other."""
+"""Version of the protocol between client and server."""
 
 HANDSHAKE_LIMIT = 256
-"""Longest payload in bytes that is taken from a stranger."""
+"""Longest payload in bytes that is accepted from a stranger."""
 
 _OPENING = struct.Struct("<8sI32s")
 _MAGIC = b"physxtcp"
@@ -39,7 +39,8 @@ class ServerHandshake:
     """The server's part of one handshake.
 
     Attributes:
-        instance_id: Instance that the client wants to run, 0 for any; None until it is trusted.
+        instance_id: Number of the instance that the client asks for, 0 for any; None until it is
+            trusted.
         since: When the server began to wait for the client, in monotonic s.
     """
 
@@ -47,7 +48,7 @@ class ServerHandshake:
         """Draw a challenge.
 
         Args:
-            token: What the client must know.
+            token: The token that the client must know.
         """
         self.instance_id: int | None = None
         self.since = time.monotonic()
@@ -59,15 +60,15 @@ class ServerHandshake:
         """Return what to send back; `instance_id` is set once the client is trusted.
 
         Raises:
-            ConnectionRefusedByPeerError: The client spoke nonsense or does not know the token.
+            ConnectionRefusedByPeerError: If the client sent nonsense or does not know the token.
         """
         if frame.kind is Kind.HELLO and self._other is None:
-            magic, version, self._other = _opening(frame.payload)
+            magic, version, self._other = _parse_opening(frame.payload)
             self.since = time.monotonic()
             if magic != _MAGIC:
-                raise ConnectionRefusedByPeerError("A stranger connected that is no physx client.")
+                raise ConnectionRefusedByPeerError("What connected is not a physx client.")
             opening = _OPENING.pack(_MAGIC, VERSION, self._own)
-            if version != VERSION:  # the client says what is wrong: it knows both versions now
+            if version != VERSION:  # the client knows both versions now and says what is wrong
                 return pack(Kind.CHALLENGE, opening + bytes(_PROOF_SIZE))
             proof = _proof(self._token, b"server", self._other, self._own)
             return pack(Kind.CHALLENGE, opening + proof)
@@ -88,12 +89,12 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
         instance: Number of the instance to run, 0 for any that is free.
 
     Returns:
-        The reader for what the server sends next.
+        The reader of the connection.
 
     Raises:
-        UnansweredError: The server does not answer, or ended the connection.
-        ConnectionRefusedByPeerError: The server is of another version, knows another token, or is
-            no server of physx.
+        UnansweredError: If the server does not answer, or ended the connection.
+        ConnectionRefusedByPeerError: If the server has another version or another token, or is
+            not a physx server.
     """
     reader = FrameReader(HANDSHAKE_LIMIT)
     own = secrets.token_bytes(32)
@@ -105,8 +106,8 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
             f"The server ended the connection or did not answer ({error})."
         ) from error
     if frame is None or frame.kind is not Kind.CHALLENGE:
-        raise ConnectionRefusedByPeerError("What answers at that address is no physx server.")
-    magic, version, other = _opening(frame.payload[:-_PROOF_SIZE])
+        raise ConnectionRefusedByPeerError("What answers at that address is not a physx server.")
+    magic, version, other = _parse_opening(frame.payload[:-_PROOF_SIZE])
     if magic != _MAGIC or version != VERSION:
         raise ConnectionRefusedByPeerError(
             f"The server speaks version {version} of the protocol, this client version {VERSION}. "
@@ -117,7 +118,7 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
     ):
         raise ConnectionRefusedByPeerError(
             "The server does not know this client's token. Set the environment variable "
-            f"{TOKEN_VARIABLE} to the token of the run that the client shall join, or name the "
+            f"{TOKEN_VARIABLE} to the token of the run to join, or name the "
             "file that holds it with --token-file."
         )
     proof = _proof(token, b"client", other, own, instance)
@@ -129,9 +130,9 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
     return reader
 
 
-def _opening(payload: bytearray) -> tuple[bytes, int, bytes]:
+def _parse_opening(payload: bytearray) -> tuple[bytes, int, bytes]:
     try:
         magic, version, challenge = _OPENING.unpack(payload)
     except struct.error:
-        raise ConnectionRefusedByPeerError("A stranger sent no proper greeting.") from None
+        raise ConnectionRefusedByPeerError("A stranger sent a malformed greeting.") from None
     return magic, version, challenge

@@ -1,4 +1,4 @@
-"""Failures: errors of physx as plain values, and back as the same classes."""
+"""Encodes errors of physx as plain values, and decodes them to the same classes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class RemoteTraceback(Exception):  # noqa: N818 - it is the cause of an error, n
     """The traceback of an error as text, as it was in the process that raised it."""
 
     def __str__(self) -> str:
-        """Return the text, set apart from the line in front of it."""
+        """Return the text on lines of its own."""
         return f"\n{self.args[0]}"
 
 
@@ -40,11 +40,11 @@ def decode_error(payload: bytes | bytearray) -> PhysxError:
     comes back as the nearest of them that it derives from.
 
     Raises:
-        ConnectionRefusedByPeerError: The bytes were not made by `encode_error`.
+        ConnectionRefusedByPeerError: If the bytes do not describe an error.
     """
     plain: dict[str, Any] = decode(payload)
     if not _is_error(plain):
-        raise ConnectionRefusedByPeerError("What was received as an error describes none.")
+        raise ConnectionRefusedByPeerError("What was received as an error does not describe one.")
     cls = next((c for c in map(_error_class, plain["classes"]) if c is not None), PhysxError)
     error = cls.__new__(cls)
     Exception.__init__(error, plain["message"])

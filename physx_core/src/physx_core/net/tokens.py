@@ -1,4 +1,4 @@
-"""Tokens: the secret of a run, where it comes from and who may read it."""
+"""Tokens: finds and checks the secret of a run."""
 
 from __future__ import annotations
 
@@ -16,31 +16,34 @@ _SHORTEST = 16
 _OTHERS = 0o077
 
 
-def given_token(token_file: str | None) -> str | None:
-    """Return the token that the user gave, None for none.
+def find_token(token_file: str | None, token: str | None = None) -> str | None:
+    """Return the token that the user gave, None if there is none.
 
     Args:
         token_file: File that holds it; None: it is in the environment variable ``PHYSX_TOKEN``.
+        token: The token itself, which then counts.
 
     Raises:
-        ConfigError: The file cannot be read, others may read it, or the token is too short.
+        ConfigError: If the file cannot be read, others may read it, or the token is too short.
     """
+    if token is not None:
+        return check_token(token, "token")
     if token_file is None:
         token, place = os.environ.get(TOKEN_VARIABLE), TOKEN_VARIABLE
     else:
         token, place = _read(token_file), token_file
-    return None if token is None else checked_token(token, place)
+    return None if token is None else check_token(token, place)
 
 
-def checked_token(token: str, place: str) -> str:
-    """Return a token that is long enough.
+def check_token(token: str, place: str) -> str:
+    """Return a token after checking that it is long enough.
 
     Args:
         token: The token.
-        place: Where it is from, for messages.
+        place: Where it comes from, for messages.
 
     Raises:
-        ConfigError: It is too short.
+        ConfigError: If it is too short.
     """
     if len(token) < _SHORTEST:
         raise ConfigError(
@@ -50,7 +53,7 @@ def checked_token(token: str, place: str) -> str:
     return token
 
 
-def run_token(config: EnvironmentConfig, by_hand: bool) -> str:
+def choose_token(config: EnvironmentConfig, by_hand: bool) -> str:
     """Return the token of a run: the one that the user gave, or a random one.
 
     Args:
@@ -58,9 +61,9 @@ def run_token(config: EnvironmentConfig, by_hand: bool) -> str:
         by_hand: Whether clients are started by hand, by somebody who has to know the token.
 
     Raises:
-        ConfigError: The user has to give a token and did not, or gave one that is unfit.
+        ConfigError: If the user has to give a token and did not, or the given one is unusable.
     """
-    token = given_token(config.token_file)
+    token = find_token(config.token_file)
     if token is not None:
         return token
     how = (
@@ -87,16 +90,16 @@ def _read(token_file: str) -> str:
         raise ConfigError(f"The token file {token_file} cannot be read: {error}.") from error
     if mode & _OTHERS:
         raise ConfigError(
-            f"Others than you may read or write the token file {token_file}: "
+            f"Other users may read or write the token file {token_file}: "
             f"chmod 600 {token_file}, and choose another token."
         )
     return text.strip()
 
 
 def _is_loopback(host: str) -> bool:
-    """Return whether a server there is reached from its own machine only."""
+    """Return whether only its own machine can reach a server at this address."""
     try:
         found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
         return all(ipaddress.ip_address(entry[4][0]).is_loopback for entry in found)
-    except (OSError, ValueError):  # the server says what is wrong with it, once it has a token
+    except (OSError, ValueError):  # the server reports what is wrong with it later
         return False

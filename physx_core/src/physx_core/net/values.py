@@ -23,14 +23,14 @@ from physx_core.net.flat import (
     LENGTH,
     LONGEST_TEXT,
     OPENING,
-    checked,
-    flat_bytes,
-    flat_prefix,
-    flat_value,
-    plain_dtype,
-    plain_shape,
+    check_array,
+    describe_flat,
+    pack_flat,
+    parse_dtype,
+    parse_shape,
+    unpack_flat,
 )
-from physx_core.net.frames import Kind, header, pack
+from physx_core.net.frames import Kind, pack, pack_header
 from physx_core.typing import Array
 
 _JSON = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
@@ -48,13 +48,13 @@ def encode(value: Any, what: str = "value") -> bytes:
         what: Name of the value for error messages.
 
     Raises:
-        UsageError: Something in it has another type, and the message says where; or there is more
-            text in it than can travel.
+        UsageError: If something in it has another type (the message says where), or it contains
+            too much text.
     """
     if type(value) is dict:
-        prefix, _ = flat_prefix(value)
+        prefix, _ = describe_flat(value)
         if prefix:
-            return flat_bytes(prefix, value)
+            return pack_flat(prefix, value)
     return _tree_bytes(value, what)
 
 
@@ -62,44 +62,44 @@ def pack_value(kind: Kind, value: Any, what: str, number: int = 0) -> bytes:
     """Return a message whose payload is a value as the bytes to send.
 
     Args:
-        kind: What the message says.
+        kind: Kind of the message.
         value: See `encode`.
         what: Name of the value for error messages.
         number: A number whose meaning depends on the kind.
 
     Raises:
-        UsageError: See `encode`; or the message is too long.
+        UsageError: See `encode`; or if the message is too long.
     """
     if type(value) is dict:
-        prefix, length = flat_prefix(value)
+        prefix, length = describe_flat(value)
         if prefix:
-            return flat_bytes(header(kind, length, number) + prefix, value)
+            return pack_flat(pack_header(kind, length, number) + prefix, value)
     return pack(kind, _tree_bytes(value, what), number)
 
 
 def _tree_bytes(value: Any, what: str) -> bytes:
-    """Return the bytes of a value that is not flat."""
+    """Return a value that is not flat as bytes."""
     blobs: list[bytes] = []
     try:
         text = _JSON.encode(_tree(value, what, blobs)).encode("ascii")
     except RecursionError:
-        raise UsageError(f"{what} is nested too deeply to travel to another process.") from None
+        raise UsageError(f"{what} is nested too deeply to be sent to another process.") from None
     if len(text) > _MAX_TEXT:
         raise UsageError(
-            f"{what} holds so many separate values that they are {len(text)} bytes of text, and "
-            f"{_MAX_TEXT} can travel to another process. Pass NumPy arrays instead of long lists."
+            f"{what} holds so many separate values that they take {len(text)} bytes of text, and "
+            f"at most {_MAX_TEXT} can be sent. Pass NumPy arrays instead of long lists."
         )
     return b"".join([LENGTH.pack(len(text)), text, *blobs])
 
 
 def decode(payload: bytes | bytearray | memoryview) -> Any:
-    """Return the value that `encode` was given; arrays are new and writable.
+    """Return the value that was given to `encode`; arrays are new and writable.
 
     Args:
-        payload: The bytes; where it is a bytearray, arrays may be views of it.
+        payload: The bytes; arrays may be views of it if it is a bytearray.
 
     Raises:
-        ConnectionRefusedByPeerError: The bytes were not made by `encode`.
+        ConnectionRefusedByPeerError: If the bytes are not an encoded value.
     """
     try:
         (length,) = LENGTH.unpack_from(payload)
@@ -109,16 +109,16 @@ def decode(payload: bytes | bytearray | memoryview) -> Any:
         text = bytes(payload[LENGTH.size : start])
         if length <= LONGEST_TEXT and text.startswith(OPENING):
             own = payload if isinstance(payload, bytearray) else bytearray(payload)
-            return flat_value(text, own)
+            return unpack_flat(text, own)
         return _value(json.loads(text), _Blobs(payload, start))
     except _DAMAGE as error:
         raise ConnectionRefusedByPeerError(
-            f"What was received or stored as values is damaged: {str(error)[:200]}."
+            f"Encoded values that were received or stored are damaged: {str(error)[:200]}."
         ) from error
 
 
 def _tree(value: Any, where: str, blobs: list[bytes]) -> Any:
-    """Return what JSON shall hold for a value; raw bytes go to the end of `blobs`."""
+    """Return the JSON form of a value; raw bytes are appended to `blobs`."""
     convert = _ENCODERS.get(type(value))
     if convert is not None:
         return convert(value, where, blobs)
@@ -198,7 +198,7 @@ _ENCODERS: dict[type[Any], Callable[[Any, str, list[bytes]], Any]] = {
 
 
 class _Blobs:
-    """The raw bytes behind the JSON text, read in their order."""
+    """The raw bytes behind the JSON text, in their order."""
 
     def __init__(self, payload: bytes | bytearray | memoryview, start: int) -> None:
         self._view = memoryview(payload)
@@ -206,7 +206,7 @@ class _Blobs:
 
     def take(self, length: Any) -> memoryview:
         if type(length) is not int:
-            raise ValueError(f"{str(length)[:50]!r} is no length")
+            raise ValueError(f"{str(length)[:50]!r} is not a length")
         end = self._start + length
         if not self._start <= end <= len(self._view):
             raise ValueError("there are fewer raw bytes than announced")
@@ -221,7 +221,7 @@ _DAMAGE = (
 
 
 def _value(tree: Any, blobs: _Blobs) -> Any:
-    """Return the value that JSON held."""
+    """Return the value of a JSON form."""
     if isinstance(tree, list):
         return [_value(item, blobs) for item in tree]
     if isinstance(tree, dict):
@@ -232,14 +232,14 @@ def _value(tree: Any, blobs: _Blobs) -> Any:
 
 def _array_of(content: Any, blobs: _Blobs) -> Array:
     kind, sizes, length = content
-    dtype, shape = plain_dtype(kind), plain_shape(sizes)
+    dtype, shape = parse_dtype(kind), parse_shape(sizes)
     data = blobs.take(length)
     if math.prod(shape) * max(1, dtype.itemsize) != length:
-        raise ValueError(f"{length} bytes are no array of {kind} and shape {shape}")
+        raise ValueError(f"{length} bytes are not an array of {kind} and shape {shape}")
     array = np.empty(shape, dtype)
     if length:
         array.reshape(-1).view(np.uint8)[:] = data
-    return checked(array)
+    return check_array(array)
 
 
 _DECODERS: dict[str, Callable[[Any, _Blobs], Any]] = {

@@ -1,4 +1,4 @@
-"""The process of a client that a server started: ``python -m physx_core.workers``."""
+"""Entry point of a client that a server started: ``python -m physx_core.workers``."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from physx_core.workers.processes.descendants import kill_descendants
 
 
 def main() -> int:
-    """Run the client that the command line describes; return its exit status."""
+    """Run the client of the command line; return its exit status."""
     parser = argparse.ArgumentParser(prog="python -m physx_core.workers", description=__doc__)
     parser.add_argument("--connect", metavar="HOST:PORT", required=True, help="the server")
     parser.add_argument("--instance", type=int, help="number of the instance; any by default")
     options = parser.parse_args()
-    faulthandler.enable()  # a crash of an engine says in which step it happened
-    faulthandler.register(signal.SIGTERM, all_threads=False, chain=True)  # a hang, where
+    faulthandler.enable()  # a crash of an engine shows where it happened
+    faulthandler.register(signal.SIGTERM, all_threads=False, chain=True)  # and so does a hang
     token = os.environ.pop(TOKEN_VARIABLE, "")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server decides when a run ends
-    if hasattr(os, "SCHED_BATCH"):  # a client that is woken lets the server wake the others first
+    if hasattr(os, "SCHED_BATCH"):  # a client that wakes up lets the server wake the others first
         with contextlib.suppress(OSError):  # not every container lets it choose
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     try:
@@ -34,7 +34,7 @@ def main() -> int:
         sys.stderr.write(f"physx client: {error}\n")
         return 1
     finally:
-        kill_descendants()  # where the server is gone too, nobody else does
+        kill_descendants()  # nobody else does if the server is gone too
 
 
 if __name__ == "__main__":

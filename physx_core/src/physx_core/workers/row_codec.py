@@ -9,7 +9,7 @@ import numpy as np
 
 from physx_core.errors import ConnectionRefusedByPeerError
 from physx_core.fields import Field
-from physx_core.net.frames import Kind, header
+from physx_core.net.frames import Kind, pack_header
 from physx_core.typing import Array, Batch
 
 _SMALL = 1 << 14
@@ -34,7 +34,7 @@ def pack_rows(block: Batch, count: int, kind: Kind = Kind.ROWS) -> list[bytes | 
     """
     arrays = list(block.values())
     length = sum(array.nbytes for array in arrays)
-    begin = header(kind, length, count)
+    begin = pack_header(kind, length, count)
     if length <= _SMALL:
         return [b"".join((begin, *(array.data for array in arrays)))]
     return [begin, *(array.reshape(-1).view("u1").data for array in arrays)]

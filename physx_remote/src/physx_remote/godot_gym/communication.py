@@ -158,7 +158,7 @@ class Communication(SocketService):
         kind = JsonReader if self._framing == "bare-json" else PrefixReader
         return kind(self._max_request)
 
-    def opened(self, connection: RequestConnection) -> None:
+    def on_open(self, connection: RequestConnection) -> None:
         """Close a further client, or log that it waits."""
         if self._served is None or self._clients == "serve":
             LOG.info("%s connected", connection.name)
@@ -167,7 +167,7 @@ class Communication(SocketService):
         else:
             LOG.info("%s waits until %s leaves", connection.name, self._served.name)
 
-    def closed(self, connection: RequestConnection) -> None:
+    def on_close(self, connection: RequestConnection) -> None:
         """Make room for the next client."""
         if connection is self._served:
             LOG.info("%s left", connection.name)
@@ -177,7 +177,7 @@ class Communication(SocketService):
         """Return whether it is this client's turn."""
         return self._clients == "serve" or self._served in (None, connection)
 
-    def received(self, connection: RequestConnection, body: bytes) -> Work:
+    def handle(self, connection: RequestConnection, body: bytes) -> Work:
         """Carry out one request."""
         if self._served is None:
             self._serve_only(connection)

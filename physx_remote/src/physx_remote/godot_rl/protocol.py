@@ -187,12 +187,12 @@ class _GodotRLService(SocketService):
         if self._released:
             self._worlds.close()
 
-    def closed(self, connection: RequestConnection) -> None:
+    def on_close(self, connection: RequestConnection) -> None:
         """End with the trainer."""
         LOG.info("The trainer at %s is gone", connection.name)
         self.close()
 
-    def received(self, connection: RequestConnection, body: bytes) -> Work | None:
+    def handle(self, connection: RequestConnection, body: bytes) -> Work | None:
         """Handle one message."""
         try:
             message = _parse_message(body)

@@ -21,10 +21,9 @@ from physx_core.net import (
     Frame,
     FrameReader,
     Kind,
-    checked_token,
     decode,
     decode_error,
-    given_token,
+    find_token,
     introduce,
 )
 from physx_remote.physx.wire import OBSERVE, SERVICE, VERSION
@@ -75,7 +74,7 @@ class PhysxLink(ClientConnection):
         """
         super().__init__(address)
         self.timeout = timeout
-        found = checked_token(token, "token") if token is not None else given_token(token_file)
+        found = find_token(token_file, token)
         if found is None:
             raise ConfigError(
                 f"A client of {self.name} needs the token of the service: set {TOKEN_VARIABLE}, or "

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from physx_core.checks import positive
 from physx_core.errors import ConfigError, UsageError
-from physx_core.net import MAX_PAYLOAD, checked_token, given_token
+from physx_core.net import MAX_PAYLOAD, find_token
 from physx_remote.physx.client import PhysxClient, PhysxEnv
 from physx_remote.physx.service import PhysxService
 from physx_remote.physx.vector_env import PhysxVectorEnv
@@ -61,7 +61,7 @@ class Physx(Protocol):
         for option, value in (("max_clients", max_clients), ("max_snapshots", max_snapshots)):
             if value < 1:
                 raise ConfigError(f"{option} is {value} but must be at least 1.")
-        found = checked_token(token, "token") if token is not None else given_token(token_file)
+        found = find_token(token_file, token)
         self.token = secrets.token_hex(32) if found is None else found
         self._options: dict[str, Any] = {
             "handshake_timeout": handshake_timeout,

@@ -18,10 +18,10 @@ from physx_core.net import (
     Reader,
     Strangers,
     decode,
+    describe_flat,
     encode_error,
-    flat_prefix,
-    header,
     pack,
+    pack_header,
     pack_value,
 )
 from physx_core.typing import Array
@@ -111,11 +111,11 @@ class PhysxService(SocketService):
         """Return a reader of frames."""
         return FrameReader(HANDSHAKE_LIMIT)
 
-    def opened(self, connection: RequestConnection) -> None:
+    def on_open(self, connection: RequestConnection) -> None:
         """Wait for a new client to prove that it knows the token."""
         self._strangers.add(connection)
 
-    def closed(self, connection: RequestConnection) -> None:
+    def on_close(self, connection: RequestConnection) -> None:
         """Forget a client; the worlds keep their state."""
         self._strangers.forget(connection)
         self._observers.pop(connection, None)
@@ -124,13 +124,13 @@ class PhysxService(SocketService):
             self._actor = None
             self._requests.forget_snapshots()
 
-    def drained(self, connection: RequestConnection) -> None:
+    def on_drain(self, connection: RequestConnection) -> None:
         """Send the latest state to an observer that did not keep up."""
         if self._observers.get(connection):
             self._observers[connection] = False
             self.send(connection, self._latest(Kind.SEEN, self._seen))
 
-    def received(self, connection: RequestConnection, body: Frame) -> Work | None:
+    def handle(self, connection: RequestConnection, body: Frame) -> Work | None:
         """Handle one frame."""
         kind, number, payload = body
         if connection in self._strangers:
@@ -293,11 +293,11 @@ def _message(
     """Return a message in parts; long arrays are not copied."""
     first = pack(Kind.NOTES, notes, number) if notes else b""
     whole = dict(arrays)
-    prefix, length = flat_prefix(whole)
+    prefix, length = describe_flat(whole)
     if length < _LARGE or len(whole) > _MOST_PARTS:
         message = pack_value(kind, whole, "observations", number)
         return [first + message]
-    opening = first + header(kind, length, number) + prefix
+    opening = first + pack_header(kind, length, number) + prefix
     return [opening, *(np.ascontiguousarray(array).data for array in whole.values())]
 
 

@@ -22,23 +22,25 @@ _READ = selectors.EVENT_READ
 _SLICE = 0.02
 
 Work = Iterator[float]
-"""A request in progress: yields how long it wants to be left alone, in s."""
+"""A request in progress: yields the time in s after which it goes on."""
 
 
 class SocketService(Service):
-    """Connections of a service.
+    """A service whose clients connect to a socket, or to whose socket it is connected.
 
-    `received` is called with one message after the other, whoever sent it; while the work that it
-    returns is in progress no other message is handed on, but connections are accepted, read and
-    closed, and timers run. Who sends faster than it is served, or does not read what it is sent,
-    waits.
+    `handle` is called with one message at a time, of any connection. While the work that it returns
+    is in progress no other message is handled, but connections are accepted, read and closed, and
+    timers run. A client that sends faster than it is served, or does not read its answers, waits.
+
+    Attributes:
+        connections: All open connections.
     """
 
     def __init__(self, *, max_clients: int = 256) -> None:
-        """Begin without any connection.
+        """Start without any connection.
 
         Args:
-            max_clients: How many connections are open at most; who comes then is closed at once.
+            max_clients: How many connections are open at most; further ones are closed at once.
         """
         self.address = ("", 0)
         self.connections: list[RequestConnection] = []
@@ -51,27 +53,27 @@ class SocketService(Service):
         self._lock = threading.RLock()
         self._is_open = self._is_polling = self._has_more = self._over = self._released = False
 
-    # What a subclass implements ---------------------------------------------------------------
+    # For a subclass to implement ---------------------------------------------------------------
 
     @abstractmethod
-    def received(self, connection: RequestConnection, body: Any) -> Work | None:
+    def handle(self, connection: RequestConnection, body: Any) -> Work | None:
         """Handle one message; return the rest of the work if it is not done at once."""
 
-    def opened(self, connection: RequestConnection) -> None:
+    def on_open(self, connection: RequestConnection) -> None:
         """Handle a new connection."""
 
-    def closed(self, connection: RequestConnection) -> None:
+    def on_close(self, connection: RequestConnection) -> None:
         """Handle the end of a connection; nothing can be sent on it."""
 
-    def drained(self, connection: RequestConnection) -> None:
-        """Handle that all is sent which had to wait."""
+    def on_drain(self, connection: RequestConnection) -> None:
+        """Handle that everything is sent that had to wait."""
 
     def admits(self, connection: RequestConnection) -> bool:
         """Return whether a message of this connection may be handled now."""
         return True
 
     def new_reader(self) -> Reader:
-        """Return what cuts the messages out of a new connection's stream."""
+        """Return the reader of a new connection."""
         return PrefixReader()
 
     @property
@@ -79,14 +81,14 @@ class SocketService(Service):
         """Whether `listen` was called."""
         return self._is_open and self._listener.address[1] > 0
 
-    # What a subclass calls ----------------------------------------------------------------------
+    # For a subclass to call ----------------------------------------------------------------------
 
     def listen(self, address: str, port: int) -> None:
-        """Begin to accept connections.
+        """Start to accept connections.
 
         Args:
             address: Address of this machine.
-            port: Port, 0 for any that is free.
+            port: Port, 0 for any free one.
 
         Raises:
             RemoteError: If the address is not one of this machine, or the port is in use.
@@ -102,17 +104,17 @@ class SocketService(Service):
         self.address = self._listener.address
 
     def adopt(self, connected: socket.socket) -> RequestConnection:
-        """Serve a socket that is connected already."""
+        """Serve a socket that is already connected."""
         self._open()
         host, port = connected.getpeername()[:2]
         connection = RequestConnection(connected, self.new_reader(), f"{host}:{port}")
         self.connections.append(connection)
         self._listener.add(connection)
-        self.opened(connection)
+        self.on_open(connection)
         return connection
 
     def send(self, connection: RequestConnection, *parts: bytes | memoryview) -> None:
-        """Send parts as one piece; a broken connection is dropped and nothing else happens."""
+        """Send parts as one piece; a broken connection is dropped without an error."""
         if connection.closed:
             return
         try:
@@ -121,11 +123,11 @@ class SocketService(Service):
             self.drop(connection, f"{error}")
 
     def drop(self, connection: RequestConnection, reason: str = "") -> None:
-        """Close a connection; what it asked for is finished, but not answered.
+        """Close a connection; its request in progress is finished, but not answered.
 
         Args:
             connection: The connection.
-            reason: What happened, for the log; empty: nothing that needs attention.
+            reason: The reason for the log; empty: nothing is logged.
         """
         if connection.closed:
             return
@@ -135,10 +137,10 @@ class SocketService(Service):
         self.connections.remove(connection)
         if connection in self._ready:
             self._ready.remove(connection)
-        self.closed(connection)
+        self.on_close(connection)
 
     def after(self, seconds: float, action: Callable[[], None]) -> None:
-        """Call a function once, some time from now, between messages."""
+        """Call a function once, `seconds` from now, between two messages."""
         self._open()
         self._listener.timers.add(seconds, action)
 
@@ -146,7 +148,7 @@ class SocketService(Service):
 
     def poll(self, timeout: float | None = 0.0) -> bool:
         """Handle what has arrived; see `Service.poll`."""
-        # Of this and `close`, which another thread may be in, at least one sees the other at work.
+        # Another thread may be in `close`: at least one of the two sees that the other is at work.
         self._is_polling = True
         try:
             if not self._over:
@@ -158,7 +160,7 @@ class SocketService(Service):
         return not self._over
 
     def close(self) -> None:
-        """End all connections; may be called by any thread, and within a request."""
+        """End all connections; may be called from any thread, and within a request."""
         self._over = True
         if not self._is_polling:
             self._release()
@@ -178,7 +180,7 @@ class SocketService(Service):
             self._has_more = False
 
     def _came_soon(self, timeout: float | None) -> bool:
-        """Handle the next message of a quick client that is alone, if it comes within a moment."""
+        """Handle the next message of a quick, lone client, if it comes within a moment."""
         connection, self._recent = self._recent, None
         if connection is None or not connection.is_quick or connection.closed:
             return False
@@ -197,14 +199,14 @@ class SocketService(Service):
         return True
 
     def _look(self, timeout: float | None) -> None:
-        """Handle what the selector sees."""
+        """Handle what the selector finds."""
         for connection, events in self._listener.select(self._wait(timeout)):
             self._serve(connection, events)
         self._looked = time.monotonic()
         self._listener.accept()
 
     def _open(self) -> None:
-        """Take what the loop needs from the system."""
+        """Acquire what the loop needs from the system."""
         with self._lock:
             if not (self._is_open or self._released):
                 self._is_open = True
@@ -223,7 +225,7 @@ class SocketService(Service):
             self._listener.close()
 
     def _wait(self, timeout: float | None) -> float | None:
-        """Return how long nothing happens, unless something arrives."""
+        """Return how long to wait for something to arrive."""
         if self._has_more:
             return 0.0
         moment = self._listener.timers.next
@@ -235,7 +237,7 @@ class SocketService(Service):
         return wait if timeout is None else min(wait, timeout)
 
     def _turn(self) -> None:
-        """Run timers, and work until there is none, or others have waited long enough."""
+        """Run timers, and work until there is none left or others have waited long enough."""
         begin = time.monotonic()
         self._listener.timers.call_due()
         self._has_more = True
@@ -255,7 +257,7 @@ class SocketService(Service):
                 return
 
     def _next(self) -> RequestConnection | None:
-        """Return whose message is to be handled now: the one that waits longest."""
+        """Return the connection whose message has waited longest, of those that are admitted."""
         for _ in range(len(self._ready)):
             connection = self._ready.popleft()
             if not connection.outgoing and self.admits(connection):
@@ -266,7 +268,7 @@ class SocketService(Service):
     def _begin(self, connection: RequestConnection) -> None:
         body, connection.body = connection.body, None
         try:
-            work = self.received(connection, body)
+            work = self.handle(connection, body)
         except BaseException as error:
             self._failed(connection, error)
             return
@@ -277,7 +279,7 @@ class SocketService(Service):
         self._go_on()
 
     def _go_on(self) -> None:
-        """Run the work in progress until it wants to wait or is done."""
+        """Run the work in progress until it has to wait or is done."""
         if self._work is None:
             return
         connection, work = self._work
@@ -291,7 +293,7 @@ class SocketService(Service):
             self._failed(connection, error)
 
     def _failed(self, connection: RequestConnection, error: BaseException) -> None:
-        """Give up the connection whose request could not be handled."""
+        """Drop the connection whose request could not be handled."""
         if not isinstance(error, Exception):
             self.drop(connection, f"interrupted by {type(error).__name__}")
             raise error
@@ -319,7 +321,7 @@ class SocketService(Service):
         connection.watch()
 
     def _serve(self, connection: RequestConnection, events: int) -> None:
-        """Read and write what a connection has and takes."""
+        """Receive from a connection and send to it, as the selector found."""
         if connection.closed:
             return
         had_body = connection.body is not None
@@ -327,14 +329,14 @@ class SocketService(Service):
             if events & selectors.EVENT_WRITE:
                 connection.flush()
                 if not connection.outgoing:
-                    self.drained(connection)
+                    self.on_drain(connection)
             if events & selectors.EVENT_READ:
                 connection.receive()
         except OSError as error:
             self.drop(connection, str(error))
             return
         if had_body and connection.ended and not self.admits(connection):
-            self.drop(connection, "it left before its turn came")
+            self.drop(connection, "it left before its turn")
         elif had_body or (self._work is not None and self._work[0] is connection):
             connection.watch()
         elif self._ready or self._work is not None or self._over:
@@ -343,7 +345,7 @@ class SocketService(Service):
             self._answer(connection)
 
     def _answer(self, connection: RequestConnection) -> None:
-        """Handle the message that has just arrived, where nobody else waits."""
+        """Handle the message that has just arrived, if no other waits."""
         try:
             if connection.next_body() and self.admits(connection) and not connection.outgoing:
                 self._begin(connection)

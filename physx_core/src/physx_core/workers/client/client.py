@@ -1,4 +1,4 @@
-"""Client: one instance of the environment in this process, for a server elsewhere."""
+"""Client: runs one instance of the environment in this process, for a server elsewhere."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from physx_core.net.spin_wait import has_core_for_each
 from physx_core.net.values import encode
 from physx_core.typing import Sample
 from physx_core.workers.client.joining import PATIENCE, join
-from physx_core.workers.client.link import Link, RunEnded, ServerGone
+from physx_core.workers.client.link import RunEnded, ServerGone, WorkerLink
 from physx_core.workers.client.producer import Producer
 from physx_core.workers.instance import Instance
 from physx_core.workers.processes.launchers import CLIENT_VARIABLE
@@ -37,16 +37,16 @@ def run_client(
         address: The server's ``HOST:PORT``.
         token: Token of the run.
         instance: Number of the instance to run, counted from 1; None: any that is free.
-        patience: Time in s for which to try again where nothing listens.
-        say: Is told what happens.
+        patience: Time in s for which to try again if nothing listens.
+        say: Called with a description of what happens.
 
     Returns:
-        Exit status of the process: 0 once the run has ended, 1 where the environment failed or the
+        Exit status of the process: 0 once the run has ended, 1 if the environment failed or the
         server is gone; the server knows why.
 
     Raises:
-        ConnectionRefusedByPeerError: Nothing answers at the address, not a server with this token,
-            or the server has no place for the instance.
+        ConnectionRefusedByPeerError: If nothing, or not a server with this token, answers at the
+            address, or the server has no place for the instance.
     """
     say(f"looks for the server at {address}")
     link, setup = join(address, token, instance or 0, patience)
@@ -59,13 +59,13 @@ def run_client(
         link.close()
 
 
-def _serve(link: Link, setup: dict[str, Any], say: Callable[[str], None]) -> int:
+def _serve(link: WorkerLink, setup: dict[str, Any], say: Callable[[str], None]) -> int:
     os.environ[CLIENT_VARIABLE] = "1"
     draw, skip = setup.pop("draw"), setup.pop("skip")
     _take_place(setup.pop("path"), setup.pop("directory"))
     say(
         f"runs {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"
-        + (f"; {skip['rows']} rows are there and are made again" if skip["rows"] else "")
+        + (f"; {skip['rows']} rows are stored and are made again" if skip["rows"] else "")
     )
     link.spins = has_core_for_each(setup["instance_nb"])
     client = _Client(link, Instance(**setup), skip)
@@ -75,7 +75,7 @@ def _serve(link: Link, setup: dict[str, Any], say: Callable[[str], None]) -> int
         client.close()
     if client.is_forsaken:
         raise ServerGone
-    with contextlib.suppress(ServerGone):  # the run has ended, for whatever reason
+    with contextlib.suppress(ServerGone):  # the server may have ended first
         link.send(pack(Kind.BYE))
     failure = client.failure
     say("the run has ended" if failure is None else f"{type(failure).__name__}: {failure}")
@@ -84,7 +84,7 @@ def _serve(link: Link, setup: dict[str, Any], say: Callable[[str], None]) -> int
 
 
 def _take_place(path: list[str], directory: str) -> None:
-    """Look for modules, scripts and files where the server does, as far as they exist here."""
+    """Use the server's module path and working directory, as far as they exist here."""
     if Path(directory).is_dir():
         os.chdir(directory)
     found = [entry for entry in path if Path(entry).exists()]
@@ -92,14 +92,14 @@ def _take_place(path: list[str], directory: str) -> None:
 
 
 class _Client:
-    """The life of one instance; its errors go to the server.
+    """Runs one instance from start to end; its errors go to the server.
 
     Attributes:
         failure: The error that was sent.
-        is_forsaken: Whether the server has gone without a word.
+        is_forsaken: Whether the server is gone without ending the run.
     """
 
-    def __init__(self, link: Link, instance: Instance, skip: dict[str, int]) -> None:
+    def __init__(self, link: WorkerLink, instance: Instance, skip: dict[str, int]) -> None:
         self.failure: PhysxError | None = None
         self.is_forsaken = False
         self._link, self._instance = link, instance
@@ -134,15 +134,15 @@ class _Client:
 
 
 class RemoteServices:
-    """Services of the run, asked over the connection."""
+    """Services of the run, requested over the connection."""
 
-    def __init__(self, link: Link, flush: Callable[[], None], shown: int = 0) -> None:
+    def __init__(self, link: WorkerLink, flush: Callable[[], None], shown: int = 0) -> None:
         """Keep the connection.
 
         Args:
             link: Connection to the server.
-            flush: Sends what waits to be sent; called before each wait for an answer.
-            shown: How many times what is drawn first was sent by a client before this one.
+            flush: Sends what waits; called before each wait for an answer.
+            shown: How many messages with drawing events a predecessor sent.
         """
         self._link, self._flush, self._to_skip = link, flush, shown
 

@@ -1,4 +1,4 @@
-"""Joining: how a client finds its server, and is told what to run."""
+"""Connects a client to its server and receives what to run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from physx_core.net.frames import Kind
 from physx_core.net.handshake import introduce
 from physx_core.net.remote_errors import decode_error
 from physx_core.net.values import decode
-from physx_core.workers.client.link import Link, RunEnded
+from physx_core.workers.client.link import RunEnded, WorkerLink
 
 PATIENCE = 10.0
 """Time in s for which a client tries to join."""
@@ -22,11 +22,11 @@ _PAUSE = 0.2
 
 def join(
     address: str, token: str, instance: int, patience: float = PATIENCE
-) -> tuple[Link, dict[str, Any]]:
-    """Connect to a server, and have it say what to run.
+) -> tuple[WorkerLink, dict[str, Any]]:
+    """Connect to a server and receive what to run.
 
-    It tries again where nothing listens, and where the server ends the connection before it knows
-    who is there, as it does with some of those who connect while it is crowded.
+    It tries again if nothing listens, and if the server ends the connection during the handshake,
+    as it does with some connections while there are too many.
 
     Args:
         address: ``HOST:PORT``.
@@ -35,21 +35,21 @@ def join(
         patience: Time in s for which to try again.
 
     Returns:
-        The connection, and what the instance is made from.
+        The connection, and the arguments of the instance.
 
     Raises:
-        ConnectionRefusedByPeerError: Nothing answers at the address, not a server with this token,
-            or the server has no place for the instance.
+        ConnectionRefusedByPeerError: If nothing, or not a server with this token, answers at the
+            address, or the server has no place for the instance.
     """
 
-    def attempt(seconds: float) -> tuple[Link, dict[str, Any]]:
+    def attempt(seconds: float) -> tuple[WorkerLink, dict[str, Any]]:
         return _try_to_join(address, token, instance)
 
     return retry(attempt, patience, _PAUSE, UnansweredError)
 
 
-def _try_to_join(address: str, token: str, instance: int) -> tuple[Link, dict[str, Any]]:
-    connection = _connection(address)
+def _try_to_join(address: str, token: str, instance: int) -> tuple[WorkerLink, dict[str, Any]]:
+    connection = _connect(address)
     try:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -58,15 +58,15 @@ def _try_to_join(address: str, token: str, instance: int) -> tuple[Link, dict[st
     except BaseException:
         connection.close()
         raise
-    link = Link(connection, reader)
+    link = WorkerLink(connection, reader)
     try:
-        return link, _what_to_run(link)
+        return link, _receive_setup(link)
     except BaseException:
         link.close()
         raise
 
 
-def _connection(address: str) -> socket.socket:
+def _connect(address: str) -> socket.socket:
     what = f'No server can be reached at "{address}"'
     advice = "Give the HOST:PORT at which the run listens."
     try:
@@ -77,7 +77,7 @@ def _connection(address: str) -> socket.socket:
         raise UnansweredError(f"{what}: {error}. {advice}") from error
 
 
-def _what_to_run(link: Link) -> dict[str, Any]:
+def _receive_setup(link: WorkerLink) -> dict[str, Any]:
     try:
         frame = link.receive()
     except RunEnded:
@@ -85,6 +85,6 @@ def _what_to_run(link: Link) -> dict[str, Any]:
     if frame.kind is Kind.ERROR:
         raise decode_error(frame.payload)
     if frame.kind is not Kind.SETUP:
-        raise ConnectionRefusedByPeerError(f"The server began with {frame.kind.name}.")
+        raise ConnectionRefusedByPeerError(f"The server started with {frame.kind.name}.")
     setup: dict[str, Any] = decode(frame.payload)
     return setup

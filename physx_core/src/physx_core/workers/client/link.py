@@ -1,4 +1,4 @@
-"""Link: the client's end of the connection."""
+"""WorkerLink: a client's end of the connection to its server."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class ServerGone(RunEnded):
     """The connection to the server has ended."""
 
 
-class Link:
+class WorkerLink:
     """Connection to the server, authenticated; blocking.
 
-    A thread watches the connection: a process whose server is gone ends within about a second,
-    even inside a long step.
+    A thread watches the connection: a process whose server is gone exits within about a second,
+    even during a long step.
 
     Attributes:
         spins: Whether to look for an answer without sleeping, for 0.2 ms.
@@ -48,7 +48,7 @@ class Link:
 
         Args:
             connection: The socket.
-            reader: The reader that the handshake left.
+            reader: The reader that the handshake returned.
         """
         self.spins = False
         self._connection = connection
@@ -64,7 +64,7 @@ class Link:
         """Send a message.
 
         Raises:
-            RunEnded: The server is gone.
+            RunEnded: If the server is gone.
         """
         try:
             self._connection.sendall(message)
@@ -75,10 +75,10 @@ class Link:
         """Send a message whose parts lie in several places.
 
         Args:
-            parts: Bytes, in their order; they may change once this returns.
+            parts: The bytes in their order; they may change once this returns.
 
         Raises:
-            RunEnded: The server is gone.
+            RunEnded: If the server is gone.
         """
         waiting = [memoryview(part) for part in parts if len(part)]
         try:
@@ -95,13 +95,13 @@ class Link:
         """Wait for the next message.
 
         Raises:
-            RunEnded: The server is gone.
+            RunEnded: If the server is gone.
         """
         self._spin()
         return self._postponed.popleft() if self._postponed else self._next()
 
     def put_back(self, frame: Frame) -> None:
-        """Have `receive` return a message again that came too early."""
+        """Have `receive` return a message again that arrived too early."""
         self._postponed.appendleft(frame)
 
     def has_message(self) -> bool:
@@ -112,16 +112,16 @@ class Link:
         """Send a request and wait for the answer.
 
         Args:
-            kind: What is asked.
-            value: What goes with it.
+            kind: Kind of the request.
+            value: Its value.
             what: Name of the value for error messages.
 
         Returns:
-            The value that the server answers.
+            The value of the answer.
 
         Raises:
-            RunEnded: The server ended the run instead.
-            PhysxError: The request was refused, or the value cannot travel.
+            RunEnded: If the server ended the run instead.
+            PhysxError: If the request failed, or the value cannot be sent.
         """
         message = pack_value(kind, value, what, self._requests + 1)
         self._requests += 1
@@ -141,7 +141,7 @@ class Link:
     def finish(self) -> None:
         """Wait until the server has read all that was sent and has closed the connection.
 
-        What a socket still has to send is lost once it is closed and the other side sends to it.
+        Unsent data of a socket are lost if it is closed and the other side sends to it.
         """
         with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_WR)
@@ -164,7 +164,7 @@ class Link:
             frame = self._reader.read(self._connection)
         except (EOFError, OSError) as error:
             raise ServerGone from error
-        if frame is None:  # a blocking socket has no such case
+        if frame is None:  # does not happen with a blocking socket
             raise ServerGone
         return frame
 
@@ -174,7 +174,7 @@ class Link:
         poll.poll()
         if self._over.wait(_CLEANUP_TIME):
             return
-        if os.getsid(0) == os.getpid():  # it was launched: a group of its own
+        if os.getsid(0) == os.getpid():  # it was launched and has a process group of its own
             os.killpg(os.getpid(), signal.SIGKILL)
         kill_descendants()
         os._exit(1)

@@ -10,7 +10,7 @@ from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.values import decode, encode
 from physx_core.rows import ROW_FIELDS, RowBuffer, copy_row, infer_shapes
 from physx_core.typing import Sample
-from physx_core.workers.client.link import Link, RunEnded
+from physx_core.workers.client.link import RunEnded, WorkerLink
 from physx_core.workers.instance import Instance
 from physx_core.workers.row_codec import pack_rows
 
@@ -25,7 +25,9 @@ class Producer:
         failure: Why generated rows cannot be sent; None while they can.
     """
 
-    def __init__(self, link: Link, instance: Instance, skip: int = 0, rejected: int = 0) -> None:
+    def __init__(
+        self, link: WorkerLink, instance: Instance, skip: int = 0, rejected: int = 0
+    ) -> None:
         """Store what generates and sends the rows.
 
         Args:

@@ -1,4 +1,4 @@
-"""Descendants: the processes that this one started, and those that they started."""
+"""Kills the processes that this one started, and all of their descendants."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 
 
 def kill_descendants() -> None:
-    """Kill all processes that this one started, and all that those did, where /proc tells them.
+    """Kill all descendants of this process, if there is a /proc file system.
 
-    A client that a person started may share its process group with the person's other programs, so
-    that it cannot clear away the group as a launched one can.
+    A client that was started by hand may share its process group with other programs of the user,
+    so it cannot kill its whole group as a launched one can.
     """
     while descendants := _descendants(os.getpid()):
         for number in descendants:
@@ -25,7 +25,7 @@ def _descendants(ancestor: int) -> list[int]:
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):
             state, parent = stat.read_text().rpartition(")")[2].split()[:2]
-            if state not in "ZX":  # those are dead already
+            if state not in "ZX":  # not dead already
                 children.setdefault(int(parent), []).append(int(stat.parent.name))
     found = children.get(ancestor, [])
     for number in found:  # grows while it is read

@@ -1,4 +1,4 @@
-"""Launchers of the core: processes on this machine, or people who start clients themselves."""
+"""Launchers of the core: client processes on this machine, or clients started by hand."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import IO
 from physx_core.components.launcher import ClientHandle, Launcher
 from physx_core.errors import ClientError, ConfigError
 from physx_core.net.handshake import TOKEN_VARIABLE
-from physx_core.workers.processes.watchdog import Guard
+from physx_core.workers.processes.watchdog import Watchdog
 
 CLIENT_VARIABLE = "PHYSX_CLIENT"
 """Environment variable that is set in every client process."""
@@ -28,8 +28,8 @@ _TERMINATE_TIME = 0.5
 class ClientProcess(ClientHandle):
     """One client, started on this machine.
 
-    Its standard input is empty, its standard output is this process's, and the end of its standard
-    error is kept for error messages. Ctrl-C in a terminal does not reach it.
+    Its standard input is empty, its standard output is that of this process, and the last lines of
+    its standard error are kept for error messages. Ctrl-C in a terminal does not reach it.
 
     Attributes:
         instance_id: Number of the instance that it runs, counted from 1.
@@ -41,19 +41,19 @@ class ClientProcess(ClientHandle):
         address: str,
         token: str,
         core: int | None = None,
-        guard: Guard | None = None,
+        watchdog: Watchdog | None = None,
     ) -> None:
-        """Keep what the process is started with.
+        """Keep the arguments of the process.
 
         Args:
             instance_id: Number of the instance, counted from 1.
             address: The server's ``HOST:PORT``.
             token: Token of the run.
             core: The only processor core that it may use; None: all that this process may use.
-            guard: Ends it if this process is gone; None: one for it alone.
+            watchdog: Kills it if this process dies; None: one of its own.
         """
         self.instance_id = instance_id
-        self._core, self._guard = core, guard or Guard()
+        self._core, self._watchdog = core, watchdog or Watchdog()
         self._command = [
             *(sys.executable, "-P", "-m", "physx_core.workers"),
             *("--connect", address, "--instance", str(instance_id)),
@@ -67,7 +67,7 @@ class ClientProcess(ClientHandle):
         """Start the process.
 
         Raises:
-            ClientError: The operating system refused.
+            ClientError: If the operating system cannot start it.
         """
         # Instances share the processor cores: a numerical library must not take all for each.
         environment = {"OMP_NUM_THREADS": "1", **os.environ, **self._variables}
@@ -82,7 +82,7 @@ class ClientProcess(ClientHandle):
             )
         except OSError as error:
             raise ClientError(self.instance_id, f"could not be started: {error}.") from error
-        self._guard.add(self._process.pid)
+        self._watchdog.add(self._process.pid)
         if self._core is not None:
             with contextlib.suppress(ProcessLookupError):  # it has ended already
                 os.sched_setaffinity(self._process.pid, {self._core})
@@ -104,7 +104,7 @@ class ClientProcess(ClientHandle):
         status = process.poll()
         if status is not None:
             self.kill()  # what the environment left running
-            self._guard.remove(process.pid)
+            self._watchdog.remove(process.pid)
         return status
 
     def stderr(self) -> str:
@@ -115,7 +115,7 @@ class ClientProcess(ClientHandle):
         return "\n".join(lines[-_LINES:])
 
     def terminate(self) -> None:
-        """Ask the process and those that it started to end."""
+        """Ask the process and those that it started to exit."""
         self._signal_group(signal.SIGTERM)
 
     def kill(self) -> None:
@@ -141,18 +141,18 @@ class SubprocessLauncher(Launcher):
     """Starts each client as a process on this machine."""
 
     def __init__(self, *, affinity: bool = False) -> None:
-        """Keep how processes are started.
+        """Keep the options.
 
         Args:
             affinity: Bind each client to one of the processor cores that this process may use, in
-                turn. It helps where as many clients as cores keep busy, and harms where the
+                turn. It helps if there are as many busy clients as cores, and harms if the
                 environments use several threads.
 
         Raises:
-            ConfigError: This operating system cannot do so.
+            ConfigError: If this operating system cannot do so.
         """
         self._cores: list[int] = []
-        self._guard = Guard()
+        self._watchdog = Watchdog()
         if affinity:
             if not hasattr(os, "sched_setaffinity"):
                 raise ConfigError(
@@ -166,7 +166,7 @@ class SubprocessLauncher(Launcher):
         try:
             for number in instances:
                 core = self._cores[(number - 1) % len(self._cores)] if self._cores else None
-                process = ClientProcess(number, address, token, core, self._guard)
+                process = ClientProcess(number, address, token, core, self._watchdog)
                 started.append(process)
                 process.start()
         except BaseException:
@@ -176,34 +176,34 @@ class SubprocessLauncher(Launcher):
 
 
 class ManualLauncher(Launcher):
-    """Starts nothing: people do, with ``physx client``, on this machine or another."""
+    """Starts nothing: clients are started by hand, with ``physx client``, on any machine."""
 
     by_hand = True
 
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
-        """Start nothing; the server says where clients can connect."""
+        """Start nothing; the server tells where clients can connect."""
         return []
 
 
 def stop(clients: Iterable[ClientHandle], patience: float) -> None:
-    """End clients and all that they started; none is left when this returns.
+    """End clients and all processes that they started; none is left when this returns.
 
     Args:
-        clients: What to end.
-        patience: Time in s for which they may end on their own.
+        clients: The clients.
+        patience: Time in s in which they may exit on their own.
     """
     running = list(clients)
     try:
-        running = _still_running(running, patience)
+        running = _wait_for(running, patience)
         for client in running:
             client.terminate()
-        running = _still_running(running, _TERMINATE_TIME)
+        running = _wait_for(running, _TERMINATE_TIME)
     finally:
         for client in running:
             client.kill()
-        _still_running(running, 10.0)
+        _wait_for(running, 10.0)
 
 
-def _still_running(clients: list[ClientHandle], patience: float) -> list[ClientHandle]:
+def _wait_for(clients: list[ClientHandle], patience: float) -> list[ClientHandle]:
     until = time.monotonic() + patience
     return [client for client in clients if not client.wait(until)]

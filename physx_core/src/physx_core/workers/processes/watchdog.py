@@ -1,4 +1,4 @@
-"""Guard: ends processes on this machine once this process is gone, whatever became of it."""
+"""Watchdog: kills the process groups of clients if this process dies."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ import subprocess
 import threading
 
 _END = "end"
-# Each line names all process groups that there are; the last one counts when no more can come.
+# Each line names all process groups; the last one counts once the pipe is closed.
 _SCRIPT = (
     f'while read -r line; do [ "$line" = {_END} ] && exit; groups=$line; done; '
     'for group in $groups; do kill -s KILL -- "-$group"; done'
 )
 
 
-class Guard:
-    """Knows the process groups of the clients; a shell ends those that this process leaves behind.
+class Watchdog:
+    """Has a shell kill the process groups of clients that this process leaves behind.
 
-    A client whose server is gone leaves on its own, unless it is stopped, or an engine keeps it
-    from running any Python. The shell waits at the end of a pipe that only this process can write
-    to, and which closes when this process ends, be it with SIGKILL; with those that it forked, for
-    they have the pipe too. There is a shell as long as there are groups.
+    A client whose server is gone exits on its own, unless it is stopped, or an engine keeps it from
+    running any Python. The shell reads from a pipe to which only this process can write, and which
+    closes when this process ends, even by SIGKILL (and when those that it forked end, which hold
+    the pipe too). There is a shell as long as there are groups.
     """
 
     def __init__(self) -> None:
-        """Begin with no groups, and no shell."""
+        """Start with no groups, and no shell."""
         self._groups: set[int] = set()
         self._shell: subprocess.Popen[bytes] | None = None
         self._lock = threading.Lock()
@@ -35,7 +35,7 @@ class Guard:
         with self._lock:
             self._groups.add(group)
             if self._shell is None:
-                with contextlib.suppress(OSError):  # no shell: clients still leave on their own
+                with contextlib.suppress(OSError):  # without it clients still exit on their own
                     self._shell = subprocess.Popen(
                         ["/bin/sh", "-c", _SCRIPT],
                         stdin=subprocess.PIPE,
@@ -47,7 +47,7 @@ class Guard:
             self._tell()
 
     def remove(self, group: int) -> None:
-        """Forget a process group, all of which has ended."""
+        """Forget a process group that has ended."""
         with self._lock:
             self._groups.discard(group)
             self._tell()
@@ -61,5 +61,5 @@ class Guard:
 
     def _write(self, line: str) -> None:
         if self._shell is not None and self._shell.stdin is not None:
-            with contextlib.suppress(OSError):  # somebody ended the shell
+            with contextlib.suppress(OSError):  # somebody killed the shell
                 os.write(self._shell.stdin.fileno(), f"{line}\n".encode())

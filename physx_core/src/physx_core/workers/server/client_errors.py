@@ -1,4 +1,4 @@
-"""Losses: how a client came to its end, as the error that says so."""
+"""Builds the errors for clients that exited or timed out."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from physx_core.errors import ClientError
 from physx_core.workers.server.peer import Peer
 
 _LINES_TIME = 0.1  # for the last lines of its standard error to arrive
-_LAST_WORDS_TIME = 0.3  # for a client that hangs to write where
-_LEAVE_TIME = 0.8  # a process that goes on without a connection ends itself a little later
+_LAST_WORDS_TIME = 0.3  # for a hung client to write where it is
+_LEAVE_TIME = 0.8  # a process that goes on without a connection exits a little later
 
 
-def ended(number: int, peer: Peer | None, handle: ClientHandle | None) -> ClientError:
+def exit_error(number: int, peer: Peer | None, handle: ClientHandle | None) -> ClientError:
     """Return the error for a client that is gone.
 
     Args:
         number: Its instance.
         peer: Its connection; None: it has not connected yet.
-        handle: Its process; None where it was started by hand.
+        handle: Its process; None if it was started by hand.
     """
     if peer is not None and peer.offense:
         if handle is not None:
@@ -34,7 +34,7 @@ def ended(number: int, peer: Peer | None, handle: ClientHandle | None) -> Client
         return ClientError(number, f"closed the connection {when}. Its own terminal may say why.")
     handle.wait(time.monotonic() + _LEAVE_TIME)
     status = handle.exit_status()
-    how = "closed the connection" if status is None else _ending(status)
+    how = "closed the connection" if status is None else _describe_status(status)
     return ClientError(
         number,
         f"{how} {when}. To see what it does, run with as_tcp_ip_client=False.",
@@ -43,15 +43,15 @@ def ended(number: int, peer: Peer | None, handle: ClientHandle | None) -> Client
     )
 
 
-def silent(
+def timeout_error(
     number: int, peer: Peer | None, handle: ClientHandle | None, timeout: float
 ) -> ClientError:
-    """Return the error for a client that let the server wait for too long.
+    """Return the error for a client that kept the server waiting for too long.
 
     Args:
         number: Its instance.
         peer: Its connection, or the last one that it had; None: it has not connected.
-        handle: Its process; None where it was started by hand.
+        handle: Its process; None if it was started by hand.
         timeout: How long the server waited, in s.
     """
     waited = f"for {timeout:g} s while the server waited for it"
@@ -59,11 +59,11 @@ def silent(
         how = f"did not connect {waited}. If its start takes"
     elif peer.vacant:
         lost = f"was lost after {peer.received} rows"
-        how = f"{lost}, and none in its place connected {waited}. If a start takes"
+        how = f"{lost}, and no other took its place {waited}. If a start takes"
     else:
         how = f"sent nothing {waited}. If its steps take"
     if handle is not None:
-        handle.terminate()  # its last lines tell where it was
+        handle.terminate()  # it writes where it was
         handle.wait(time.monotonic() + _LAST_WORDS_TIME)
     return ClientError(
         number,
@@ -72,8 +72,8 @@ def silent(
     )
 
 
-def _ending(status: int) -> str:
-    """Return an exit status, negative for a signal, in words."""
+def _describe_status(status: int) -> str:
+    """Describe an exit status, negative for a signal."""
     if status >= 0:
         return f"ended with exit status {status}"
     try:

@@ -1,4 +1,4 @@
-"""ClientGroup: the clients of a run, started together, watched together, ended together."""
+"""ClientGroup: starts, watches, restarts and ends the clients of a run."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from physx_core.components.launcher import ClientHandle, Launcher
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import ClientError, ConfigError, EnvironmentFailedError, PhysxError
 from physx_core.net.handshake import TOKEN_VARIABLE
-from physx_core.net.tokens import run_token
+from physx_core.net.tokens import choose_token
 from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate
 from physx_core.workers.instance import instance_arguments
 from physx_core.workers.processes.launchers import stop
-from physx_core.workers.server.client_errors import ended, silent
+from physx_core.workers.server.client_errors import exit_error, timeout_error
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.server import Server
 
@@ -39,7 +39,7 @@ class ClientGroup:
 
     Attributes:
         server: The server.
-        config: Which environment, how many clients, and how long they may be silent.
+        config: The environment, the number of clients, and how long they may be silent.
     """
 
     def __init__(
@@ -50,11 +50,11 @@ class ClientGroup:
         *,
         accept_all: bool = False,
     ) -> None:
-        """Keep what the clients are started with.
+        """Keep the arguments; `open` starts the clients.
 
         Args:
-            config: Which environment, how many clients, and what starts them.
-            services: What the environments may ask of the run.
+            config: The environment, the number of clients, and their launcher.
+            services: The services of the run, for the environments.
             seed: Seed of all instances.
             accept_all: Whether samples that `check_sample` rejects count like the others.
         """
@@ -73,20 +73,20 @@ class ClientGroup:
             config.port,
             config.num_clients,
             services,
-            self._setup,
-            run_token(config, self._launcher.by_hand),
+            self._encode_setup,
+            choose_token(config, self._launcher.by_hand),
             self._replaces,
         )
 
     def open(self) -> None:
-        """Start the clients and wait until their environments live.
+        """Start the clients and wait until their environments are ready.
 
         Raises:
-            ConfigError: The server cannot listen there.
-            ClientError: A client did not come to life.
-            PhysxError: An environment failed.
+            ConfigError: If the server cannot listen there.
+            ClientError: If a client did not start.
+            PhysxError: If an environment failed.
         """
-        self._encoded(1)  # what cannot travel is named before anything is started
+        self._encode(1)  # an argument that cannot be sent is an error before anything is started
         self.server.open()
         numbers = list(self._numbers)
         self._launch(numbers)
@@ -109,11 +109,11 @@ class ClientGroup:
         """Serve the clients until none is waited for.
 
         Args:
-            missing: Tells the instances that are waited for; called after each round.
+            missing: Returns the instances that are waited for; called after each round.
 
         Raises:
-            PhysxError: A client ended, failed, or let the server wait for too long, and none takes
-                its place.
+            PhysxError: If a client exited, failed, or kept the server waiting for too long, and
+                none takes its place.
         """
         began = time.monotonic()
         if began - self._served > _TICK / 10:
@@ -122,27 +122,27 @@ class ClientGroup:
             self._serve(_TICK)
             if self._served - began < min(_SAY_EVERY, self.config.timeout):
                 continue
-            self._say(waited, began)
-            if self._silent(waited, began):
-                self._serve(0.0)  # an answer may have taken long while others had their say
-                for number in self._silent(waited, began):
+            self._report_missing(waited, began)
+            if self._find_silent(waited, began):
+                self._serve(0.0)  # an answer may have arrived while others were served
+                for number in self._find_silent(waited, began):
                     peer, handle = self.server.peers.get(number), self._handles.get(number)
-                    self._lose(number, silent(number, peer, handle, self.config.timeout))
+                    self._lose(number, timeout_error(number, peer, handle, self.config.timeout))
 
     def close(self, *, orderly: bool) -> None:
         """Have the clients close their environments, and end them; no process is left behind.
 
         Args:
-            orderly: Wait for as long as a client may be silent, and raise what goes wrong;
-                otherwise wait for a moment and raise nothing.
+            orderly: Wait for as long as a client may be silent, and raise errors; otherwise wait
+                for a moment and raise nothing.
 
         Raises:
-            ClientError: A client ended too early or is silent for too long.
+            ClientError: If a client exited too early or is silent for too long.
         """
         patience = 0.0
         self._closing = True
         try:
-            absent = [number for number in self._handles if self._present(number) is None]
+            absent = [number for number in self._handles if self._find_peer(number) is None]
             stop([self._handles.pop(number) for number in absent], 0.0)
             self.server.end()
             if orderly:
@@ -175,7 +175,7 @@ class ClientGroup:
             )
 
     def _public_address(self) -> str:
-        """Return ``HOST:PORT`` for people."""
+        """Return ``HOST:PORT`` as other machines reach it."""
         if self.config.ip_address not in ("", "0.0.0.0", "::"):
             return self.server.address
         return f"{socket.gethostname()}:{self.server.address.rpartition(':')[2]}"
@@ -194,27 +194,27 @@ class ClientGroup:
         while self._unfinished() and time.monotonic() < until:
             try:
                 self.server.pump(_TICK)
-            except Exception:  # the run has failed already, with an error of its own
+            except Exception:  # the run has failed already, with its own error
                 continue
 
     def _unfinished(self) -> list[int]:
         peers = self.server.peers.values()
         return [p.instance_id for p in peers if not (p.finished or p.closed or p.failure)]
 
-    def _present(self, number: int) -> Peer | None:
-        """Return the connection of an instance's client; None where it has none now."""
+    def _find_peer(self, number: int) -> Peer | None:
+        """Return the connection of an instance's client; None if it has none now."""
         peer = self.server.peers.get(number)
         return None if peer is None or peer.vacant else peer
 
     def _is_ready(self, number: int) -> bool:
-        peer = self._present(number)
+        peer = self._find_peer(number)
         if peer is not None and peer.failure is not None:
             raise peer.failure
         return peer is not None and bool(peer.fields)
 
     def _check_ended(self, now: float, listened_since: float) -> None:
         for number in self._numbers:
-            handle, peer = self._handles.get(number), self._present(number)
+            handle, peer = self._handles.get(number), self._find_peer(number)
             if peer is not None and peer.failure is not None:
                 if self._replaces(number, peer.failure):
                     self._lose(number, peer.failure)
@@ -223,17 +223,17 @@ class ClientGroup:
                 continue
             if peer is not None and peer.closed:
                 left = handle is None and not peer.offense
-                self._lose(number, ended(number, peer, handle), left=left)
+                self._lose(number, exit_error(number, peer, handle), left=left)
             elif handle is not None and handle.exit_status() is not None:
                 # What it sent before its end may still be on its way, or wait to be read.
                 since = self._exits.setdefault(number, now)
                 if peer is None or (now - since > 2 * _TICK and peer.heard < listened_since):
-                    self._lose(number, ended(number, peer, handle))
+                    self._lose(number, exit_error(number, peer, handle))
 
-    # Clients that others take the place of --------------------------------------------------
+    # Replacing clients -----------------------------------------------------------------
 
     def _replaces(self, number: int, error: PhysxError | None) -> bool:
-        """Return whether another client goes on where one failed, or left without an error."""
+        """Return whether another client replaces one that failed, or left without an error."""
         if error is None and self._launcher.by_hand:
             return True
         passing = error is None or isinstance(error, _PASSING)
@@ -245,18 +245,18 @@ class ClientGroup:
         Args:
             number: The instance.
             error: How it was lost.
-            left: Whether it closed the connection, as those may that people start.
+            left: Whether it closed the connection, as clients that were started by hand may.
 
         Raises:
-            PhysxError: None takes its place: the error.
+            PhysxError: The error, if none takes its place.
         """
-        absent = self._launcher.by_hand and self._present(number) is None
+        absent = self._launcher.by_hand and self._find_peer(number) is None
         if absent or not self._replaces(number, None if left else error):
             raise error
         if not left:
             self._restarts[number] += 1
         text, _, details = str(error).partition("\n")
-        follows = self._what_follows(number, left)
+        follows = self._describe_next(number, left)
         _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
         self.server.vacate(number)
         handle = self._handles.pop(number, None)
@@ -266,25 +266,25 @@ class ClientGroup:
         if not self._closing:
             self._launch([number])
 
-    def _what_follows(self, number: int, left: bool) -> str:
+    def _describe_next(self, number: int, left: bool) -> str:
         if self._closing:
-            return "The run was at its end, and all rows are there."
-        text = "Another client goes on in its place."
+            return "The run was at its end, and all its rows are there."
+        text = "Another client takes its place."
         if self._launcher.by_hand:
             text = (
-                f"The run waits up to {self.config.timeout:g} s for another client to go on in its "
+                f"The run waits up to {self.config.timeout:g} s for another client to take its "
                 f"place, at {self._public_address()}."
             )
         restart = f"Restart {self._restarts[number]} of {self.config.restarts}."
         return text if left else f"{restart} {text}"
 
-    def _say(self, waited: Sequence[int], began: float) -> None:
-        """Say now and then which clients are not there."""
+    def _report_missing(self, waited: Sequence[int], began: float) -> None:
+        """Report now and then which clients are missing."""
         now = time.monotonic()
         if now - max(began, self._said) < _SAY_EVERY:
             return
         times = {n: now - max(began, self._heard(n)) for n in self.server.holding_up(waited)}
-        absent = [n for n in sorted(times) if self._present(n) is None and times[n] > _SAY_EVERY]
+        absent = [n for n in sorted(times) if self._find_peer(n) is None and times[n] > _SAY_EVERY]
         if absent:
             self._said = now
             _LOG.warning(
@@ -300,18 +300,18 @@ class ClientGroup:
         peer = self.server.peers.get(number)
         return max(self._launched.get(number, 0.0), peer.heard if peer is not None else 0.0)
 
-    def _silent(self, waited: Sequence[int], began: float) -> list[int]:
-        """Return those that let the server wait for too long."""
+    def _find_silent(self, waited: Sequence[int], began: float) -> list[int]:
+        """Return the instances that keep the server waiting for too long."""
         limit = time.monotonic() - self.config.timeout
         numbers = sorted(self.server.holding_up(waited))
         return [number for number in numbers if max(began, self._heard(number)) < limit]
 
-    def _setup(self, peer: Peer) -> bytes:
-        """Return what a client is told first: the instance, and what of it is there already."""
+    def _encode_setup(self, peer: Peer) -> bytes:
+        """Return the first message to a client: its instance, and what the server has of it."""
         skip = {"rows": peer.received, "rejected": peer.rejected.count, "shown": peer.shown}
-        return self._encoded(peer.instance_id, skip=skip)
+        return self._encode(peer.instance_id, skip=skip)
 
-    def _encoded(self, instance_id: int, **progress: Any) -> bytes:
+    def _encode(self, instance_id: int, **progress: Any) -> bytes:
         config = self.config
         return encode(
             {
@@ -335,5 +335,5 @@ def _make_launcher(config: EnvironmentConfig) -> Launcher:
         text = str(error).split("() ")[-1]
         raise ConfigError(f"EnvironmentConfig.launcher_kwargs: {name} {text}.") from error
     if not isinstance(launcher, Launcher):
-        raise ConfigError(f"EnvironmentConfig.launcher: {name} is no Launcher.")
+        raise ConfigError(f"EnvironmentConfig.launcher: {name} is not a Launcher.")
     return launcher

@@ -1,4 +1,4 @@
-"""Journal: what the server told one instance, to be told again to a client that takes its place."""
+"""Journal: log of the server's messages to one instance, replayed to a restarted client."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ _IN_MEMORY = 1 << 22
 
 
 class Journal:
-    """Answers by the number of the request, and orders in the order in which they were given.
+    """Answers by the number of their request, and orders in the order in which they were given.
 
-    Orders are what a client obeys between two rows: credit, predictions to apply, stored rows.
-    Credit after credit is one order, the last of them, so that the journal of an instance that
-    only makes rows does not grow. The others are kept as they were sent, in a temporary file once
-    they are many.
+    Orders are the messages that a client obeys between two rows: credit, predictions to apply,
+    stored rows. Of successive credits only the last is kept, so that the journal of an instance
+    that only makes rows does not grow. Other messages are kept as they were sent, in a temporary
+    file once there are many.
     """
 
     def __init__(self) -> None:
-        """Begin with nothing."""
+        """Start empty."""
         self._messages = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 - see close
         self._size = 0
         self._answers = array("Q")  # request number - 1 to the place of its answer + 1; 0: none
@@ -28,7 +28,7 @@ class Journal:
         self._credit = b""
 
     def record(self, message: bytes) -> bool:
-        """Keep a message to the client if it must be told again; return whether it is an order."""
+        """Keep a message if a successor must be told again; return whether it is an order."""
         _, kind, _, number = HEADER.unpack_from(message)
         if kind == Kind.CREDIT:
             self._credit = bytes(message)
@@ -44,7 +44,7 @@ class Journal:
         return kind in (Kind.CREDIT, Kind.APPLY, Kind.STORED)
 
     def answer(self, number: int) -> bytes | None:
-        """Return the answer to a request, None where it was not answered yet.
+        """Return the answer to a request, None if it was not answered yet.
 
         Args:
             number: Number of the request, counted from 1.
@@ -53,12 +53,12 @@ class Journal:
         return self._read(place - 1) if place else None
 
     def order(self, index: int) -> bytes | None:
-        """Return an order that others followed, counted from 0; None once there are no more."""
+        """Return an order that others followed, counted from 0; None if there are no more."""
         return self._read(self._orders[index]) if index < len(self._orders) else None
 
     @property
     def credit(self) -> bytes:
-        """The credit that was given after all other orders; empty for none."""
+        """The credit that was given after all other orders; empty if there is none."""
         return self._credit
 
     def close(self) -> None:

@@ -18,7 +18,7 @@ _PIECE = 1 << 16
 
 
 class Peer(Connection):
-    """What the server knows about one connection.
+    """One connection of the server, and what its client has sent.
 
     Attributes:
         reader: Reads its frames.
@@ -33,13 +33,13 @@ class Peer(Connection):
         failure: The error that it sent.
         failed_row: Row, counted from 0, that the error kept it from making.
         last_step: Step of its last row, -1 before the first.
-        offense: What it sent against the rules, for which it was cut off; empty for nothing.
-        finished: Whether it said that its environment is closed.
+        offense: The violation of the protocol for which it was cut off; empty if there is none.
+        finished: Whether it reported that its environment is closed.
         vacant: Whether another client may take the instance's place.
-        has_told_fields: Whether it told the fields of its rows.
+        has_told_fields: Whether it sent the fields of its rows.
         requests: How many requests it sent.
         shown: How many messages with drawing events arrived in all.
-        journal: What to tell a client that takes its place; None where none can.
+        journal: Messages for a client that takes its place; None if none can.
     """
 
     reader: FrameReader
@@ -71,7 +71,7 @@ class Peer(Connection):
 
     @property
     def is_at_work(self) -> bool:
-        """Whether its environment comes to life or makes rows, or would if it were not lost."""
+        """Whether its environment is starting or making rows, or would be if it were not lost."""
         return not self.finished and (not self.fields or self.received < self.granted)
 
     @property
@@ -80,7 +80,7 @@ class Peer(Connection):
         return self.closed or self.failure is not None
 
     def succeed(self, former: Peer) -> None:
-        """Take the place of another client of the instance, with all that arrived from it."""
+        """Take the place of another client of the instance, with everything it sent."""
         self.rows, self.received, self.granted = former.rows, former.received, former.granted
         self.rejected, self.rejected_limit = former.rejected, former.rejected_limit
         self.row_fields, self.last_step = former.row_fields, former.last_step
@@ -88,9 +88,9 @@ class Peer(Connection):
         self._next_order = None if self.journal is None else 0
 
     def hear(self, *, whole: bool) -> None:
-        """Note that the peer is heard of, if it sent a whole frame, or a good piece of a long one.
+        """Note a sign of life: a whole frame, or a good piece of a long one.
 
-        A few bytes now and then are no sign of life.
+        A few bytes now and then do not count.
         """
         arrived = 0 if whole else self.reader.arrived
         if whole or arrived - self._arrived >= _PIECE:

@@ -1,4 +1,4 @@
-"""Server: listens, lets in who knows the token, and serves the clients in one thread."""
+"""Server: accepts clients that know the token and serves them in one thread."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from physx_core.workers.server.validation import (
     check_environment_fields,
     check_row_fields,
     check_rows,
-    declared_fields,
+    parse_fields,
 )
 
 _HANDSHAKE_TIME = 5.0
@@ -39,7 +39,7 @@ _LONG = 1 << 16
 
 
 class Server:
-    """Connections of the clients; nothing happens but in calls of `pump`.
+    """The connections of the clients; all work is done in calls of `pump`.
 
     Attributes:
         peers: Instance number to the connection of its client.
@@ -56,17 +56,17 @@ class Server:
         token: str,
         replaces: Callable[[int, PhysxError | None], bool] = lambda number, error: False,
     ) -> None:
-        """Keep where to listen and what to tell clients.
+        """Keep the arguments; `open` starts to listen.
 
         Args:
             ip_address: Address to listen at.
             port: Port to listen at, 0 for any free one.
             instance_nb: How many instances run.
-            services: What the environments may ask of the run.
-            setup: Makes the payload that tells an instance's client what to run.
+            services: The services of the run, for the environments.
+            setup: Returns the payload that tells an instance's client what to run.
             token: Secret of the run.
-            replaces: Whether an instance's client that fails with an error, or leaves without one,
-                makes room for another.
+            replaces: Whether another client takes the place of one that failed with an error, or
+                left without one.
         """
         self.peers: dict[int, Peer] = {}
         self.token = token
@@ -80,21 +80,21 @@ class Server:
             token, _HANDSHAKE_TIME, _MAX_STRANGERS, self._drop, self._listener.timers
         )
         self._dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
-            Kind.READY: _ready,
-            Kind.FIELDS: _fields,
-            Kind.ROWS: _rows,
-            Kind.WRONG: _wrong,
-            Kind.ERROR: _error,
-            Kind.BYE: self._bye,
-            Kind.AGAIN: _again,
+            Kind.READY: _take_ready,
+            Kind.FIELDS: _take_fields,
+            Kind.ROWS: _take_rows,
+            Kind.WRONG: _take_wrong,
+            Kind.ERROR: _take_error,
+            Kind.BYE: self._take_bye,
+            Kind.AGAIN: _take_again,
             **dict.fromkeys((Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW), self._requests.take),
         }
 
     def open(self) -> None:
-        """Begin to listen.
+        """Start to listen.
 
         Raises:
-            ConfigError: The address is not one of this machine, or the port is in use.
+            ConfigError: If the address is not one of this machine, or the port is in use.
         """
         try:
             self._listener.listen(self._ip_address, self._port)
@@ -115,10 +115,10 @@ class Server:
         return format_address(host, port)
 
     def pump(self, timeout: float) -> None:
-        """Do what there is to do; wait up to `timeout` s for the first of it.
+        """Handle what has arrived; wait up to `timeout` s for the first of it.
 
-        As long as all that happens is that predictions are asked for and answered, and for no
-        longer than `timeout`, it goes on.
+        It goes on as long as predictions are requested and answered and nothing else happens, but
+        no longer than `timeout`.
         """
         until = time.monotonic() + timeout
         spin = 0.0
@@ -127,7 +127,7 @@ class Server:
         self._listener.timers.call_due()
 
     def _answer_at_once(self, timeout: float, spin: float) -> bool:
-        """Do what there is to do; return whether it was to answer requests and nothing else.
+        """Handle what has arrived; return whether it was requests, all answered, and nothing else.
 
         Args:
             timeout: How long to wait for the first of it, in s.
@@ -159,7 +159,7 @@ class Server:
             peer.send(pack(Kind.CLOSE))
 
     def vacate(self, number: int) -> None:
-        """Have the next client of an instance go on where the present one failed or left."""
+        """Have the next client of an instance continue where the present one failed or left."""
         peer = self.peers.get(number)
         if peer is not None:
             self._drop(peer)
@@ -176,9 +176,9 @@ class Server:
         self._listener.close()
 
     def holding_up(self, waited: Iterable[int]) -> set[int]:
-        """Return those that the server waits for in the end, where it waits for some instances.
+        """Return the instances that cause the wait when the server waits for some instances.
 
-        Those of them that wait for a prediction wait for the others that are at work.
+        Those that wait for a prediction wait for the others that are at work.
         """
         waited = set(waited)
         others = self._at_work() if waited & self.asking else set()
@@ -187,9 +187,9 @@ class Server:
     def _expects_more_requests(self) -> bool:
         """Return whether a client is at work that may yet ask for a prediction.
 
-        A batch is predicted once every client asks or has nothing to do. So which requests are in
-        a batch depends on the environments, and not on how fast each of them happens to be: the
-        rounding of a network's result may depend on the size of the batch.
+        A batch is predicted once every client has asked or has nothing to do. So the requests in a
+        batch depend on the environments, not on their speed: the rounding of a network's result
+        may depend on the size of the batch.
         """
         if self._ending or not self._requests.batches:
             return False
@@ -224,8 +224,8 @@ class Server:
                     return
                 enough = turns >= _TURNS or len(frame.payload) > _LONG
                 if enough and not peer.reader.has_buffered:
-                    # Others want to be heard too; the selector finds what is left. And rows are
-                    # moved to their places while they are in the processor's cache.
+                    # The others get their turn; the selector finds the rest. And rows are moved to
+                    # their places while they are in the processor's cache.
                     return
         except EOFError:
             self._drop(peer)
@@ -244,7 +244,7 @@ class Server:
             self._dispatch[frame.kind](peer, frame)
         else:
             raise ConnectionRefusedByPeerError(
-                f"It sent {frame.kind.name}, which is not for a client to send now."
+                f"It sent {frame.kind.name}, which a client may not send now."
             )
 
     def _greet(self, peer: Peer, frame: Frame) -> None:
@@ -278,36 +278,36 @@ class Server:
         peer.close()
         self._strangers.forget(peer)
 
-    # What clients say -----------------------------------------------------------------------
+    # Messages of clients -----------------------------------------------------------------------
 
-    def _bye(self, peer: Peer, frame: Frame) -> None:
+    def _take_bye(self, peer: Peer, frame: Frame) -> None:
         if not (self._ending or peer.failure):
-            raise ConnectionRefusedByPeerError("It said that it is done, but nobody ended the run.")
+            raise ConnectionRefusedByPeerError("It reported its end, but nobody ended the run.")
         peer.finished = peer.failure is None
         self._drop(peer)  # for which it waits
 
 
-def _ready(peer: Peer, frame: Frame) -> None:
-    fields = declared_fields(frame.payload)
+def _take_ready(peer: Peer, frame: Frame) -> None:
+    fields = parse_fields(frame.payload)
     if peer.fields:
         raise ConnectionRefusedByPeerError("It defined its fields twice.")
     check_environment_fields(fields)
     peer.fields = fields
 
 
-def _fields(peer: Peer, frame: Frame) -> None:
-    fields = declared_fields(frame.payload)
+def _take_fields(peer: Peer, frame: Frame) -> None:
+    fields = parse_fields(frame.payload)
     if peer.has_told_fields:
-        raise ConnectionRefusedByPeerError("It told the fields of its rows twice.")
+        raise ConnectionRefusedByPeerError("It sent the fields of its rows twice.")
     check_row_fields(fields, peer.fields)
     if peer.row_fields and fields != peer.row_fields:
         raise ConnectionRefusedByPeerError(
-            "Its rows have other fields than those of the client before it."
+            "Its rows have other fields than those of its predecessor."
         )
     peer.row_fields, peer.has_told_fields = fields, True
 
 
-def _rows(peer: Peer, frame: Frame) -> None:
+def _take_rows(peer: Peer, frame: Frame) -> None:
     count = frame.number
     if not peer.row_fields or not 0 < count <= peer.granted - peer.received:
         raise ConnectionRefusedByPeerError(f"It sent {count} rows that nobody asked for.")
@@ -317,7 +317,7 @@ def _rows(peer: Peer, frame: Frame) -> None:
     peer.received += count
 
 
-def _wrong(peer: Peer, frame: Frame) -> None:
+def _take_wrong(peer: Peer, frame: Frame) -> None:
     count = frame.number
     if not peer.row_fields or not 0 < count <= peer.rejected_limit - peer.rejected.count:
         raise ConnectionRefusedByPeerError(f"It sent {count} rejected rows that nobody asked for.")
@@ -326,9 +326,9 @@ def _wrong(peer: Peer, frame: Frame) -> None:
     peer.rejected.append(block, count)
 
 
-def _again(peer: Peer, frame: Frame) -> None:
-    """Nothing is to be done: the client is heard of while it has no rows to send."""
+def _take_again(peer: Peer, frame: Frame) -> None:
+    """Do nothing: the message is a sign of life of a client that has no rows to send."""
 
 
-def _error(peer: Peer, frame: Frame) -> None:
+def _take_error(peer: Peer, frame: Frame) -> None:
     peer.failure, peer.failed_row = decode_error(frame.payload), frame.number

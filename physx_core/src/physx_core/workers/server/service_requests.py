@@ -14,31 +14,31 @@ from physx_core.net.remote_errors import encode_error
 from physx_core.net.values import pack_value
 from physx_core.typing import Batch, Sample
 from physx_core.workers.server.peer import Peer
-from physx_core.workers.server.validation import drawing_events, named_values
+from physx_core.workers.server.validation import parse_events, parse_values
 
 _MOST_UNREAD = 1 << 26
 _KEPT = "the kept parameters"
 
 Signature: TypeAlias = tuple[tuple[str, tuple[int, ...], str], ...]
 Request: TypeAlias = tuple[Peer, int, Sample]
-"""Who wants a prediction, the number of the request, and for what."""
+"""A request for a prediction: the client, the number of the request, and the sample."""
 
 
 class ServiceRequests:
-    """Answers requests; those for predictions are collected and answered together.
+    """Answers the requests of clients; those for predictions are collected and answered together.
 
-    Where the services have a method ``predict_batch(batch) -> batch``, requests of the same fields
-    that wait at the same moment go through it as one batch. Otherwise each goes through `predict`.
+    If the services have a method ``predict_batch(batch) -> batch``, simultaneous requests with the
+    same fields go through it as one batch. Otherwise each goes through `predict`.
 
     Attributes:
-        batches: Whether requests for predictions go through the services as one batch.
+        batches: Whether requests for predictions are answered as one batch.
     """
 
     def __init__(self, services: Services) -> None:
         """Keep the services.
 
         Args:
-            services: What the environments may ask of the run.
+            services: The services of the run.
         """
         self._services = services
         self._predict_batch: Callable[[Batch], Batch] | None = getattr(
@@ -60,12 +60,12 @@ class ServiceRequests:
     def take(self, peer: Peer, frame: Frame) -> None:
         """Answer a request, or keep it for `predict`.
 
-        Whatever the services raise goes back to the environment if it is an error of physx, and on
-        to the caller otherwise. A request that a client before this one made gets the same answer.
+        Errors of physx that the services raise are sent to the environment, others are raised.
+        A request that the predecessor of this client made gets the same answer.
 
         Raises:
-            ConnectionRefusedByPeerError: The requests are not numbered from 1, are malformed, or
-                answers to others before it are not read.
+            ConnectionRefusedByPeerError: If the requests are not numbered from 1 or are malformed,
+                or earlier answers are not read.
         """
         if frame.kind is not Kind.SHOW:
             if len(peer.outgoing) > _MOST_UNREAD:
@@ -80,26 +80,26 @@ class ServiceRequests:
         if frame.kind is Kind.PREDICT:
             self._keep(peer, frame)
         elif frame.kind is Kind.SAVE:
-            values = named_values(frame.payload)
+            values = parse_values(frame.payload)
             save = self._services.save_parameters
             self._answer(peer, frame.number, _KEPT, save, peer.instance_id, values)
         elif frame.kind is Kind.LOAD:
             load = self._services.load_parameters
             self._answer(peer, frame.number, _KEPT, load, peer.instance_id)
         else:
-            events = drawing_events(frame.payload)
+            events = parse_events(frame.payload)
             peer.shown += 1
             self._services.show(peer.instance_id, frame.number, events)
 
     def _keep(self, peer: Peer, frame: Frame) -> None:
-        """Keep a request for `predict`, in the place of one that its environment gave up."""
-        sample = named_values(frame.payload)
+        """Keep a request for `predict`; it replaces one that its environment abandoned."""
+        sample = parse_values(frame.payload)
         for name, value in sample.items():
             try:
                 if isinstance(value, (list, tuple)):
                     np.asarray(value)
             except ValueError:
-                refusal = UsageError(f'get_prediction() got "{name}", which is no array.')
+                refusal = UsageError(f'get_prediction() got "{name}", which is not an array.')
                 peer.send(pack(Kind.REFUSAL, encode_error(refusal), frame.number))
                 return
         if self._waiting:
@@ -111,7 +111,7 @@ class ServiceRequests:
         self._waiting = [request for request in self._waiting if request[0] is not peer]
 
     def predict(self) -> bool:
-        """Answer the requests for predictions that wait; return whether all answers are sent."""
+        """Answer the waiting requests for predictions; return whether all answers are sent."""
         waiting, self._waiting = self._waiting, []
         if len(waiting) == 1:
             ((peer, number, sample),) = waiting

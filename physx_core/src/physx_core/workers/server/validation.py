@@ -24,7 +24,7 @@ _ROLES = ("training", "additional")
 _ACTIONS = ("add", "update")
 
 
-def declared_fields(payload: bytes | bytearray) -> list[Field]:
+def parse_fields(payload: bytes | bytearray) -> list[Field]:
     """Return the fields that a message lists.
 
     Raises:
@@ -38,7 +38,7 @@ def declared_fields(payload: bytes | bytearray) -> list[Field]:
     except ConfigError as error:
         raise ConnectionRefusedByPeerError(f"It does not list valid fields: {error}") from error
     if not fields or len({field.name for field in fields}) < len(fields):
-        raise ConnectionRefusedByPeerError("It listed no fields, or one twice.")
+        raise ConnectionRefusedByPeerError("It does not list any fields, or lists one twice.")
     return fields
 
 
@@ -68,11 +68,11 @@ def check_environment_fields(fields: Sequence[Field]) -> None:
 
 
 def check_row_fields(fields: Sequence[Field], environment: Sequence[Field]) -> None:
-    """Check the fields that rows are said to have.
+    """Check the fields of rows.
 
     Args:
         fields: Fields of the rows.
-        environment: Fields that the environment defined before; open shapes may be known now.
+        environment: Fields that the environment defined before, whose shapes may have been open.
 
     Raises:
         ConnectionRefusedByPeerError: If they are others, have an open shape, or a row of them is
@@ -94,7 +94,7 @@ def check_row_fields(fields: Sequence[Field], environment: Sequence[Field]) -> N
         )
 
 
-def named_values(payload: bytes | bytearray) -> dict[str, Any]:
+def parse_values(payload: bytes | bytearray) -> dict[str, Any]:
     """Return the values of a request, by name.
 
     Raises:
@@ -106,7 +106,7 @@ def named_values(payload: bytes | bytearray) -> dict[str, Any]:
     return values
 
 
-def drawing_events(payload: bytes | bytearray) -> list[Event]:
+def parse_events(payload: bytes | bytearray) -> list[Event]:
     """Return the drawing events of a message.
 
     Raises:
@@ -128,13 +128,13 @@ def _is_event(parts: Any) -> bool:
 
 
 def check_rows(block: Batch, fields: Sequence[Field], instance_id: int, last_step: int) -> int:
-    """Check rows that arrived, as the client must have done before it sent them.
+    """Check received rows, as the client must have done before it sent them.
 
     Args:
         block: Rows of a client, at least one.
         fields: Fields of the rows.
         instance_id: The client's instance.
-        last_step: Step of its last row before these, -1 for none.
+        last_step: Step of its last row before these, -1 if there is none.
 
     Returns:
         Step of the last row.
@@ -148,7 +148,7 @@ def check_rows(block: Batch, fields: Sequence[Field], instance_id: int, last_ste
     if numbers[0] != instance_id or (several and (numbers != instance_id).any()):
         raise ConnectionRefusedByPeerError("It sent rows of another instance.")
     if steps[0] <= last_step or (several and (steps[1:] <= steps[:-1]).any()):
-        raise ConnectionRefusedByPeerError("It sent rows whose steps do not rise.")
+        raise ConnectionRefusedByPeerError("It sent rows whose steps do not increase.")
     for field in fields:
         values = block[field.name]
         kind = values.dtype.kind

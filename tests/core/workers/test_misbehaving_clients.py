@@ -1,7 +1,7 @@
-"""ClientSource: clients that know the token, and lie about what they send.
+"""ClientSource: misbehaving clients that know the token.
 
-The liar is a thread that joins with the public handshake. It sends two good rows, or none, before
-it lies.
+The client is a thread that joins with the public handshake. It sends two good rows, or none, before
+it misbehaves.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ X = DEFINED[0].to_dict()
 
 
 @pytest.fixture
-def lied_to(clients, monkeypatch, port, folder):
-    """Have a liar send messages, and return the error that the run ends with and what it stored."""
+def run_with(clients, monkeypatch, port, folder):
+    """Have a client send messages; return the error that ends the run, and the rows it stored."""
     monkeypatch.setenv("PHYSX_TOKEN", TOKEN)
 
-    def lie(messages, until):
+    def misbehave(messages, until):
         with contextlib.suppress(OSError, EOFError), connected(port) as connection:
             reader = introduce(connection, TOKEN, 1)
             granted = 0
@@ -77,7 +77,7 @@ def lied_to(clients, monkeypatch, port, folder):
         until = threading.Event()  # it reads nothing before
         if not deaf:
             until.set()
-        thread = threading.Thread(target=lie, args=(messages, until))
+        thread = threading.Thread(target=misbehave, args=(messages, until))
         thread.start()
         settings = {"launcher": "physx/manual", "port": port, "timeout": 20.0}
         try:
@@ -118,21 +118,24 @@ LATER = {
     "fewer bytes than rows": (pack(Kind.ROWS, b"", 1), "0 bytes for 1 rows of 37 bytes"),
     "wider rows": (rows(2, width=3), "45 bytes for 1 rows of 37 bytes"),
     "rows of another instance": (rows(2, env_id=2), "rows of another instance"),
-    "rows that were there": (rows(1), "steps do not rise"),
-    "rows before the first": (rows(-5), "steps do not rise"),
+    "rows that were there": (rows(1), "steps do not increase"),
+    "rows before the first": (rows(-5), "steps do not increase"),
     "neither true nor false": (rows(2, flag=7), '"flag" is neither true nor false'),
     "rejected rows": (pack(Kind.WRONG, rows(2)[HEADER.size :], 1), "nobody asked for"),
     "fields again": (FIELDS, "fields of its rows twice"),
     "ready again": (READY, "defined its fields twice"),
-    "an answer to nobody": (pack(Kind.ANSWER, encode({}), 1), "ANSWER, which is not for a client"),
-    "a refusal": (pack(Kind.REFUSAL, b"", 2**64 - 1), "REFUSAL, which is not for a client"),
-    "credit": (pack(Kind.CREDIT, number=9), "CREDIT, which is not for a client"),
-    "hello again": (pack(Kind.HELLO, bytes(44)), "HELLO, which is not for a client"),
-    "proof again": (pack(Kind.PROOF, bytes(32), 1), "PROOF, which is not for a client"),
+    "an answer to nobody": (
+        pack(Kind.ANSWER, encode({}), 1),
+        "ANSWER, which a client may not",
+    ),
+    "a refusal": (pack(Kind.REFUSAL, b"", 2**64 - 1), "REFUSAL, which a client may not send"),
+    "credit": (pack(Kind.CREDIT, number=9), "CREDIT, which a client may not send"),
+    "hello again": (pack(Kind.HELLO, bytes(44)), "HELLO, which a client may not send"),
+    "proof again": (pack(Kind.PROOF, bytes(32), 1), "PROOF, which a client may not send"),
     "the end": (pack(Kind.BYE), "nobody ended the run"),
-    "an unknown kind": (HEADER.pack(0, 999, 0, 0), "no message of physx"),
-    "a longer message than there can be": (HEADER.pack(2**32 - 1, 8, 0, 1), "no message of physx"),
-    "a spare that is used": (HEADER.pack(0, 8, 1, 0), "no message of physx"),
+    "an unknown kind": (HEADER.pack(0, 999, 0, 0), "not a physx message"),
+    "a longer message than there can be": (HEADER.pack(2**32 - 1, 8, 0, 1), "not a physx message"),
+    "a spare that is used": (HEADER.pack(0, 8, 1, 0), "not a physx message"),
     "a request out of turn": (pack(Kind.LOAD, number=7), "numbered its requests wrongly"),
     "a damaged request": (pack(Kind.PREDICT, b"x", 1), "damaged"),
     "a request of no names": (pack(Kind.PREDICT, encode([1]), 1), "not a dictionary of names"),
@@ -173,10 +176,10 @@ FIRST = {
 
 BEFORE = {
     "fields before all": (FIELDS, "5 fields, but it defined 3"),
-    "no fields": (plain_fields(Kind.READY), "no fields, or one twice"),
+    "no fields": (plain_fields(Kind.READY), "not list any fields, or lists one twice"),
     "fields that are no list": (pack(Kind.READY, encode(1)), "is malformed"),
     "a field that is none": (plain_fields(Kind.READY, 1), "is malformed"),
-    "a field twice": (plain_fields(Kind.READY, X, X), "no fields, or one twice"),
+    "a field twice": (plain_fields(Kind.READY, X, X), "not list any fields, or lists one twice"),
     "a field of physx": (plain_fields(Kind.READY, {**X, "name": "step"}), 'field "step"'),
     "a name that is none": (plain_fields(Kind.READY, {**X, "name": "a b"}), "identifier"),
     "objects": (plain_fields(Kind.READY, {**X, "dtype": "|O"}), "is malformed"),
@@ -187,10 +190,10 @@ BEFORE = {
 }
 
 
-@pytest.mark.parametrize("lie", LATER)
-def test_a_lie_after_good_rows_is_named(lied_to, lie):
-    message, text = LATER[lie]
-    error, stored = lied_to((0, READY), (1, FIELDS), (2, rows(0, 1)), (3, message))
+@pytest.mark.parametrize("case", LATER)
+def test_a_bad_message_after_good_rows_is_reported(run_with, case):
+    message, text = LATER[case]
+    error, stored = run_with((0, READY), (1, FIELDS), (2, rows(0, 1)), (3, message))
     assert type(error) is ClientError
     assert error.instance_id == 1
     assert str(error).startswith("Client 1 was cut off after 2 rows. ")
@@ -199,43 +202,43 @@ def test_a_lie_after_good_rows_is_named(lied_to, lie):
     assert stored == 2
 
 
-@pytest.mark.parametrize("lie", FIRST)
-def test_a_lie_about_the_fields_of_rows_is_named(lied_to, lie):
-    message, text = FIRST[lie]
-    error, stored = lied_to((0, READY), (2, message))
+@pytest.mark.parametrize("case", FIRST)
+def test_bad_fields_of_rows_are_reported(run_with, case):
+    message, text = FIRST[case]
+    error, stored = run_with((0, READY), (2, message))
     assert str(error).startswith("Client 1 was cut off after 0 rows. ")
     assert text in str(error)
     assert stored == 0
 
 
-@pytest.mark.parametrize("lie", BEFORE)
-def test_a_lie_before_the_environment_lives_is_named(lied_to, lie):
-    message, text = BEFORE[lie]
-    error, stored = lied_to((0, message))
+@pytest.mark.parametrize("case", BEFORE)
+def test_a_bad_message_before_the_environment_is_ready_is_reported(run_with, case):
+    message, text = BEFORE[case]
+    error, stored = run_with((0, message))
     assert str(error).startswith("Client 1 was cut off after 0 rows. ")
     assert text in str(error)
     assert stored == 0
 
 
 @pytest.mark.parametrize("sizes", [[2**31, 2**31, 2**31], [2**62, 4], [2**28]])
-def test_rows_beyond_all_bounds_are_refused_before_anything_is_allocated(lied_to, sizes):
+def test_huge_rows_are_rejected_before_anything_is_allocated(run_with, sizes):
     open_shape = plain_fields(Kind.READY, {k: v for k, v in X.items() if k != "shape"})
     listed = [{**X, "shape": sizes}, *(field.to_dict() for field in ROW_FIELDS)]
-    error, stored = lied_to((0, open_shape), (2, plain_fields(Kind.FIELDS, *listed)))
+    error, stored = run_with((0, open_shape), (2, plain_fields(Kind.FIELDS, *listed)))
     assert "bytes; the limit is 1073741824" in str(error)
     assert stored == 0
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_rows_that_are_not_finite_are_not_stored(lied_to, value):
-    error, stored = lied_to((0, READY), (1, FIELDS), (2, rows(0, 1)), (3, rows(2, x=value)))
+def test_rows_that_are_not_finite_are_not_stored(run_with, value):
+    error, stored = run_with((0, READY), (1, FIELDS), (2, rows(0, 1)), (3, rows(2, x=value)))
     assert type(error) is NotFiniteError
     assert (error.instance_id, error.field, error.step) == (1, "x", 2)
     assert stored == 2
 
 
-def test_a_client_that_reads_no_answers_is_cut_off(lied_to, services):
+def test_a_client_that_reads_no_answers_is_cut_off(run_with, services):
     services.kept[1] = {"large": np.zeros(1 << 21)}
     requests = b"".join(pack(Kind.LOAD, encode(None), number) for number in range(1, 20))
-    error, _ = lied_to((0, READY), (1, requests), deaf=True)
+    error, _ = run_with((0, READY), (1, requests), deaf=True)
     assert "does not read the answers" in str(error)
