@@ -22,7 +22,7 @@ def observation_fields(tree: SpaceTree) -> list[str]:
     The field of a space without parts is ``observation``. A part is named by its keys, joined by
     ``__``, if that gives every part a valid and distinct name, and by its number otherwise.
     """
-    if tree.paths == [()]:
+    if tree.is_leaf:
         return [OBSERVATION]
     names = ["__".join(str(key) for key in path) for path in tree.paths]
     is_valid = all(n.isascii() and n.isidentifier() and n[0] != "_" for n in names)

@@ -32,15 +32,17 @@ class SpaceArrays(SpaceTree):
         """
         super().__init__(space)
         self.names = [f"{prefix}{number}" for number in range(len(self.leaves))]
-        self._dtypes = [np.dtype(leaf.dtype) for leaf in self.leaves]
-        self._shapes = [tuple(leaf.shape or ()) for leaf in self.leaves]
+        self._parts = [
+            (name, np.dtype(leaf.dtype), tuple(leaf.shape or ()), leaf)
+            for name, leaf in zip(self.names, self.leaves, strict=True)
+        ]
         self._is_discrete = [isinstance(leaf, spaces.Discrete) for leaf in self.leaves]
-        self._has_one_array = self.paths == [()] and (self._shapes[0] != () or self._is_discrete[0])
+        has_axes = self.is_leaf and self._parts[0][2] != ()
+        self._rows_are_values = self.is_leaf and (has_axes or self._is_discrete[0])
 
     def zeros(self, count: int) -> dict[str, Array]:
         """Return arrays of zeros for `count` worlds."""
-        parts = zip(self.names, self._shapes, self._dtypes, strict=True)
-        return {name: np.zeros((count, *shape), dtype) for name, shape, dtype in parts}
+        return {name: np.zeros((count, *shape), dtype) for name, dtype, shape, _ in self._parts}
 
     def put(self, arrays: Sequence[Array], row: int, value: Any) -> None:
         """Write one world's value into a row of the arrays; shapes are not broadcast.
@@ -48,10 +50,11 @@ class SpaceArrays(SpaceTree):
         Raises:
             ValueError, LookupError or TypeError: If the value is not in the space.
         """
+        if self.is_leaf:  # in every step of most environments
+            _put(arrays[0], row, value)
+            return
         for array, part in zip(arrays, self.split(value), strict=True):
-            if np.shape(part) != array.shape[1:]:
-                raise ValueError(f"it has shape {np.shape(part)}, not {array.shape[1:]}")
-            array[row] = part
+            _put(array, row, part)
 
     def check(self, arrays: Mapping[str, Any], count: int) -> None:
         """Check received arrays of `count` worlds.
@@ -59,7 +62,7 @@ class SpaceArrays(SpaceTree):
         Raises:
             RequestError: If one is missing, or has another type or shape.
         """
-        for name, shape, dtype in zip(self.names, self._shapes, self._dtypes, strict=True):
+        for name, dtype, shape, _ in self._parts:
             array = arrays.get(name)
             if not isinstance(array, np.ndarray):
                 raise RequestError(f"The actions lack the array {name} of {self.space}.")
@@ -71,16 +74,21 @@ class SpaceArrays(SpaceTree):
 
     def rows(self, arrays: Mapping[str, Array], count: int) -> list[Any]:
         """Return the value of each of `count` worlds: views of the arrays."""
-        if self._has_one_array:
+        if self._rows_are_values:
             return list(arrays[self.names[0]])
         return [self.row(arrays, row) for row in range(count)]
 
     def batch(self, arrays: Mapping[str, Array]) -> Any:
         """Return the worlds' values as one value of Gymnasium's batched space."""
+        if self.is_leaf:
+            return arrays[self.names[0]]
         return self.join(arrays[name] for name in self.names)
 
     def row(self, arrays: Mapping[str, Array], row: int) -> Any:
         """Return one world's value: views of the arrays."""
+        if self.is_leaf:
+            array = arrays[self.names[0]]
+            return array[row] if self._is_discrete[0] else array[row, ...]
         parts = zip(self.names, self._is_discrete, strict=True)
         return self.join(arrays[n][row] if scalar else arrays[n][row, ...] for n, scalar in parts)
 
@@ -94,18 +102,23 @@ class SpaceArrays(SpaceTree):
         Raises:
             ActionError: If it does not have the structure, shapes or types of the space.
         """
+        arrays = {}
         try:
-            pairs = zip(self.split(value), self._dtypes, strict=True)
-            parts = [cast_exactly(part, dtype) for part, dtype in pairs]
+            parts = zip(self._parts, self.split(value), strict=True)
+            for (name, dtype, shape, leaf), part in parts:
+                array = cast_exactly(part, dtype)
+                arrays[name] = array[None] if one else array
+                if arrays[name].shape[1:] != shape:
+                    raise ActionError(
+                        f"An action has shape {arrays[name].shape[1:]}, but {leaf} has shape "
+                        f"{shape}."
+                    )
         except (TypeError, ValueError, LookupError, OverflowError) as error:
             raise ActionError(f"{value!r:.200} is not in {self.space}: {error!r}.") from error
-        arrays = {}
-        for name, array, leaf, shape in zip(
-            self.names, parts, self.leaves, self._shapes, strict=True
-        ):
-            arrays[name] = array[None] if one else array
-            if arrays[name].shape[1:] != shape:
-                raise ActionError(
-                    f"An action has shape {arrays[name].shape[1:]}, but {leaf} has shape {shape}."
-                )
         return arrays
+
+
+def _put(array: Array, row: int, value: Any) -> None:
+    if np.shape(value) != array.shape[1:]:
+        raise ValueError(f"it has shape {np.shape(value)}, not {array.shape[1:]}")
+    array[row] = value

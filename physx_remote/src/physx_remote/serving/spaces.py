@@ -28,6 +28,7 @@ class SpaceTree:
         space: The space.
         paths: The keys that lead to each leaf; ``()`` for a space without parts.
         leaves: The leaves, in the order of the space.
+        is_leaf: Whether the space itself has no parts.
     """
 
     def __init__(self, space: Space) -> None:
@@ -40,6 +41,7 @@ class SpaceTree:
         self.space = space
         self.paths: list[Path] = [path for path, _ in found]
         self.leaves: list[Leaf] = [leaf for _, leaf in found]
+        self.is_leaf = self.paths == [()]
 
     def split(self, value: Any) -> list[Any]:
         """Return the leaves' values in a value of the space.
@@ -47,7 +49,7 @@ class SpaceTree:
         Raises:
             LookupError or TypeError: If the value has another structure.
         """
-        return [reduce(getitem, path, value) for path in self.paths]
+        return [value] if self.is_leaf else [reduce(getitem, p, value) for p in self.paths]
 
     def join(self, values: Iterable[Any]) -> Any:
         """Return the value of the space whose leaves have these values."""
