@@ -70,7 +70,7 @@ class Environment:
             kwargs: Must be empty; a subclass takes its own options by name.
 
         Raises:
-            UnknownOptionError: An option that no class of the environment takes.
+            UnknownOptionError: If no class of the environment takes an option.
         """
         if kwargs:
             raise UnknownOptionError(type(self).__name__, kwargs, options_of(type(self)))
