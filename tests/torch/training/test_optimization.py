@@ -295,7 +295,7 @@ def test_state_of_another_optimizer_or_network(tmp_path):
     with pytest.raises(CheckpointError, match="another network"):
         made([2, 8, 8, 1])[1].load_state(tmp_path / "s")
     network.save_parameters(tmp_path / "p")
-    with pytest.raises(CheckpointError, match="no state"):
+    with pytest.raises(CheckpointError, match="not contain the state"):
         optimization.load_state(tmp_path / "p")
     with pytest.raises(CheckpointError, match="no file"):
         optimization.load_state(tmp_path / "nothing")
