@@ -54,7 +54,7 @@ def end(process, number=signal.SIGINT):
     return process.wait(PATIENCE), out, error
 
 
-def test_a_token_of_its_own_goes_again(start):
+def test_a_generated_token_is_removed(start):
     process, printed, address = start("gym/CartPole-v1", "--num-worlds", "2")
     file = Path(printed[1].removeprefix("token: ").strip())
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
@@ -68,7 +68,7 @@ def test_a_token_of_its_own_goes_again(start):
     assert not file.exists()
 
 
-def test_a_token_file_is_made_and_stays(start, tmp_path):
+def test_a_token_file_is_created_and_kept(start, tmp_path):
     file = tmp_path / "token"
     words = ("physx/Cartpole-v0", "--token-file", str(file), "--env-kwargs", "continuous=true")
     process, printed, address = start(*words)

@@ -300,7 +300,7 @@ def test_a_mistake_in_a_setting(scene_class, name, value):
         setattr(scene_class(), name, value)
 
 
-def test_a_speed_that_is_none(start, scene_class):
+def test_an_invalid_speed(start, scene_class):
     environment = scene_class()
     environment.time_speed = 0
     with pytest.raises(PhysxError, match="time_speed must be a positive number"):

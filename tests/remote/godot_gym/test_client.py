@@ -61,7 +61,7 @@ def test_a_server_that_says_nothing_of_itself(in_thread, scene_class):
     env.close()
 
 
-def test_a_client_with_messages_that_are_none():
+def test_a_client_with_invalid_messages():
     with pytest.raises(ConfigError, match="no message Message"):
         GodotGymClient(np)
     with pytest.raises(ConfigError, match="no message Message"):

@@ -207,7 +207,7 @@ def test_an_application_of_an_older_version(port, beside):
         {**INFO, "action_space": [MOVE]},
     ],
 )
-def test_descriptions_that_are_none(port, beside, answer):
+def test_invalid_descriptions(port, beside, answer):
     beside(application, port, answer)
     with pytest.raises(RemoteError):
         connect_vector(f"127.0.0.1:{port}", "godot-rl")
@@ -228,7 +228,7 @@ def test_descriptions_that_are_none(port, beside, answer):
         {"type": "reset"},
     ],
 )
-def test_answers_that_are_none(port, beside, change):
+def test_invalid_answers(port, beside, change):
     beside(application, port, INFO, {**STEP, **change})
     vector = connect_vector(f"127.0.0.1:{port}", "godot-rl")
     with pytest.raises(RemoteProtocolError):

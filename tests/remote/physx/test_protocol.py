@@ -173,7 +173,7 @@ def test_the_same_trajectory_in_process_and_over_both_protocols(place, in_thread
     np.testing.assert_equal(found[2], found[0])
 
 
-def test_actions_that_are_none(client):
+def test_invalid_actions(client):
     env = PhysxEnv(client)
     env.reset(seed=0)
     for action in ([1.0], "push", None, np.ones((2, 2))):
@@ -340,7 +340,7 @@ def test_an_observer_changes_nothing(client):
     assert client.step({"action0": np.zeros((3, 2), np.float32)}).arrays["reward"].sum() == 0
 
 
-def test_an_observer_that_does_not_read_holds_nobody_up(place):
+def test_an_observer_that_does_not_read_delays_nobody(place):
     address = place(Episodes, env_kwargs={"large": 20_000})
     steps = 60
     with connect(address, token=TOKEN) as env, PhysxObserver(address, token=TOKEN) as observer:

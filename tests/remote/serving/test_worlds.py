@@ -79,7 +79,7 @@ def test_ids_of_gymnasium():
         ("physx_remote.serving.worlds:open_worlds", ConfigError, "does not take"),
     ],
 )
-def test_references_that_lead_nowhere(reference, error, said):
+def test_unresolvable_references(reference, error, said):
     with pytest.raises((error, UsageError), match=said):
         open_worlds(reference)
 
@@ -118,7 +118,7 @@ def test_an_error_within_a_constructor_is_its_own():
         open_worlds(confused)
 
 
-def test_what_is_made_must_be_an_environment():
+def test_a_function_must_return_an_environment():
     with pytest.raises(UsageError, match="not a Gymnasium environment"):
         open_worlds(lambda: 3)
     with pytest.raises(ConfigError, match="at least 1"):

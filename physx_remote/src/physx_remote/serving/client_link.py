@@ -31,7 +31,7 @@ class RequestLink(ClientConnection):
 
         Args:
             address: Host and port.
-            timeout: How long an answer may take, in s; None: for ever.
+            timeout: How long an answer may take, in s; None: forever.
             connect_timeout: How long to try to connect, in s.
             max_answer: Longest answer in bytes that is accepted.
 

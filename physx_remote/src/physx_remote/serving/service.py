@@ -25,7 +25,7 @@ class Service(Closeable):
         """Handle what has arrived.
 
         Args:
-            timeout: How long to wait for something to arrive, in s; None: for ever.
+            timeout: How long to wait for something to arrive, in s; None: forever.
 
         Returns:
             False once the service has ended: closed here, or by the other side where the
