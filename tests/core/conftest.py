@@ -167,7 +167,7 @@ def unhurried():
     What is added is several times as long as an interpreter takes to start here and now.
     """
     began = time.monotonic()
-    command = [sys.executable, "-c", "import physx_core.workers.client.client, h5py"]
+    command = [sys.executable, "-c", "import physx_core.workers.client.worker, h5py"]
     subprocess.run(command, check=True)
     starting = time.monotonic() - began
     return lambda seconds: round(seconds + 5 * starting, 1)

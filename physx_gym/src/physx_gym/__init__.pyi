@@ -25,7 +25,7 @@ from .simulator.simulator import Simulator as Simulator
 from .simulator.states import RobotState as RobotState
 from .simulator.states import StepperState as StepperState
 from .tasks.trajectory import Trajectory as Trajectory
-from .telemetry.log import Log as Log
+from .telemetry.episode_log import Log as Log
 from .telemetry.log_file import read_log as read_log
 from .vector.vector_env import ParallelVectorEnv as ParallelVectorEnv
 from .version import __version__ as __version__

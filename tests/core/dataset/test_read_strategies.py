@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from physx_core import Dataset, Field, Normalization
-from physx_core.dataset.read import memory
+from physx_core.dataset.read.strategies import memory
 from physx_core.errors import ConfigError, DatasetError
 
 STRATEGIES = ["memory", "disk exact", "disk windowed"]
@@ -87,7 +87,7 @@ def test_memory_is_known():
 
 def test_limits_of_the_process_count():
     code = (
-        "import resource; from physx_core.dataset.read.memory import available_memory;"
+        "import resource; from physx_core.dataset.read.strategies.memory import available_memory;"
         "resource.setrlimit(resource.RLIMIT_AS, (2**32, 2**32)); print(available_memory())"
     )
     words = [sys.executable, "-c", code]

@@ -12,7 +12,7 @@ import pytest
 from physx_core import DataGeneration, DatasetConfig, EnvironmentConfig, NetworkConfig, Observer
 from physx_core import Training as PhysxTraining
 from physx_core.cli import main
-from physx_core.cli.stats import spark_line
+from physx_core.cli.commands.stats import spark_line
 from physx_core.errors import SessionError
 from physx_core.observers import Observers, ScalarsFile, read_scalars
 

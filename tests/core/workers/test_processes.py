@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
-from physx_core.workers.client.client import run_client
+from physx_core.workers.client.worker import run_client
 from physx_core.workers.processes.launchers import ClientProcess, stop
 
 ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
@@ -69,7 +69,7 @@ def test_stop_ends_what_ignores_a_polite_signal(clients, services, tmp_path):
 HAND = """
 import os, sys, time
 from physx_core.errors import PhysxError
-from physx_core.workers.client.client import run_client
+from physx_core.workers.client.worker import run_client
 for _ in range(500):
     try:
         status = run_client(sys.argv[1], os.environ["PHYSX_TOKEN"])

@@ -12,7 +12,7 @@ import pytest
 
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.net import HEADER, Kind, introduce, pack
-from physx_core.workers.client.client import run_client
+from physx_core.workers.client.worker import run_client
 
 
 def test_strangers_do_not_disturb_a_run(clients, port):

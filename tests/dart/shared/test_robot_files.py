@@ -8,7 +8,7 @@ import pytest
 
 from physx_core import Robot, World
 from physx_core.errors import ConfigError, MissingMeshesError, ModelError
-from physx_dart.shared.robot_files import example_robot
+from physx_dart.models.robot_files import example_robot
 
 LINK = '<link name="{}"/>'
 JOINT = '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/>{}</joint>'

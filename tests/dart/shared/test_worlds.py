@@ -23,7 +23,7 @@ from physx_core import (
     Wrench,
 )
 from physx_core.errors import ConfigError, FeatureNotSupportedError, ModelError
-from physx_dart.shared.meshes import bounding_box, bounding_capsule
+from physx_dart.models.meshes import bounding_box, bounding_capsule
 
 MESH_ROBOT = """
 <robot name="r"><link name="body">

@@ -182,7 +182,7 @@ def test_a_log_that_cannot_be_written(log, tmp_path):
 WRITER = """
 import sys
 import numpy as np
-from physx_gym.telemetry.log import Log
+from physx_gym.telemetry.episode_log import Log
 log = Log({}, {"time": np.arange(20000.0), "v": np.arange(20000.0)})
 print("ready", flush=True)
 number = 0

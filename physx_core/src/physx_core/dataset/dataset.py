@@ -10,13 +10,13 @@ import numpy as np
 
 from physx_core import files
 from physx_core.closeable import Closeable
-from physx_core.dataset.read.cache import ColumnCache
 from physx_core.dataset.read.episodes import Episode, find_episodes
 from physx_core.dataset.read.mode_statistics import compute_statistics
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.sampling import BatchOptions, BatchReader
 from physx_core.dataset.read.splits import Subset, split
-from physx_core.dataset.read.strategy import Strategy
+from physx_core.dataset.read.strategies.cache import ColumnCache
+from physx_core.dataset.read.strategies.strategy import Strategy
 from physx_core.dataset.read.views import ModeView, row_numbers
 from physx_core.dataset.repair import recovery, repair
 from physx_core.dataset.repair.report import find_problems, summarize
@@ -226,7 +226,7 @@ class Dataset(Closeable):
                 normalize (bool | Mapping[str, Normalization]): Whether floating fields are
                 normalized, in place, by the mean and deviation of all samples of the mode; or the
                 normalization to use. False by default.
-                strategy (str): How samples are read, see `physx_core.dataset.read.strategy`;
+                strategy (str): How samples are read, see `physx_core.dataset.read.strategies`;
                 ``"auto"``, the default: as suits the fields' sizes and the free memory.
 
         Returns:

@@ -1,8 +1,8 @@
 """Pipelines: data generation, training, prediction, and replay."""
 
 from .data_generation import DataGeneration as DataGeneration
-from .learner import Learner as Learner
-from .learner import load_learner as load_learner
+from .learning.learner import Learner as Learner
+from .learning.learner import load_learner as load_learner
 from .pipeline import Pipeline as Pipeline
 from .prediction import Prediction as Prediction
 from .replay import Replay as Replay

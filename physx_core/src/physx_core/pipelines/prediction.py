@@ -11,7 +11,7 @@ from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, a
 from physx_core.dataset import Dataset
 from physx_core.fields import Field
 from physx_core.pipelines.interrupt import deferred_interrupt
-from physx_core.pipelines.learner import Learner, load_learner
+from physx_core.pipelines.learning.learner import Learner, load_learner
 from physx_core.pipelines.pipeline import Pipeline, choose_seed, derive_seed
 from physx_core.pipelines.run_description import describe_environment_config, describe_learner
 from physx_core.pipelines.storage import (

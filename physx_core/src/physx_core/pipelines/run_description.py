@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from physx_core.config import EnvironmentConfig, to_plain
 from physx_core.dataset import Dataset
-from physx_core.pipelines.learner import Learner
+from physx_core.pipelines.learning.learner import Learner
 
 
 def describe_component(component: object) -> str:

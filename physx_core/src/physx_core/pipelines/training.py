@@ -16,9 +16,11 @@ from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, a
 from physx_core.dataset import Dataset
 from physx_core.observers import statistics_observers
 from physx_core.pipelines.interrupt import deferred_interrupt
-from physx_core.pipelines.learner import Learner
+from physx_core.pipelines.learning.learner import Learner
+from physx_core.pipelines.learning.resuming import read_last_checkpoint, without_copied_dataset
+from physx_core.pipelines.learning.training_data import TrainingData
+from physx_core.pipelines.learning.training_record import BestEpoch, TrainingRecord
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
-from physx_core.pipelines.resuming import read_last_checkpoint, without_copied_dataset
 from physx_core.pipelines.run_description import describe_training
 from physx_core.pipelines.storage import (
     check_sources,
@@ -28,8 +30,6 @@ from physx_core.pipelines.storage import (
     open_own,
     reject_environments,
 )
-from physx_core.pipelines.training_data import TrainingData
-from physx_core.pipelines.training_record import BestEpoch, TrainingRecord
 from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
 from physx_core.sources.source import Source

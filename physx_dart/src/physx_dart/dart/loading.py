@@ -17,8 +17,8 @@ from physx_core.errors import ModelError
 from physx_core.rotations import to_matrix
 from physx_core.simulation import Ground, HeightField, Stairs
 from physx_core.typing import Vector
-from physx_dart.shared.parts import Mover, Static
-from physx_dart.shared.shapes import CollisionShape
+from physx_dart.models.parts import Mover, Static
+from physx_dart.models.shapes import CollisionShape
 
 WORLD = "world"
 ROOT = "physx root"

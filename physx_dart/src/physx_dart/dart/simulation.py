@@ -20,11 +20,11 @@ from physx_core.simulation import FEATURES, Backend, RobotInfo, Simulation, Worl
 from physx_core.typing import Records, Vector
 from physx_dart.dart.contacts import ContactReader
 from physx_dart.dart.loading import attach_shapes, static_skeleton
-from physx_dart.dart.robot import DartRobot
-from physx_dart.shared import catalog
-from physx_dart.shared.parts import Parts, read_parts
+from physx_dart.dart.skeleton import DartRobot
+from physx_dart.models import catalog
+from physx_dart.models.parts import Parts, read_parts
+from physx_dart.models.shapes import CollisionShape
 from physx_dart.shared.robot_simulation import RobotSimulation
-from physx_dart.shared.shapes import CollisionShape
 
 _DETECTORS = {
     "dart": CollisionDetectorType.DART,

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from physx_core.errors import FeatureNotSupportedError
 from physx_core.typing import Vector
+from physx_dart.models.parts import Mover, Static
+from physx_dart.models.shapes import CollisionShape
 from physx_dart.pinocchio.surfaces import Plane, Surface, surfaces_of
-from physx_dart.shared.parts import Mover, Static
-from physx_dart.shared.shapes import CollisionShape
 
 _MARGIN = 1e-4
 """Distance, in m, below which a point counts as touching."""

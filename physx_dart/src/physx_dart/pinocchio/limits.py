@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physx_core.typing import Vector
-from physx_dart.shared.urdf import Joint
+from physx_dart.models.urdf import Joint
 
 _REGULARIZATION = 1e-9
 """Relative addition to the diagonal, as in DART's solver."""

@@ -10,7 +10,7 @@ import pinocchio
 from physx_core.errors import ModelError
 from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
-from physx_dart.shared.parts import Mover
+from physx_dart.models.parts import Mover
 
 _TRANSLATION, _ROTATION = "physx translation", "physx rotation"
 _LINK = "physx link "

@@ -18,12 +18,12 @@ from numpy import add, multiply
 from physx_core.rotations import rotate, rotate_back, to_matrix
 from physx_core.simulation import CONTACT, World
 from physx_core.typing import Records, Vector
+from physx_dart.models.parts import Mover, Static
 from physx_dart.pinocchio.contacts import ContactFinder, ContactPoints, Indices
 from physx_dart.pinocchio.limits import JointConstraints, solve
 from physx_dart.pinocchio.models import frames_of, load_stepping_model
 from physx_dart.pinocchio.solver import ImpulseSolver
 from physx_dart.shared.engine import RobotEngine, base_accelerations
-from physx_dart.shared.parts import Mover, Static
 
 _UNSEEN = 10
 """Steps between two checks whether a limit might have acted."""

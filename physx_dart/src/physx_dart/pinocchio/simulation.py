@@ -14,10 +14,10 @@ import numpy as np
 from physx_core.errors import FeatureNotSupportedError
 from physx_core.simulation import FEATURES, Backend, RobotInfo, Simulation, World
 from physx_core.typing import Records
+from physx_dart.models import catalog
+from physx_dart.models.parts import Parts, read_parts
 from physx_dart.pinocchio.robot import PinocchioRobot
 from physx_dart.pinocchio.solver import ImpulseSolver
-from physx_dart.shared import catalog
-from physx_dart.shared.parts import Parts, read_parts
 from physx_dart.shared.robot_simulation import RobotSimulation
 
 _WITHOUT_RK4 = ("actuators", "contacts", "isotropic_friction", "joint_friction", "limits")

@@ -13,8 +13,8 @@ from physx_core.errors import FeatureNotSupportedError
 from physx_core.rotations import to_matrix
 from physx_core.simulation import Ground, HeightField, Stairs
 from physx_core.typing import Vector
-from physx_dart.shared.parts import Static
-from physx_dart.shared.shapes import CollisionShape
+from physx_dart.models.parts import Static
+from physx_dart.models.shapes import CollisionShape
 
 
 class Surface(ABC):

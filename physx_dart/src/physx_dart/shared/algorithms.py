@@ -14,8 +14,8 @@ import pinocchio
 
 from physx_core.simulation import World
 from physx_core.typing import Vector
+from physx_dart.models.parts import Mover, Parts, read_parts, static_poses
 from physx_dart.pinocchio.models import frames_of, load_model
-from physx_dart.shared.parts import Mover, Parts, read_parts, static_poses
 from physx_dart.shared.resistance import Resistance
 
 _WORLD_AXES = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED

@@ -9,7 +9,7 @@ import numpy as np
 
 from physx_core.rotations import Triple, cross, rotate_back
 from physx_core.typing import Vector
-from physx_dart.shared.parts import Mover
+from physx_dart.models.parts import Mover
 from physx_dart.shared.resistance import Resistance
 
 

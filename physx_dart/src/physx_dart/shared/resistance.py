@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from physx_core.typing import Vector
-from physx_dart.shared.parts import Mover
+from physx_dart.models.parts import Mover
 
 
 class Resistance:

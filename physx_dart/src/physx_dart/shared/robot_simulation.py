@@ -25,11 +25,11 @@ from physx_core.simulation import (
     finite_vector,
 )
 from physx_core.typing import Records, Vector
+from physx_dart.models.parts import Parts, layout_of
+from physx_dart.models.reach import Reach
 from physx_dart.shared.checks import LayoutChecks, integer
 from physx_dart.shared.engine import RobotEngine
 from physx_dart.shared.influences import Hooks, Wrenches
-from physx_dart.shared.parts import Parts, layout_of
-from physx_dart.shared.reach import Reach
 
 if TYPE_CHECKING:
     from physx_dart.batch.processes import ParallelDynamics

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from physx_gym.telemetry.log import TIME, Log
+from physx_gym.telemetry.episode_log import TIME, Log
 from physx_gym.telemetry.log_file import read_log
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from physx_core.errors import LogError, MissingLibraryError, listed
 from physx_gym.show.display import has_display
-from physx_gym.telemetry.log import TIME, Log
+from physx_gym.telemetry.episode_log import TIME, Log
 from physx_gym.telemetry.log_file import Source, as_logs
 from physx_gym.telemetry.standard_columns import BASE_POSITION, BASE_VELOCITY
 

@@ -15,7 +15,7 @@ from physx_core.simulation import Backend
 from physx_gym.show.drawing import WorldDrawing
 from physx_gym.show.film import write_film
 from physx_gym.show.rendering import PICTURE_SIZE, Picture, open_viewer
-from physx_gym.telemetry.log import Log
+from physx_gym.telemetry.episode_log import Log
 from physx_gym.telemetry.log_file import Source, as_logs
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from physx_core.errors import LogError
-from physx_gym.telemetry.log import FORMAT, TIME, VERSION, Column, Log
+from physx_gym.telemetry.episode_log import FORMAT, TIME, VERSION, Column, Log
 
 _NAMES_WIDTH = 4096
 

@@ -10,7 +10,7 @@ from physx_core.config import reference_of
 from physx_core.simulation import Layout, Part, Sensor
 from physx_gym.simulator.equipment import kind_of
 from physx_gym.simulator.simulator import Simulator
-from physx_gym.telemetry.log import POSITIONS, VELOCITIES
+from physx_gym.telemetry.episode_log import POSITIONS, VELOCITIES
 from physx_gym.telemetry.telemetry import Telemetry
 
 BASE_POSITION = {"x": "m", "y": "m", "z": "m", "qx": "", "qy": "", "qz": "", "qw": ""}

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physx_core.errors import ConfigError, EpisodeError
-from physx_gym.telemetry.log import TIME, Log
+from physx_gym.telemetry.episode_log import TIME, Log
 from physx_gym.telemetry.variables import WORD, Variable, words_of
 
 _BLOCK = 1024  # rows that are allocated at once

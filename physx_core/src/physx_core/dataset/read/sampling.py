@@ -1,6 +1,6 @@
 """Reads batches of rows, in the order of writing or shuffled, into arrays that may be reused.
 
-`physx_core.dataset.read.strategy` lists the ways to read rows; each is an `Epoch`.
+`physx_core.dataset.read.strategies.strategy` lists the ways to read rows; each is an `Epoch`.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from typing import Protocol, TypedDict
 import numpy as np
 from numpy.typing import DTypeLike
 
-from physx_core.dataset.read.cache import ColumnCache, MemoryColumn, converted_dtype
-from physx_core.dataset.read.disk import DiskColumn
-from physx_core.dataset.read.prefetch import ExactEpoch
-from physx_core.dataset.read.strategy import Choice, Strategy, check_strategy
-from physx_core.dataset.read.windows import WindowedEpoch
+from physx_core.dataset.read.strategies.cache import ColumnCache, MemoryColumn, converted_dtype
+from physx_core.dataset.read.strategies.disk import DiskColumn
+from physx_core.dataset.read.strategies.prefetch import ExactEpoch
+from physx_core.dataset.read.strategies.strategy import Choice, Strategy, check_strategy
+from physx_core.dataset.read.strategies.windows import WindowedEpoch
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.statistics import Normalization
 from physx_core.typing import Batch, Index

@@ -8,7 +8,7 @@ from typing import Any
 from physx_core import files
 from physx_core.dataset.store.definitions import compare_fields, complete_shapes
 from physx_core.dataset.store.manifest import Mode
-from physx_core.dataset.write.checks import check_rows, infer_fields
+from physx_core.dataset.write.row_validation import check_rows, infer_fields
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import ConfigError
 from physx_core.fields import Field

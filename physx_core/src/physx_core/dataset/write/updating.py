@@ -14,7 +14,7 @@ import numpy as np
 from physx_core import files
 from physx_core.dataset.store.manifest import Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
-from physx_core.dataset.write.checks import check_rows
+from physx_core.dataset.write.row_validation import check_rows
 from physx_core.errors import FieldShapeError, MissingFieldError
 from physx_core.fields import Field
 from physx_core.rows import check_names

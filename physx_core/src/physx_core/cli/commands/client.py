@@ -15,8 +15,8 @@ import tyro
 from physx_core.errors import ConfigError
 from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.net.tokens import find_token
-from physx_core.workers.client.client import run_client
 from physx_core.workers.client.joining import PATIENCE
+from physx_core.workers.client.worker import run_client
 from physx_core.workers.processes.descendants import kill_descendants
 
 

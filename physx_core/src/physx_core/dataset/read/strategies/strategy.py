@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, TypeAlias, cast, get_args
 
-from physx_core.dataset.read import memory
+from physx_core.dataset.read.strategies import memory
 from physx_core.errors import ConfigError, listed
 from physx_core.fields import Field
 

@@ -11,8 +11,8 @@ import numpy as np
 from physx_core.errors import ModelError, listed, nearest
 from physx_core.simulation import Box, Capsule, Cylinder, Mesh, Robot, Sphere, UrdfTree, WorldObject
 from physx_core.typing import Vector
-from physx_dart.shared.meshes import bounding_box, bounding_capsule, read_vertices
-from physx_dart.shared.robot_files import mesh_path
+from physx_dart.models.meshes import bounding_box, bounding_capsule, read_vertices
+from physx_dart.models.robot_files import mesh_path
 
 
 @dataclass(frozen=True, eq=False)

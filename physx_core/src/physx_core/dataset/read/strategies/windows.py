@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from physx_core.dataset.read.disk import DiskColumn
+from physx_core.dataset.read.strategies.disk import DiskColumn
 from physx_core.typing import Batch, Index
 
 # The order depends on these sizes, never on the free memory: a seed reproduces it on any machine.

@@ -11,7 +11,7 @@ import tyro
 
 from physx_core import checkpoint
 from physx_core.config import NetworkConfig
-from physx_core.pipelines.learner import load_learner
+from physx_core.pipelines.learning.learner import load_learner
 
 
 @dataclass

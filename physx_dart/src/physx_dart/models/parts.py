@@ -10,8 +10,8 @@ import numpy as np
 
 from physx_core.errors import ModelError
 from physx_core.simulation import Ground, HeightField, Layout, Part, Stairs, World, WorldObject
-from physx_dart.shared.shapes import CollisionShape, moments, shape_of_object
-from physx_dart.shared.urdf import Joint, RobotModel, read_robot
+from physx_dart.models.shapes import CollisionShape, moments, shape_of_object
+from physx_dart.models.urdf import Joint, RobotModel, read_robot
 
 _OBJECT = (
     '<robot name="robot"><link name="body"><inertial><mass value="{mass!r}"/><inertia '

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from physx_core import files
-from physx_core.dataset.read.cache import converted_dtype
 from physx_core.dataset.read.reader import Reader
+from physx_core.dataset.read.strategies.cache import converted_dtype
 from physx_core.typing import Array, Index
 
 _OPEN_FILES = 64

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset.read.cache import ColumnCache, MemoryColumn
-from physx_core.dataset.read.disk import DiskColumn
-from physx_core.dataset.read.strategy import LARGE_ROW, memory_budget
+from physx_core.dataset.read.strategies.cache import ColumnCache, MemoryColumn
+from physx_core.dataset.read.strategies.disk import DiskColumn
+from physx_core.dataset.read.strategies.strategy import LARGE_ROW, memory_budget
 from physx_core.typing import Batch, Index
 
 _AHEAD = 2**24  # bytes that the system is asked to read ahead

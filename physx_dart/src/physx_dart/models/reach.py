@@ -8,9 +8,9 @@ import numpy as np
 
 from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
-from physx_dart.shared.meshes import read_vertices
-from physx_dart.shared.parts import Mover
-from physx_dart.shared.shapes import CollisionShape
+from physx_dart.models.meshes import read_vertices
+from physx_dart.models.parts import Mover
+from physx_dart.models.shapes import CollisionShape
 
 
 class Reach:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset.read.mapping import MappedColumn
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.read.strategy import Strategy, choose_strategy
+from physx_core.dataset.read.strategies.mapping import MappedColumn
+from physx_core.dataset.read.strategies.strategy import Strategy, choose_strategy
 from physx_core.fields import Field
 from physx_core.typing import Array, Index
 

@@ -16,9 +16,9 @@ from physx_core.rotations import (
 )
 from physx_core.typing import Vector
 from physx_dart.dart.loading import link_name, load_skeleton
+from physx_dart.models.parts import Mover
+from physx_dart.models.urdf import Joint
 from physx_dart.shared.engine import RobotEngine, base_accelerations
-from physx_dart.shared.parts import Mover
-from physx_dart.shared.urdf import Joint
 
 _ACTUATORS = {
     "force": dynamics.ActuatorType.FORCE,

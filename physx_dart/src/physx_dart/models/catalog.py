@@ -9,8 +9,8 @@ from xml.etree.ElementTree import Element
 
 from physx_core import PhysxError
 from physx_core.simulation import Robot, RobotInfo, parse_urdf
-from physx_dart.shared.robot_files import mesh_path, named_robots
-from physx_dart.shared.urdf import read_robot
+from physx_dart.models.robot_files import mesh_path, named_robots
+from physx_dart.models.urdf import read_robot
 
 _NO_DIRS: Mapping[str, str | Path] = {}
 

@@ -1,0 +1,1 @@
+"""What a training is made of: learner, batches, records, and resuming."""

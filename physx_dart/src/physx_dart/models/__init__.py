@@ -1,0 +1,1 @@
+"""Robots and objects as the engines load them: files, shapes, meshes."""

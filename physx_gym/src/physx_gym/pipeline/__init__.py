@@ -1,0 +1,1 @@
+"""Pipelines of environments and layers, built from plain data."""
