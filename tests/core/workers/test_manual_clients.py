@@ -130,16 +130,18 @@ def test_another_client_takes_the_place_of_one_that_leaves(local, by_hand, join,
     assert [row.tobytes() for row in rows] == [row.tobytes() for row in expected["position"]]
     assert leaver.returncode == 130
     said = late.communicate(timeout=60)[0]
-    assert "rows are there and are made again" in said
+    assert "rows are stored and are made again" in said
     (text,) = [text for text in warnings(caplog) if "closed the connection" in text]
-    assert "The run waits up to 20 s for another client to go on in its place" in text
+    assert "The run waits up to 20 s for another client to take its place" in text
 
 
 def test_a_place_that_nobody_takes_ends_the_run(by_hand, join, unhurried):
     client, timeout = join(), unhurried(2.0)
     assert "looks for the server" in client.stdout.readline()
     with (
-        pytest.raises(ClientError, match=r"Client 1 was lost after \d+ rows, and none .* s while"),
+        pytest.raises(
+            ClientError, match=r"Client 1 was lost after \d+ rows, and no other .* s while"
+        ),
         by_hand(timeout=timeout) as source,
     ):
         source.batch(1)
@@ -197,8 +199,8 @@ def test_the_token_may_come_from_a_file(clients, join, port, tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("content", "mode", "text"),
     [
-        (TOKEN, 0o640, "Others than you may read or write the token file .*chmod 600"),
-        (TOKEN, 0o604, "Others than you"),
+        (TOKEN, 0o640, "Other users may read or write the token file .*chmod 600"),
+        (TOKEN, 0o604, "Other users"),
         ("short", 0o600, "has 5 characters: it must have at least 16"),
         (None, 0, "cannot be read"),
     ],

@@ -151,7 +151,7 @@ def test_a_client_that_breaks_is_started_again(
     assert warning.levelname == "WARNING"
     assert ("Client 2" if fault != "fail" else "Instance 2") in warning.getMessage()
     if place == "close":
-        assert "all rows are there" in warning.getMessage()
+        assert "all its rows are there" in warning.getMessage()
     else:
         assert "Restart 1 of 1" in warning.getMessage()
     assert fresh_notes() == (2 if place == "close" else 3)
