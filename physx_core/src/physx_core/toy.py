@@ -120,9 +120,6 @@ class Linear(Network):
         Args:
             net_fields: Names of the input fields.
             opt_fields: Name of the predicted field.
-
-        Raises:
-            ConfigError: If `opt_fields` contains more than one field.
         """
         self.net_fields = [net_fields] if isinstance(net_fields, str) else list(net_fields)
         self.opt_fields = [opt_fields] if isinstance(opt_fields, str) else list(opt_fields)

@@ -116,9 +116,6 @@ def fill(tree: Any, values: Any) -> Any:
 
     Returns:
         The tree; or the values, if the tree is a leaf that is not an array.
-
-    Raises:
-        SimulationError: If the values do not have the form of the tree.
     """
     try:
         if isinstance(tree, np.ndarray):
@@ -156,9 +153,6 @@ class SpaceFields:
         Args:
             space: The space.
             prefix: First part of the fields' names.
-
-        Raises:
-            ConfigError: If values of a leaf do not have a fixed shape.
         """
         self.space = space
         self.fields: list[Field] = []

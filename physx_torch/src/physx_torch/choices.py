@@ -33,9 +33,6 @@ def choose(what: str, given: Any, known: Mapping[str, Any]) -> Any:
         what: Kind of the object for messages, for example ``"loss"``.
         given: A known name, ``"package.module:Name"``, or the object itself.
         known: Objects by name.
-
-    Raises:
-        ConfigError: If there is no object of the name.
     """
     if not isinstance(given, str):
         return given
@@ -55,11 +52,7 @@ def choose(what: str, given: Any, known: Mapping[str, Any]) -> Any:
 
 
 def make(what: str, factory: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """Return ``factory(*args, **kwargs)``.
-
-    Raises:
-        ConfigError: If it rejects the arguments; the message lists those that it takes.
-    """
+    """Return ``factory(*args, **kwargs)``."""
     try:
         return factory(*args, **kwargs)
     except (TypeError, ValueError) as error:
@@ -78,9 +71,6 @@ def make_activation(option: str, given: Any, channels: int) -> torch.nn.Module:
         given: Name of a class in `torch.nn` such as ``"SiLU"``, ``"package.module:Class"``, or a
             class.
         channels: Number of its channels: `torch.nn.PReLU` learns a slope for each.
-
-    Raises:
-        ConfigError: If there is no such activation.
     """
     known = find_classes(torch.nn.modules.activation, torch.nn.Module)
     chosen = choose("activation", given, {**known, "Identity": torch.nn.Identity})

@@ -24,9 +24,6 @@ def find_device(name: str) -> torch.device:
         name: ``"cpu"``, ``"cuda"``, ``"cuda:<index>"``, ``"mps"`` or ``"auto"``: the first CUDA
             device if there is one, otherwise the processor. If torchrun started several
             processes, ``"cuda"`` and ``"auto"`` give each its own device.
-
-    Raises:
-        ConfigError: If the device does not exist on this machine.
     """
     existing = list_devices()
     own = int(os.environ.get("LOCAL_RANK", "0")) % max(1, torch.cuda.device_count())

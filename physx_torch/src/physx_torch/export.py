@@ -67,10 +67,6 @@ def export_network(
         predict: Prediction in physical units with the network: tensors by field to tensors by
             field.
         fields: The fields that the network was bound to, by name.
-
-    Raises:
-        ConfigError: If the network is not on the processor, or cannot be exported in this format.
-        MissingLibraryError: If ONNX is not installed: ``physx-torch[export]`` brings it.
     """
     if network.device.type != "cpu":
         raise ConfigError(

@@ -27,9 +27,6 @@ def join_group(device: str) -> Group:
 
     Args:
         device: The network's device, as in `NetworkConfig.device`.
-
-    Raises:
-        ConfigError: If the installed torch does not support it, or the processes cannot connect.
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         return Group()
@@ -42,11 +39,7 @@ class TorchGroup(Group):
     """The processes that torchrun started."""
 
     def __init__(self, device: torch.device) -> None:
-        """Connect to the other processes, unless the user's code has already done so.
-
-        Raises:
-            ConfigError: If the processes cannot connect.
-        """
+        """Connect to the other processes, unless the user's code has already done so."""
         if not distributed.is_initialized():
             _connect(device)
         self.rank, self.size = distributed.get_rank(), distributed.get_world_size()
@@ -75,11 +68,7 @@ class TorchGroup(Group):
 
 
 def _connect(device: torch.device) -> None:
-    """Connect to the other processes until this one exits.
-
-    Raises:
-        ConfigError: If the processes cannot connect.
-    """
+    """Connect to the other processes until this one exits."""
     own = device.type == "cuda" and _local("WORLD_SIZE") <= torch.cuda.device_count()
     if own:
         torch.cuda.set_device(device)

@@ -26,10 +26,6 @@ def print_dataset(place: Path, *, verify: bool) -> None:
     Args:
         place: A session's or a dataset's folder.
         verify: Whether every byte is checked, not only sizes and headers.
-
-    Raises:
-        DatasetNotFoundError: If there is no dataset.
-        DatasetError: If its manifest cannot be read.
     """
     with Dataset.open(place) as dataset:
         rows = dataset.describe()

@@ -38,10 +38,6 @@ def pipeline_from(
         words: The words after the command. ``--config FILE`` names a TOML file whose table of the
             pipeline's kind contains options; words after it override them.
         given: Table of options that apply unless the file contains them.
-
-    Raises:
-        PhysxError: If an option is unknown or its value invalid.
-        SystemExit: If help was requested, or the parser has printed an error.
     """
     table, rest = _take_file(make, list(words))
     table = {**(given or {}), **table}

@@ -96,9 +96,6 @@ def unpack_flat(text: bytes, payload: bytearray) -> dict[str, Any]:
     Args:
         text: The JSON text, not longer than `LONGEST_TEXT`.
         payload: All bytes, those of the text among them; the arrays are views of them.
-
-    Raises:
-        ValueError: If text or bytes are damaged; damaged JSON may raise other exceptions.
     """
     places, finishes, length = _places(text)
     if len(payload) != length:
@@ -138,11 +135,7 @@ def _scalar(array: Array) -> Any:
 
 
 def check_array(array: Array) -> Array:
-    """Return an array that was received, after checking its bytes.
-
-    Raises:
-        ValueError: If they are not valid truth values or characters.
-    """
+    """Return an array that was received, after checking its bytes."""
     kind, order = array.dtype.kind, array.dtype.byteorder
     if kind == "b" and (array.view(np.uint8) > 1).any():
         raise ValueError("truth values are neither 0 nor 1")
@@ -154,23 +147,14 @@ def check_array(array: Array) -> Array:
 
 
 def parse_dtype(text: Any) -> np.dtype[Any]:
-    """Return the NumPy type of a string that was received.
-
-    Raises:
-        ValueError: If it does not name a type whose elements have a fixed plain layout.
-        TypeError: If NumPy does not know the type.
-    """
+    """Return the NumPy type of a string that was received."""
     if not isinstance(text, str) or not _DTYPE.fullmatch(text):
         raise ValueError(f"{str(text)[:50]!r} is not a plain type")
     return np.dtype(text)
 
 
 def parse_shape(sizes: Any) -> tuple[int, ...]:
-    """Return the shape in a list that was received.
-
-    Raises:
-        ValueError: If it is not a shape.
-    """
+    """Return the shape in a list that was received."""
     if not isinstance(sizes, list) or not all(type(n) is int and 0 <= n < 1 << 60 for n in sizes):
         raise ValueError(f"{str(sizes)[:50]!r} is not a shape")
     return tuple(sizes)

@@ -41,9 +41,6 @@ def check_token(token: str, place: str) -> str:
     Args:
         token: The token.
         place: Where it comes from, for messages.
-
-    Raises:
-        ConfigError: If it is too short.
     """
     if len(token) < _SHORTEST:
         raise ConfigError(
@@ -59,9 +56,6 @@ def choose_token(config: EnvironmentConfig, by_hand: bool) -> str:
     Args:
         config: Where the server listens, and the file with the token, if there is one.
         by_hand: Whether clients are started by hand, by somebody who has to know the token.
-
-    Raises:
-        ConfigError: If the user has to give a token and did not, or the given one is unusable.
     """
     token = find_token(config.token_file)
     if token is not None:

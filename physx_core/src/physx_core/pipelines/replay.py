@@ -122,11 +122,7 @@ class Replay(NewSessionPipeline):
 
 
 def recorded_environment(dataset: Dataset) -> dict[str, Any]:
-    """Return the options of the environment that a dataset was generated with.
-
-    Raises:
-        ConfigError: If the dataset does not name its environment.
-    """
+    """Return the options of the environment that a dataset was generated with."""
     info: Mapping[str, Any] = dataset.info
     if not isinstance(info.get("environment"), str):
         raise ConfigError(

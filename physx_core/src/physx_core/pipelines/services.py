@@ -43,20 +43,12 @@ class RunServices:
         self._predict = predict
 
     def predict(self, fields: Sample) -> Sample:
-        """Return the prediction for one sample.
-
-        Raises:
-            UsageError: If the pipeline has no network.
-        """
+        """Return the prediction for one sample."""
         batch = {name: np.asarray(value)[np.newaxis] for name, value in fields.items()}
         return {name: values[0] for name, values in self.predict_batch(batch).items()}
 
     def predict_batch(self, batch: Batch) -> Batch:
-        """Return the prediction for several samples.
-
-        Raises:
-            UsageError: If the pipeline has no network.
-        """
+        """Return the prediction for several samples."""
         if self._predict is None:
             raise UsageError(
                 "get_prediction() needs a network, and this run has none. "
@@ -74,11 +66,7 @@ class RunServices:
         partial.replace(path)
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return the values that an instance saved.
-
-        Raises:
-            DatasetError: If the file is damaged.
-        """
+        """Return the values that an instance saved."""
         values: dict[str, Any] = {}
         for place in (self._source_dir, self._dir):
             path = place / PARAMETERS.format(instance_id) if place is not None else None

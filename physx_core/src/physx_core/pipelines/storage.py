@@ -20,11 +20,7 @@ PARAMETERS = "parameters_{}.bin"
 
 
 def open_own(session: Session, config: DatasetConfig) -> Dataset:
-    """Open a session's own dataset for writing; create it if it does not exist.
-
-    Raises:
-        DatasetError: If it is damaged, or another process writes to it.
-    """
+    """Open a session's own dataset for writing; create it if it does not exist."""
     if (session.dataset_dir / "dataset.json").exists():
         return Dataset.open(
             session.dataset_dir,
@@ -38,11 +34,7 @@ def open_own(session: Session, config: DatasetConfig) -> Dataset:
 
 
 def open_existing(session: Session, config: DatasetConfig) -> Dataset:
-    """Open the dataset that a configuration names, or else the session's own, for reading.
-
-    Raises:
-        DatasetNotFoundError: If there is none.
-    """
+    """Open the dataset that a configuration names, or else the session's own, for reading."""
     try:
         return Dataset.open(config.existing_dir or session.dataset_dir)
     except DatasetNotFoundError as error:
@@ -55,11 +47,7 @@ def open_existing(session: Session, config: DatasetConfig) -> Dataset:
 
 
 def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) -> None:
-    """Check that a training's samples come from one place.
-
-    Raises:
-        ConfigError: If they do not.
-    """
+    """Check that a training's samples come from one place."""
     if environment is None:
         return
     if config.mode == WRONG:
@@ -80,11 +68,7 @@ def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) 
 
 
 def reject_environments(environment: EnvironmentConfig) -> None:
-    """Reject environments in a training of several processes.
-
-    Raises:
-        ConfigError: Always; the message tells how to get the same training.
-    """
+    """Reject environments in a training of several processes."""
     replays = environment.load_samples
     if environment.always_produce or (replays and not environment.only_first_epoch):
         advice = (
@@ -112,11 +96,6 @@ def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
     Args:
         dataset: The session's own dataset, open for writing.
         config: Names the existing dataset, if any.
-
-    Raises:
-        ConfigError: If the session's own dataset has samples.
-        DatasetNotFoundError: If there is no such dataset.
-        DatasetError: If it is damaged, or the disk is full.
     """
     if config.existing_dir is None:
         return

@@ -38,9 +38,6 @@ class StoredRows:
             mode: Their mode.
             rows: Indices of the rows of a pass; None: all current rows.
             random: Draws the order of each pass; None: the order of `rows`.
-
-        Raises:
-            DatasetError: If the mode has no rows.
         """
         if mode not in dataset.modes or not dataset.num_samples(mode):
             raise DatasetError(

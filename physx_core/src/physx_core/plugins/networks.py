@@ -25,11 +25,6 @@ def resolve_network(reference: Any, arguments: Mapping[str, Any]) -> tuple[Any, 
     Args:
         reference: As in `resolve`; also a class derived from one of a plugin's library.
         arguments: The user's keyword arguments.
-
-    Raises:
-        ConfigError: If the arguments contain ``module``.
-        PluginNotFoundError: If the library's plugin is not installed.
-        PhysxError: If the reference cannot be resolved: see `resolve`.
     """
     found = resolve("network", reference)
     library = _library_of(found)

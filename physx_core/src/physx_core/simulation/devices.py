@@ -39,9 +39,6 @@ def places_of(kind: str, names: Iterable[str], known: Mapping[str, int] | Sequen
         kind: ``"joint"`` or ``"body"``.
         names: Names to look up.
         known: Places by name, or names in order.
-
-    Raises:
-        ComponentNotFoundError: If a name is unknown.
     """
     places = known if isinstance(known, Mapping) else {name: i for i, name in enumerate(known)}
     found = []
@@ -61,11 +58,7 @@ def as_slice(places: Any) -> Any:
 
 
 def check_unique(kind: str, names: Sequence[str]) -> None:
-    """Check that there are names and no two are equal.
-
-    Raises:
-        ConfigError: If two names are equal, or there are none.
-    """
+    """Check that there are names and no two are equal."""
     if not names:
         raise ConfigError(f"There are no {kind.split()[0]}.")
     for name in names:

@@ -92,11 +92,7 @@ class Source(ABC):
 
 
 def check_stored(stored: Batch, size: int) -> None:
-    """Check that there is one stored row for each row of a batch.
-
-    Raises:
-        UsageError: If there are more or fewer.
-    """
+    """Check that there is one stored row for each row of a batch."""
     for name, values in stored.items():
         if len(values) != size:
             raise UsageError(f'{len(values)} stored rows of "{name}" do not make {size} rows.')

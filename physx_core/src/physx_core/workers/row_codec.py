@@ -28,9 +28,6 @@ def pack_rows(block: Batch, count: int, kind: Kind = Kind.ROWS) -> list[bytes | 
         block: Field name to contiguous array of shape (count, *field shape).
         count: How many rows.
         kind: Kind of the message.
-
-    Raises:
-        UsageError: If the block is longer than a message may be.
     """
     arrays = list(block.values())
     length = sum(array.nbytes for array in arrays)
@@ -47,9 +44,6 @@ def unpack_rows(payload: bytearray, fields: Sequence[Field], count: int) -> Batc
         payload: Payload of the message.
         fields: Fields of the rows, all shapes known.
         count: Number of rows according to the header.
-
-    Raises:
-        ConnectionRefusedByPeerError: If the payload has a different length.
     """
     sizes = [field.nbytes for field in fields]
     if len(payload) != count * sum(sizes):

@@ -54,21 +54,13 @@ class ParallelDynamics(Closeable):
         weakref.finalize(self, _end_processes, self._held, self._owner)
 
     def forward(self, q: Vector, v: Vector, tau: Vector, *, processes: int) -> Vector:
-        """Return the accelerations, shape (n, nv).
-
-        Raises:
-            SimulationError: If one of the processes ended.
-        """
+        """Return the accelerations, shape (n, nv)."""
         return self._compute(FORWARD, (q, v, tau), processes)
 
     def gradients(
         self, q: Vector, v: Vector, a: Vector, weights: Vector, *, processes: int
     ) -> Vector:
-        """Return the gradients of weighted sums of the accelerations, shape (3, n, nv).
-
-        Raises:
-            SimulationError: If one of the processes ended.
-        """
+        """Return the gradients of weighted sums of the accelerations, shape (3, n, nv)."""
         return self._compute(GRADIENTS, (q, v, a, weights), processes)
 
     def close(self) -> None:
@@ -125,9 +117,6 @@ class _Worker:
         Args:
             file: Descriptor of the shared memory.
             held: Ends the process when it is closed.
-
-        Raises:
-            SimulationError: If the operating system cannot start it.
         """
         self._link, theirs = socket.socketpair()
         held.enter_context(self._link)
@@ -151,22 +140,14 @@ class _Worker:
         held.callback(self._process.kill)
 
     def ask(self, message: bytes) -> None:
-        """Send a message.
-
-        Raises:
-            SimulationError: If the process ended.
-        """
+        """Send a message."""
         try:
             self._link.sendall(message)
         except ConnectionError:
             raise self._lost() from None
 
     def wait(self) -> None:
-        """Wait until it has finished its request.
-
-        Raises:
-            SimulationError: If the process ended.
-        """
+        """Wait until it has finished its request."""
         with contextlib.suppress(ConnectionError):
             if self._link.recv(len(DONE)) == DONE:
                 return

@@ -16,11 +16,7 @@ meshes, Robot(collisions="boxes") or "capsules" is many times faster."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Print each robot that an installed backend knows by name.
-
-    Raises:
-        UsageError: If there are words after the command.
-    """
+    """Print each robot that an installed backend knows by name."""
     if words and words[0] in ("-h", "--help"):
         print(_HELP)
         return

@@ -34,11 +34,7 @@ _MESH = (
 
 
 def load_skeleton(mover: Mover) -> dynamics.Skeleton:
-    """Return the skeleton of a robot or object, without shapes.
-
-    Raises:
-        ModelError: If DART cannot load it; the message quotes DART.
-    """
+    """Return the skeleton of a robot or object, without shapes."""
     model, text = mover.model, mover.model.text
     if model.links[0] == WORLD:
         text = text.replace(f'link="{WORLD}"', f'link="{ROOT}"')
@@ -57,11 +53,7 @@ def link_name(link: str) -> str:
 
 
 def attach_shapes(skeleton: dynamics.Skeleton, shapes: Sequence[CollisionShape]) -> None:
-    """Attach collision shapes to a skeleton's bodies.
-
-    Raises:
-        ModelError: If a mesh cannot be loaded.
-    """
+    """Attach collision shapes to a skeleton's bodies."""
     for shape in shapes:
         body = skeleton.getBodyNode(link_name(shape.body))
         if body is None:  # an object has a single body
@@ -70,11 +62,7 @@ def attach_shapes(skeleton: dynamics.Skeleton, shapes: Sequence[CollisionShape])
 
 
 def static_skeleton(static: Static) -> dynamics.Skeleton:
-    """Return the immobile skeleton of a shape or of the ground.
-
-    Raises:
-        ModelError: If a mesh cannot be loaded.
-    """
+    """Return the immobile skeleton of a shape or of the ground."""
     skeleton = dynamics.Skeleton(static.name)
     joint, body = skeleton.createWeldJointAndBodyNodePair()
     rotation = to_matrix(static.orientation)

@@ -19,9 +19,6 @@ def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
     Args:
         path: Path of an stl, obj, or dae file.
         scale: Factors of the lengths along each axis.
-
-    Raises:
-        ModelError: If the file does not exist, is of another format, or cannot be read.
     """
     if not path.is_file():
         raise ModelError(f"There is no mesh file {path}.")

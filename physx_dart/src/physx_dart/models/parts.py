@@ -75,11 +75,7 @@ class Parts:
 
 
 def read_parts(world: World) -> Parts:
-    """Read the files of a world.
-
-    Raises:
-        ModelError: If a file cannot be read, or a robot has no joint and a fixed base.
-    """
+    """Read the files of a world."""
     movers = []
     for robot in world.robots:
         model = read_robot(robot, touching=_touches(world, robot.self_collisions))
@@ -126,11 +122,7 @@ def static_poses(parts: Parts) -> np.ndarray:
 
 
 def layout_of(parts: Parts) -> Layout:
-    """Return names and places of everything in the state.
-
-    Raises:
-        ModelError: If two bodies have one name.
-    """
+    """Return names and places of everything in the state."""
     several = len(parts.world.robots) > 1
     joints: list[Joint] = []
     joint_names: list[str] = []

@@ -22,9 +22,6 @@ def find_robot(urdf: str | Path) -> Path:
     Args:
         urdf: A path; or the name of a robot of this package, as in ``"cartpole"``, or of
             ``example-robot-data``, as in ``"a1/a1"``; ``physx robots`` lists the names.
-
-    Raises:
-        ModelError: If it is neither the path of a URDF file nor the name of a robot.
     """
     path = Path(urdf).absolute()
     if isinstance(urdf, Path) or urdf.lower().endswith(".urdf") or path.is_file():
@@ -82,9 +79,6 @@ def example_robot(name: str) -> Path:
 
     Args:
         name: Path in its folder ``robots``, as in ``"panda_description/urdf/panda.urdf"``.
-
-    Raises:
-        ModelError: If the package is not installed, or has no such robot.
     """
     folder = example_data_dir()
     if folder is None:
@@ -105,9 +99,6 @@ def check_meshes(model: Path, root: Element, package_dirs: Mapping[str, str | Pa
         model: Path of the robot's URDF file.
         root: Its root element.
         package_dirs: Folder of each package.
-
-    Raises:
-        MissingMeshesError: If some do not exist; it names all of them.
     """
     missing = []
     for name in dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh")):

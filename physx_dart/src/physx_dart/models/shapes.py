@@ -48,9 +48,6 @@ def shapes_of_robot(robot: Robot, path: Path, tree: UrdfTree) -> tuple[Collision
         robot: Its description.
         path: Its URDF file.
         tree: Its links.
-
-    Raises:
-        ModelError: If a shape is invalid, a mesh cannot be read, or a foot is not a link.
     """
     unknown = [name for name in robot.feet if name not in tree.links]
     if unknown:
@@ -76,11 +73,7 @@ def shapes_of_robot(robot: Robot, path: Path, tree: UrdfTree) -> tuple[Collision
 
 
 def shape_of_object(thing: WorldObject) -> CollisionShape:
-    """Return the shape of an object.
-
-    Raises:
-        ModelError: If its kind is unknown, or its mesh does not exist or cannot be read.
-    """
+    """Return the shape of an object."""
     mesh = None
     if isinstance(thing, Box):
         kind, size = "box", thing.size

@@ -94,10 +94,6 @@ def read_robot(robot: Robot, *, touching: bool = False) -> RobotModel:
     Args:
         robot: The robot's description.
         touching: Whether to read its collision shapes.
-
-    Raises:
-        ModelError: If the file is missing or is not a URDF file, or its links do not form a tree.
-        MissingMeshesError: If mesh files that it names do not exist.
     """
     path = find_robot(robot.urdf)
     root = parse_urdf(path)

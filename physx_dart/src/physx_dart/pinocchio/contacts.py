@@ -125,11 +125,7 @@ class ContactFinder:
         frames: Sequence[int],
         features: Sequence[str],
     ) -> None:
-        """Prepare the points; `find` uses the model and its data.
-
-        Raises:
-            FeatureNotSupportedError: If a shape is a mesh.
-        """
+        """Prepare the points; `find` uses the model and its data."""
         self._model, self._data = model, data
         self._surfaces = [
             (place, surface)

@@ -17,11 +17,7 @@ _LINK = "physx link "
 
 
 def load_model(mover: Mover, gravity: tuple[float, ...], *, armature: Vector) -> Any:
-    """Return the model of a robot or object in the convention of `physx_core`.
-
-    Raises:
-        ModelError: If Pinocchio cannot load it.
-    """
+    """Return the model of a robot or object in the convention of `physx_core`."""
     if mover.fixed_base:
         model = _parse(mover)
         _weld(model, mover)
@@ -36,9 +32,6 @@ def load_stepping_model(mover: Mover, gravity: tuple[float, ...], *, armature: V
     Its positions are those of `load_model`; the first three velocities of a floating base are along
     the world's axes, not its own, so that semi-implicit Euler conserves the linear momentum of a
     tumbling body, as in DART; in the base's own frame it would not.
-
-    Raises:
-        ModelError: If Pinocchio cannot load it.
     """
     if mover.fixed_base:
         return load_model(mover, gravity, armature=armature)

@@ -47,12 +47,7 @@ class PinocchioRobot(RobotEngine):
         solver: ImpulseSolver,
         features: Sequence[str],
     ) -> None:
-        """Load the models.
-
-        Raises:
-            ModelError: If Pinocchio cannot load the robot.
-            FeatureNotSupportedError: If a collision shape is a mesh.
-        """
+        """Load the models."""
         super().__init__(mover)
         self._period = world.period
         resists, dt = self.resistance, world.period

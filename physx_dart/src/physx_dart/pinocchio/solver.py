@@ -35,11 +35,7 @@ class ImpulseSolver:
     """
 
     def __init__(self, name: str) -> None:
-        """Prepare the solver.
-
-        Raises:
-            UnknownOptionError: If there is no solver of that name.
-        """
+        """Prepare the solver."""
         if name not in SOLVERS:
             raise UnknownOptionError("World.solver for pinocchio", [name], SOLVERS)
         gauss_seidel = (
@@ -70,9 +66,6 @@ class ImpulseSolver:
             friction: Coefficients of the points, shape (k,).
             least: Smallest impulses of the rows, shape (m,); rows with one bound come first.
             most: Largest impulses, likewise.
-
-        Raises:
-            SimulationError: If a value is not finite.
         """
         if not np.isfinite(free).all() or not np.isfinite(response).all():
             raise SimulationError("The state is no longer finite. Use a smaller period.")

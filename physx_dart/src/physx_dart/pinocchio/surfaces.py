@@ -99,11 +99,7 @@ class Heights(Surface):
 
 
 def surfaces_of(static: Static, engine: str, features: Sequence[str]) -> list[Surface]:
-    """Return the surfaces of something static.
-
-    Raises:
-        FeatureNotSupportedError: If it is a mesh.
-    """
+    """Return the surfaces of something static."""
     what = static.what
     if isinstance(what, HeightField):
         return [Heights(what)]

@@ -39,11 +39,7 @@ class MoverAlgorithms:
 
     @classmethod
     def load(cls, mover: Mover, gravity: tuple[float, ...]) -> Self:
-        """Return the algorithms of a robot or object.
-
-        Raises:
-            ModelError: If Pinocchio cannot load it.
-        """
+        """Return the algorithms of a robot or object."""
         resistance = Resistance.of(mover)
         model = load_model(mover, gravity, armature=resistance.armature)
         return cls(model, resistance, frames_of(model, mover))
@@ -189,20 +185,12 @@ class Algorithms:
 
     @classmethod
     def of(cls, world: World) -> Self:
-        """Return the algorithms of a world.
-
-        Raises:
-            ModelError: If a robot cannot be loaded; the message says why.
-        """
+        """Return the algorithms of a world."""
         return cls.of_parts(read_parts(world))
 
     @classmethod
     def of_parts(cls, parts: Parts) -> Self:
-        """Return the algorithms of the parts of a world.
-
-        Raises:
-            ModelError: If Pinocchio cannot load a robot.
-        """
+        """Return the algorithms of the parts of a world."""
         movers = [MoverAlgorithms.load(each, parts.world.gravity) for each in parts.movers]
         return cls(movers, static_poses(parts))
 

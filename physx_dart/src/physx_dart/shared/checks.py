@@ -14,11 +14,7 @@ from physx_core.typing import Vector
 
 
 def integer(name: str, given: Any, least: int) -> int:
-    """Return a value as an integer.
-
-    Raises:
-        SimulationError: If it is not an integer, or is below `least`.
-    """
+    """Return a value as an integer."""
     try:
         number = operator.index(given)
     except TypeError:
@@ -38,12 +34,7 @@ class LayoutChecks:
         self._floating = [part for part in layout.parts.values() if part.floating]
 
     def positions(self, given: Any) -> Vector:
-        """Return positions as a new vector (nq,), their quaternions scaled to length 1.
-
-        Raises:
-            SimulationError: If the shape is wrong, a value is not finite, or the length of a
-                quaternion is not 1 within 0.001.
-        """
+        """Return positions as a new vector (nq,), their quaternions scaled to length 1."""
         q = finite_vector("positions", given, self._layout.nq)
         for part in self._floating:
             base = slice(part.positions.start + 3, part.positions.start + 7)
@@ -57,20 +48,11 @@ class LayoutChecks:
         return q
 
     def velocities(self, name: str, given: Any) -> Vector:
-        """Return velocities, accelerations, or torques as a new vector (nv,).
-
-        Raises:
-            SimulationError: If the shape is wrong or a value is not finite.
-        """
+        """Return velocities, accelerations, or torques as a new vector (nv,)."""
         return finite_vector(name, given, self._layout.nv)
 
     def rows(self, positions: Any, **others: Any) -> list[Vector]:
-        """Return many states as new arrays: positions (n, nq), then the others (n, nv).
-
-        Raises:
-            SimulationError: If a shape is wrong, a value is not finite, or the length of a
-                quaternion is not 1 within 0.001.
-        """
+        """Return many states as new arrays: positions (n, nq), then the others (n, nv)."""
         q, nv = finite_rows("positions", positions, self._layout.nq), self._layout.nv
         rows = [finite_rows(name, values, nv) for name, values in others.items()]
         if any(len(each) != len(q) for each in rows):
@@ -91,11 +73,7 @@ class LayoutChecks:
         return [q, *rows]
 
     def body(self, name: Any) -> int:
-        """Return the place of a body in `Layout.names`.
-
-        Raises:
-            SimulationError: If there is no body of that name.
-        """
+        """Return the place of a body in `Layout.names`."""
         place = self._bodies.get(name) if isinstance(name, str) else None
         if place is None:
             raise SimulationError(
@@ -105,11 +83,7 @@ class LayoutChecks:
         return place
 
     def bodies(self, names: Any) -> list[int]:
-        """Return the places of bodies in `Layout.names`; None: all that move.
-
-        Raises:
-            SimulationError: If `names` is not a list of names of bodies.
-        """
+        """Return the places of bodies in `Layout.names`; None: all that move."""
         if names is None:
             return list(range(len(self._layout.bodies)))
         if isinstance(names, str):
@@ -124,11 +98,7 @@ class LayoutChecks:
             raise SimulationError(f"names is {names!r} but must be a list of names.") from None
 
     def part(self, name: Any) -> int:
-        """Return the place of a robot or moving object in `Layout.parts`.
-
-        Raises:
-            SimulationError: If nothing of that name moves.
-        """
+        """Return the place of a robot or moving object in `Layout.parts`."""
         known = list(self._layout.parts)
         if name not in known:
             raise SimulationError(

@@ -28,11 +28,7 @@ class Wrenches:
         return number
 
     def remove(self, number: int) -> None:
-        """Remove a wrench.
-
-        Raises:
-            SimulationError: If no wrench with that number acts.
-        """
+        """Remove a wrench."""
         if number not in self._active:
             raise SimulationError(
                 f"No wrench has the number {number!r}; active wrenches: {sorted(self._active)}."
@@ -77,21 +73,13 @@ class Hooks:
         return len(self._hooks)
 
     def add(self, hook: Hook, every: int) -> None:
-        """Call a function before the steps whose frame is a multiple of `every`.
-
-        Raises:
-            SimulationError: If it is not callable.
-        """
+        """Call a function before the steps whose frame is a multiple of `every`."""
         if not callable(hook):
             raise SimulationError(f"{hook!r} is not callable, so it cannot be a hook.")
         self._hooks.append((hook, every))
 
     def remove(self, hook: Hook) -> None:
-        """Remove a hook.
-
-        Raises:
-            SimulationError: If the function is not a hook of this simulation.
-        """
+        """Remove a hook."""
         for place, (known, _) in enumerate(self._hooks):
             if known == hook:
                 del self._hooks[place]

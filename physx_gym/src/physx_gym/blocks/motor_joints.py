@@ -32,9 +32,6 @@ class JointEncoders(SharedArrays):
             env: The environment that has the sensors.
             joints: Names of the joints.
             purpose: What needs the encoders, for errors.
-
-        Raises:
-            ConfigError: If a joint does not have an encoder.
         """
         encoders = [each for each in env.simulator.sensors if type(each) is Encoder]
         known = [each.joint for each in encoders]
@@ -87,10 +84,6 @@ class MotorJoints(SharedArrays):
         Args:
             env: The environment.
             purpose: What needs the motors, for errors.
-
-        Raises:
-            ConfigError: If there is no motor, the environment's action is not one torque for each
-                motor, or a joint does not have an encoder.
         """
         motors, layout = env.simulator.motors, env.simulator.layout
         if not motors:
@@ -113,11 +106,7 @@ class MotorJoints(SharedArrays):
         self.encoders = JointEncoders(env, self.names, purpose)
 
     def option(self, name: str, given: Any, *, positive: bool = False) -> Vector:
-        """Return an option as one number for each motor; it may be infinite.
-
-        Raises:
-            ConfigError: If it is neither a number nor one for each motor, or is NaN or negative.
-        """
+        """Return an option as one number for each motor; it may be infinite."""
         count = len(self.names)
         try:
             values = np.broadcast_to(np.asarray(given, np.float64), (count,)).copy()

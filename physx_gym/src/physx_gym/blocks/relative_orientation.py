@@ -40,10 +40,6 @@ class RelativeOrientation:
             simulation: Simulation that the links are in.
             known: Link whose orientation will be known.
             wanted: Link whose orientation is wanted.
-
-        Raises:
-            FeatureNotSupportedError: If the links differ and the engine does not have Jacobians.
-            SimulationError: If there is no link of that name.
         """
         self.joints: tuple[str, ...] = ()
         self._up: list[tuple[int, Triple]] = []

@@ -19,9 +19,6 @@ def make_env(env: str, options: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
             ``"physx_gym:physx/Ant-v0"``; or the location of its class, ``"package.module:Class"``
             or ``"script.py:Class"``.
         options: Its keyword arguments.
-
-    Raises:
-        ConfigError: If there is no environment of that name.
     """
     _, colon, name = env.rpartition(":")
     if colon and name.replace(".", "").isidentifier():

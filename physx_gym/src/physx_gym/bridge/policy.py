@@ -97,9 +97,6 @@ def action_arrays(actions: SpaceFields, prediction: Mapping[str, Any]) -> dict[s
 
     Returns:
         Arrays of shape (samples, *field shape).
-
-    Raises:
-        UsageError: If the network does not predict a field, or predicts a wrong number of values.
     """
     found = {}
     for field, space in zip(actions.fields, actions.leaves, strict=True):

@@ -28,13 +28,7 @@ class ShowLog:
 
 
 def run(words: Sequence[str]) -> None:
-    """Print each log as a table, or write a plot or a recording.
-
-    Raises:
-        LogError: If a file cannot be read, or does not hold what was asked for.
-        MissingLibraryError: If Matplotlib is not installed.
-        PluginNotFoundError: If the viewer is not installed.
-    """
+    """Print each log as a table, or write a plot or a recording."""
     options = tyro.cli(ShowLog, args=words, prog="physx log")
     logs = [read_log(file) for file in options.files]
     if options.plot is not None:

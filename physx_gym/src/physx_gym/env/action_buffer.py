@@ -26,11 +26,7 @@ class ActionBuffer(SharedArrays):
             self._first, self._end = int(space.start), int(space.start + space.n)
 
     def write(self, action: Any) -> None:
-        """Check an action, and write it into the buffer, clipped to the bounds of its space.
-
-        Raises:
-            ActionError: If its form is wrong, or an entry is not finite.
-        """
+        """Check an action, and write it into the buffer, clipped to the bounds of its space."""
         buffer = self._buffer
         kind = type(action)
         if kind is np.int64 or kind is int:

@@ -51,11 +51,7 @@ class ObservationChecks(SharedArrays):
         return np.concatenate([value_at(observation, path) for path, _ in self._leaves], None)
 
     def check_finite(self, observation: Any) -> None:
-        """Check that there is no NaN.
-
-        Raises:
-            SimulationError: If there is one; the message says where.
-        """
+        """Check that there is no NaN."""
         if self._is_floating:
             vector = self._vector(observation)
             total = vector.dot(vector)
@@ -83,11 +79,7 @@ class ObservationChecks(SharedArrays):
         return b"\0" not in self._within.tobytes()  # many times faster than all()
 
     def check_form(self, observation: Any) -> None:
-        """Check that an observation has the form of its space, whatever its values.
-
-        Raises:
-            SimulationError: If it does not.
-        """
+        """Check that an observation has the form of its space, whatever its values."""
         for path, space in self._leaves:
             try:
                 part = value_at(observation, path)

@@ -19,9 +19,6 @@ def construct_next(kind: type[Any], env: Any, options: Mapping[str, Any]) -> Non
         kind: The class before.
         env: The environment.
         options: Options of the constructor.
-
-    Raises:
-        UnknownOptionError: If there are options, but no class takes them.
     """
     order = type(env).__mro__
     place = order.index(kind) + 1
@@ -53,11 +50,7 @@ _PAIRS = {
 
 
 def check_mode(mode: Any, modes: Sequence[str]) -> None:
-    """Check a render mode; None: whichever is possible.
-
-    Raises:
-        UnknownOptionError: If there is no such mode.
-    """
+    """Check a render mode; None: whichever is possible."""
     if mode is not None and mode not in modes:
         raise UnknownOptionError("render_mode", [str(mode)], modes)
 
@@ -75,11 +68,7 @@ def metadata_of(kind: type[Any], step_dt: float) -> dict[str, Any]:
 
 
 def check_pair(env: Any, method: str, found: Any) -> tuple[Any, Any]:
-    """Return what a method returned, if it is a pair.
-
-    Raises:
-        ConfigError: If it is not.
-    """
+    """Return what a method returned, if it is a pair."""
     if not isinstance(found, (tuple, list)) or len(found) != 2:
         raise ConfigError(
             f"{type(env).__name__}.{method} returned {found!r} but must return {_PAIRS[method]}."
@@ -88,11 +77,7 @@ def check_pair(env: Any, method: str, found: Any) -> tuple[Any, Any]:
 
 
 def check_number(env: Any, reward: Any) -> float:
-    """Return a reward as a number.
-
-    Raises:
-        ConfigError: If it is not a number.
-    """
+    """Return a reward as a number."""
     try:
         return float(reward)
     except (TypeError, ValueError) as error:
@@ -102,11 +87,7 @@ def check_number(env: Any, reward: Any) -> float:
 
 
 def check_spaces(env: Any) -> None:
-    """Check that an environment has its spaces.
-
-    Raises:
-        ConfigError: If one is missing, or is not a space.
-    """
+    """Check that an environment has its spaces."""
     for kind in ("action_space", "observation_space"):
         space = getattr(env, kind, None)
         if not isinstance(space, gymnasium.Space):

@@ -43,10 +43,6 @@ class StepTiming:
             control_period: Time between two commands, in s; None: a step.
             observe_period: Time between two observations, in s; None: as between two commands.
             duration: Time after which an episode is truncated, in s.
-
-        Raises:
-            ConfigError: If a step is not a multiple of the other periods, or one of these is not
-                a multiple of the physics'.
         """
         self.step = steps_of("step_dt", step_dt, period)
         self.control = steps_of("control_period", control_period or step_dt, period)

@@ -38,11 +38,6 @@ class Recipe:
         Args:
             backend: Engine to use instead of the one in the tables; None: theirs.
             options: Options of the environment that replace those in its table.
-
-        Raises:
-            UnknownOptionError: If a part does not have an option of that name.
-            ConfigError: If an argument of a part is missing, or a part rejects its options.
-            ComponentNotFoundError: If a part among the options is not found.
         """
         table, layers = copy.deepcopy((self.env_config, self.layers_config))
         maker, registered = find_environment(table["cls"])

@@ -34,10 +34,6 @@ def find(kind: str, reference: Any) -> Callable[..., Any]:
         kind: ``environment``, ``block``, ``wrapper``, or ``component`` for everything else.
         reference: A class or function, ``"package.module:Class"``, ``"script.py:Class"``, or the
             name of one that physx provides.
-
-    Raises:
-        ComponentNotFoundError: If there is none of that name.
-        ConfigError: If the reference is neither a name nor callable.
     """
     if not isinstance(reference, str):
         found = reference
@@ -90,11 +86,6 @@ def build(where: str, kind: str, table: Mapping[str, Any], *args: Any, **given: 
         table: The table.
         args: First arguments of the part.
         given: Options that replace those in the table.
-
-    Raises:
-        UnknownOptionError: If the table or the part does not have an option of that name.
-        ConfigError: If the table is incomplete, or an argument of the part is missing.
-        ComponentNotFoundError: If a part is not found.
     """
     check_table(where, table, ("cls", "kwargs"))
     maker = find(kind, table["cls"])
@@ -115,12 +106,7 @@ def build_nested(where: str, value: Any) -> Any:
 
 
 def check_table(where: str, table: Any, known: Iterable[str], required: str = "cls") -> None:
-    """Check the keys of a table.
-
-    Raises:
-        UnknownOptionError: If it has a key that is not known.
-        ConfigError: If it or its options are not a table, or the required key is missing.
-    """
+    """Check the keys of a table."""
     if not isinstance(table, Mapping):
         raise ConfigError(f"{where} is {table!r} but must be a table.")
     unknown = [str(key) for key in table if key not in known]
@@ -135,12 +121,7 @@ def check_table(where: str, table: Any, known: Iterable[str], required: str = "c
 def check_call(
     where: str, maker: Callable[..., Any], args: tuple[Any, ...], options: Mapping[str, Any]
 ) -> None:
-    """Check that a class or function takes some arguments.
-
-    Raises:
-        UnknownOptionError: If it does not have an option of that name.
-        ConfigError: If an argument is missing.
-    """
+    """Check that a class or function takes some arguments."""
     try:
         signature = inspect.signature(maker)
     except (TypeError, ValueError):  # implemented in C: it reports its own mistakes

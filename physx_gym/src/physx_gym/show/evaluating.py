@@ -43,9 +43,6 @@ def evaluate(
 
     Returns:
         Rewards of all steps, and information: one more, as the first is that of the reset.
-
-    Raises:
-        ConfigError: If the horizon is not positive, or the policy does not accept its arguments.
     """
     _check(policy_fn)
     steps = math.inf
@@ -84,11 +81,7 @@ def evaluate(
 
 
 def _check(policy_fn: Any) -> None:
-    """Check that a policy accepts its arguments.
-
-    Raises:
-        ConfigError: If it does not.
-    """
+    """Check that a policy accepts its arguments."""
     try:
         inspect.signature(policy_fn).bind(*[None] * 6)
     except (TypeError, ValueError) as error:

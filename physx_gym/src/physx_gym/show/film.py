@@ -23,10 +23,6 @@ def write_film(pictures: Iterable[NDArray[np.uint8]], path: Path, frame_rate: fl
 
     Returns:
         The path.
-
-    Raises:
-        ConfigError: If the suffix is not one of these.
-        MissingLibraryError: If Pillow is not installed.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise ConfigError(

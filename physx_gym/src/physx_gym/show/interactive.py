@@ -35,11 +35,7 @@ class Keyboard:
         self._bytes = b""
 
     def __enter__(self) -> Self:
-        """Make the terminal pass on keys immediately.
-
-        Raises:
-            UsageError: If there is no terminal.
-        """
+        """Make the terminal pass on keys immediately."""
         try:
             import termios
             import tty
@@ -125,9 +121,6 @@ def play(
         enable_is_done: Whether the end of an episode ends the game; otherwise the next one begins.
         verbose: Whether to print what happens.
         kwargs: For `RobotEnv._key_to_action`.
-
-    Raises:
-        UsageError: If there is no terminal, or the environment does not define what keys do.
     """
     viewer = _viewer(env, enable_travelling)
     try:

@@ -32,11 +32,6 @@ def open_viewer(title: str, instances: int = 1, **options: Any) -> Visualizer:
         title: Title of its recording.
         instances: Number of worlds to show.
         options: Of the visualizer; ``visualizer`` is its reference, by default `VIEWER`.
-
-    Raises:
-        PluginNotFoundError: If the visualizer is not installed.
-        UnknownOptionError: If it does not have an option.
-        VisualizerError: If it cannot be opened.
     """
     options = dict(options)
     kind: Any = plugins.resolve("visualizer", options.pop("visualizer", VIEWER))
@@ -59,9 +54,6 @@ class Renderer:
             env: The environment to show.
             mode: Overrides the environment's ``render_mode``.
             follow: Whether the camera follows a robot whose base floats.
-
-        Raises:
-            UnknownOptionError: If there is no such ``render_mode``.
         """
         mode = mode or env.render_mode or ("human" if has_display() else "rgb_array")
         if mode not in MODES:
@@ -79,10 +71,6 @@ class Renderer:
 
         Returns:
             A picture, shape (height, width, 3); None in the mode ``"human"``.
-
-        Raises:
-            PluginNotFoundError: If the viewer is not installed.
-            VisualizerError: If the viewer cannot draw; the message says what is missing.
         """
         simulator = self._env.simulator
         poses = simulator.simulation.body_poses()

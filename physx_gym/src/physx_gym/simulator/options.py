@@ -34,12 +34,7 @@ def sensor_options(sensors: Sequence[Sensor]) -> dict[str, Any]:
 
 
 def change_world(world: World, options: Mapping[str, Any]) -> World:
-    """Return a world with some options changed.
-
-    Raises:
-        UnknownOptionError: If there is no option of that name.
-        ConfigError: If a value is out of range.
-    """
+    """Return a world with some options changed."""
     options = dict(_mapping("world", options))
     ground = options.pop("ground", None)
     changes: dict[str, Any] = {}
@@ -60,12 +55,7 @@ def change_world(world: World, options: Mapping[str, Any]) -> World:
 
 
 def change_each(where: str, things: Mapping[str, Any], options: Any) -> dict[str, Any]:
-    """Return things by name with some options changed.
-
-    Raises:
-        UnknownOptionError: If there is no thing, or no option, of that name.
-        ConfigError: If a value is out of range.
-    """
+    """Return things by name with some options changed."""
     options = _mapping(where, options)
     check_known(where, options, things)
     return {
@@ -75,11 +65,7 @@ def change_each(where: str, things: Mapping[str, Any], options: Any) -> dict[str
 
 
 def check_known(where: str, options: Any, known: Any) -> None:
-    """Check the names of options.
-
-    Raises:
-        UnknownOptionError: If one is not known.
-    """
+    """Check the names of options."""
     unknown = [str(name) for name in _mapping(where, options) if name not in known]
     if unknown:
         raise UnknownOptionError(f"Options of the simulator: {where}", unknown, known)

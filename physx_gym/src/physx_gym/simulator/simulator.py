@@ -556,12 +556,7 @@ class Simulator(SharedArrays):
 
 
 def make_simulator(thing: Any, options: Mapping[str, Any]) -> Simulator:
-    """Return a simulator of a world, or of the file or name of a robot.
-
-    Raises:
-        ConfigError: If the thing is none of these.
-        UnknownOptionError: If there is no option of a name.
-    """
+    """Return a simulator of a world, or of the file or name of a robot."""
     make: Any = Simulator if isinstance(thing, World) else Simulator.build
     if not isinstance(thing, (World, str, Path)):
         raise ConfigError(
@@ -579,11 +574,7 @@ def make_simulator(thing: Any, options: Mapping[str, Any]) -> Simulator:
 
 
 def _check_list(option: str, kind: type[Any], given: Any) -> tuple[Any, ...] | None:
-    """Return a list of motors or sensors as a tuple; None stays None.
-
-    Raises:
-        ConfigError: If it is anything else.
-    """
+    """Return a list of motors or sensors as a tuple; None stays None."""
     if given is None:
         return None
     name = kind.__name__

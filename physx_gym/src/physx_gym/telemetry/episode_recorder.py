@@ -51,9 +51,6 @@ class EpisodeRecorder:
 
         Returns:
             The path of the file.
-
-        Raises:
-            ConfigError: If the path is not a path.
         """
         if path is not None and not isinstance(path, (str, Path)):
             raise ConfigError(f'The option "log_path" is {path!r} but must be a path.')

@@ -48,9 +48,6 @@ def as_logs(sources: Source | Sequence[Source], more: Sequence[Source] = ()) -> 
     Args:
         sources: One or several.
         more: Several.
-
-    Raises:
-        LogError: If something is none of these, a file cannot be read, or nothing was recorded.
     """
     several = isinstance(sources, Sequence) and not isinstance(sources, str)
     given: Any = sources if several else [sources]

@@ -75,9 +75,6 @@ def world_of(value: Any, where: str) -> World:
     Args:
         value: The plain data.
         where: Where the data is from, for errors.
-
-    Raises:
-        LogError: If the data does not describe a valid world.
     """
     try:
         world = _build(value, _DEPTH)

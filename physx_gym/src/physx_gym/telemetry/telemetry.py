@@ -72,10 +72,6 @@ class Telemetry:
             namespace: Prefix of the name.
             is_eval_only: Whether it is left out in training.
             unit: Unit of all its numbers, or a sequence of units.
-
-        Raises:
-            EpisodeError: If an episode is being recorded.
-            ConfigError: If a type, shape or name is wrong, or the name is taken.
         """
         if self.is_recording:
             raise EpisodeError(
@@ -108,11 +104,7 @@ class Telemetry:
             taken[name] = f'"{variable.name}" too'
 
     def unregister(self, name: str) -> None:
-        """Remove a variable, if there is one of a name with namespace.
-
-        Raises:
-            EpisodeError: If an episode is being recorded.
-        """
+        """Remove a variable, if there is one of a name with namespace."""
         if self.is_recording:
             raise EpisodeError(f'The variable "{name}" cannot be removed while an episode runs.')
         self._variables.pop(name, None)
@@ -159,11 +151,7 @@ class Telemetry:
             self._table.rewind(time)
 
     def end(self) -> None:
-        """End the episode and write its file; nothing happens if none is being recorded.
-
-        Raises:
-            LogError: If the file cannot be written.
-        """
+        """End the episode and write its file; nothing happens if none is being recorded."""
         if not self.is_recording:
             return
         self.is_recording, self._new = False, set()

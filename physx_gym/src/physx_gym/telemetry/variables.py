@@ -51,11 +51,7 @@ class Variable(SharedArrays):
         unit: str | Sequence[str],
         is_eval_only: bool,
     ) -> Variable:
-        """Check a variable and name its columns; see `Telemetry.register`.
-
-        Raises:
-            ConfigError: If a type, shape or name is wrong.
-        """
+        """Check a variable and name its columns; see `Telemetry.register`."""
         for text in (name, namespace):
             if not isinstance(text, (str, type(None))):
                 raise ConfigError(f"The name of a variable must be a string, not {text!r}.")

@@ -36,11 +36,7 @@ class InfoLayout:
     """
 
     def __init__(self, names: Sequence[Any]) -> None:
-        """Create the layout of names.
-
-        Raises:
-            ValueError: If one is not that of a number.
-        """
+        """Create the layout of names."""
         self.names = names
         self._entries = _parse(names)
         kinds = [*_kinds(self._entries)]

@@ -58,12 +58,7 @@ class Serve:
 
 
 def run(words: Sequence[str]) -> None:
-    """Run the command.
-
-    Raises:
-        PhysxError: If the environment cannot be created or served there.
-        KeyboardInterrupt: If the user ended it; everything is closed.
-    """
+    """Run the command."""
     with argument_registry():
         chosen = tyro.cli(Serve, args=words, prog="physx serve")
     if chosen.write_launcher is not None:
@@ -124,11 +119,7 @@ def _print_address(chosen: Serve, service: Service, token_file: str | None) -> N
 
 @contextlib.contextmanager
 def _token_file(given: Path | None) -> Iterator[str | None]:
-    """Yield the file with the token, None if it is in the environment; remove a generated one.
-
-    Raises:
-        ConfigError: If the file cannot be created.
-    """
+    """Yield the file with the token, None if it is in the environment; remove a generated one."""
     if given is None and TOKEN_VARIABLE in os.environ:
         yield None
     elif given is not None:

@@ -329,11 +329,7 @@ def _to_leaf(leaf: Space, value: Any) -> Any:
 
 
 def _check_given(observation_space: Any, action_space: Any, requested: Any) -> None:
-    """Check the spaces and the requested observation; each may be None.
-
-    Raises:
-        ConfigError: If one has the wrong type.
-    """
+    """Check the spaces and the requested observation; each may be None."""
     for option, space in (("observation", observation_space), ("action", action_space)):
         if space is not None and not isinstance(space, gymnasium.Space):
             raise ConfigError(f"{option}_space is {space!r:.80}, which is not a gymnasium.Space.")

@@ -282,9 +282,6 @@ class RLEnvironment:
         Args:
             configuration_request: Dictionary with any of the keys ``agent``, ``world`` and
                 ``environment``; the last takes ``repeat_action`` and ``time_speed``.
-
-        Raises:
-            RequestError: If a value of the environment is not valid; nothing is changed then.
         """
         own = configuration_request.get(self.ENVIRONMENT_KEY, {})
         values = as_object(f"{self.CONFIG_KEY}.{self.ENVIRONMENT_KEY}", own)

@@ -26,11 +26,7 @@ class GymnasiumScene(RLEnvironment):
     """
 
     def __init__(self, worlds: Worlds) -> None:
-        """Take the only world.
-
-        Raises:
-            UsageError: If there are several worlds, or a space has no fixed layout.
-        """
+        """Take the only world."""
         super().__init__()
         if worlds.num_worlds != 1:
             raise UsageError(

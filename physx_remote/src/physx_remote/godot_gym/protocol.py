@@ -21,25 +21,14 @@ class GodotGym(Protocol):
     name: ClassVar[str] = "godot-gym"
 
     def __init__(self, **options: Any) -> None:
-        """Keep the options of `Communication`; without any an `RLEnvironment` uses its own.
-
-        Raises:
-            UnknownOptionError: If `Communication` does not have an option.
-            ConfigError: If `Communication` does not accept a value.
-        """
+        """Keep the options of `Communication`; without any an `RLEnvironment` uses its own."""
         known = Communication.__init__.__kwdefaults__ or {}
         check_names(f'The protocol "{self.name}"', options, known)
         Communication(**options)  # checks the values
         self._options = options
 
     def service(self, worlds: Worlds | Scene, *, address: str, port: int) -> GodotGymService:
-        """Return a listening service; see `Protocol.service`.
-
-        Raises:
-            UsageError: If there are several worlds, the environment was served before, or it is
-                not an `RLEnvironment`.
-            RemoteError: If it cannot listen there.
-        """
+        """Return a listening service; see `Protocol.service`."""
         environment = GymnasiumScene(worlds) if isinstance(worlds, Worlds) else worlds
         if not isinstance(environment, RLEnvironment):
             raise UsageError(f"{type(environment).__name__} is not an RLEnvironment.")

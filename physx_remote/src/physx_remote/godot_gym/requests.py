@@ -17,11 +17,7 @@ _PARTS = re.compile(rb'["\\{}]')
 
 
 def parse_request(body: bytes) -> dict[str, Any]:
-    """Return a request; an empty body is an empty request.
-
-    Raises:
-        RequestError: If the body is not a JSON object.
-    """
+    """Return a request; an empty body is an empty request."""
     if not body:
         return {}
     try:
@@ -39,44 +35,28 @@ def parse_request(body: bytes) -> dict[str, Any]:
 
 
 def as_object(key: str, value: Any) -> dict[str, Any]:
-    """Return a value that must be a JSON object.
-
-    Raises:
-        RequestError: If it is not one.
-    """
+    """Return a value that must be a JSON object."""
     if not isinstance(value, dict):
         raise RequestError(f'The value of "{key}" must be a JSON object, not {value!r:.60}.')
     return value
 
 
 def as_count(key: str, value: Any, least: int = 0) -> int:
-    """Return a number of physics frames or steps.
-
-    Raises:
-        RequestError: If it is not an integer, or less than `least`.
-    """
+    """Return a number of physics frames or steps."""
     if not _is_number(value) or value != int(value) or value < least:
         raise RequestError(f"{key} must be an integer of at least {least}, not {value!r:.60}.")
     return int(value)
 
 
 def as_seed(value: Any) -> int:
-    """Return a seed.
-
-    Raises:
-        RequestError: If it is not a non-negative integer.
-    """
+    """Return a seed."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise RequestError(f"A seed must be a non-negative integer, not {value!r:.60}.")
     return value
 
 
 def as_speed(value: Any) -> float | None:
-    """Return how many times faster than real time to run; None: as fast as possible.
-
-    Raises:
-        RequestError: If it is not a positive number or None.
-    """
+    """Return how many times faster than real time to run; None: as fast as possible."""
     if value is None:
         return None
     if not _is_number(value) or value <= 0:
@@ -107,11 +87,7 @@ class JsonReader(BufferReader):
         self._in_text = False
 
     def take(self) -> bytes | None:
-        """Return the next whole object, or None until more has arrived.
-
-        Raises:
-            RemoteProtocolError: If the data are not an object, or it is too long.
-        """
+        """Return the next whole object, or None until more has arrived."""
         if self._depth == 0:
             space = len(self.buffer) - len(self.buffer.lstrip())
             del self.buffer[:space]

@@ -39,9 +39,6 @@ class Agents:
             worlds: One for each agent.
             action_repeat: Steps of the environment in one step of the trainer.
             seed: Seed of the first episodes; None: unseeded.
-
-        Raises:
-            PhysxError: If godot-rl has no format for a space of the worlds.
         """
         self._worlds = worlds
         self._observations = ObservationWriter(worlds.observation_space)

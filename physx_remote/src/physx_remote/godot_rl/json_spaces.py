@@ -50,12 +50,7 @@ class ObservationWriter:
     """
 
     def __init__(self, space: Space) -> None:
-        """Choose the format of each part.
-
-        Raises:
-            ConfigError: If two parts would get the same key, or one a key that godot-rl misreads.
-            UsageError: If godot-rl has no format for a part of the space.
-        """
+        """Choose the format of each part."""
         self.description: dict[str, dict[str, Any]] = {}
         self._tree = SpaceTree(space)
         self._writers: list[Callable[[Any], Any]] = []
@@ -133,12 +128,7 @@ class ActionReader:
     """
 
     def __init__(self, space: Space) -> None:
-        """Choose the format of each part.
-
-        Raises:
-            ConfigError: If two parts would get the same key.
-            UsageError: If godot-rl has no format for a part of the space.
-        """
+        """Choose the format of each part."""
         self.description: dict[str, dict[str, Any]] = {}
         self._tree = SpaceTree(space)
         self._readers: list[Callable[[Mapping[str, Any]], Any]] = []
@@ -155,9 +145,6 @@ class ActionReader:
 
         Args:
             given: Entry to number or list of numbers, from JSON.
-
-        Raises:
-            ActionError: If an entry is missing, unknown, or does not fit its description.
         """
         if not isinstance(given, dict) or given.keys() != self.description.keys():
             has = listed(given) if isinstance(given, dict) else type(given).__name__
@@ -230,11 +217,7 @@ def _index(name: str, number: Any, count: int) -> int:
 
 
 def observation_space_of(name: str, entry: Mapping[str, Any]) -> Space:
-    """Return the space of an entry of the observations.
-
-    Raises:
-        KeyError, TypeError, ValueError or AssertionError: If the description is not valid.
-    """
+    """Return the space of an entry of the observations."""
     if entry["space"] == "discrete":
         return spaces.Discrete(int(entry["size"]))
     if entry["space"] != "box":
@@ -257,11 +240,7 @@ def action_space_of(name: str, entry: Mapping[str, Any]) -> Space:
 
 
 def read_observation(name: str, space: Space, given: Any) -> Any:
-    """Return an entry of an observation as a value of its space.
-
-    Raises:
-        TypeError or ValueError: If it does not fit the space.
-    """
+    """Return an entry of an observation as a value of its space."""
     if isinstance(space, spaces.Discrete):
         return np.int64(given)
     if IMAGE in name:

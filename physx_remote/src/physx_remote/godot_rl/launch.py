@@ -61,9 +61,6 @@ def parse_flags(words: Sequence[str]) -> dict[str, Any]:
 
     Returns:
         Keyword arguments of `serve`.
-
-    Raises:
-        UsageError: If a word is not a flag, or the value of a number is not valid.
     """
     env_kwargs: dict[str, Any] = {}
     given: dict[str, Any] = {"env_kwargs": env_kwargs}

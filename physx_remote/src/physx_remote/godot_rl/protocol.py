@@ -65,10 +65,6 @@ class GodotRL(Protocol):
             timeout: How long to keep trying to reach the trainer, in s.
             max_request: Longest accepted message in bytes.
             options: Must be empty.
-
-        Raises:
-            ConfigError: If a number is out of range.
-            UnknownOptionError: If the protocol does not have an option.
         """
         super().__init__(**options)
         sizes = {"action_repeat": action_repeat, "max_request": max_request}
@@ -93,10 +89,6 @@ class GodotRL(Protocol):
             worlds: One world for each agent of the trainer.
             address: Address where the trainer listens.
             port: Port where the trainer listens; 0: 11008.
-
-        Raises:
-            RemoteError: If nothing listens there, or these worlds cannot be served.
-            PhysxError: If godot-rl has no format for a space of the worlds.
         """
         if not isinstance(worlds, Worlds):
             raise RemoteError(

@@ -40,11 +40,7 @@ class LatestState:
         self.infos: list[dict[str, Any]] = [{} for _ in range(count)]
 
     def put(self, world: int, transition: Transition) -> None:
-        """Keep the transition of a world.
-
-        Raises:
-            RemoteError: If the observation is not in the environment's own space.
-        """
+        """Keep the transition of a world."""
         observation, reward, terminated, truncated, info = transition
         try:
             self._observations.put(self._parts, world, observation)

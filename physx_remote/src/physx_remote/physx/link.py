@@ -67,10 +67,6 @@ class PhysxLink(ClientConnection):
             timeout: How long an answer may take, in s; None: forever.
             connect_timeout: How long to keep trying to connect, in s.
             max_answer: Size of the longest accepted answer in bytes.
-
-        Raises:
-            ConfigError: If no token is given.
-            RemoteError: If nothing answers, or the service does not accept this client.
         """
         super().__init__(address)
         self.timeout = timeout
@@ -140,12 +136,7 @@ class PhysxLink(ClientConnection):
         return bool(self._why_closed)
 
     def send(self, message: bytes) -> None:
-        """Send a message.
-
-        Raises:
-            RemoteTimeoutError: If the service does not read it in time.
-            RemoteClosedError: If the connection has ended.
-        """
+        """Send a message."""
         self._check_open()
         try:
             sent = self._socket.send(message)
@@ -172,11 +163,6 @@ class PhysxLink(ClientConnection):
 
         Args:
             patience: How long to wait, in s; None: as long as an answer may take.
-
-        Raises:
-            RemoteTimeoutError: If there is none in time.
-            RemoteClosedError: If the connection has ended.
-            RemoteProtocolError: If the message is not valid or too long.
         """
         frame = self.look(self.timeout if patience is None else patience)
         if frame is None:
@@ -188,10 +174,6 @@ class PhysxLink(ClientConnection):
 
         Args:
             patience: How long to wait, in s; None: forever.
-
-        Raises:
-            RemoteClosedError: If the connection has ended.
-            RemoteProtocolError: If the message is not valid or too long.
         """
         self._check_open()
         until, left = None, patience
@@ -217,12 +199,7 @@ class PhysxLink(ClientConnection):
             raise
 
     def decode(self, frame: Frame) -> Any:
-        """Return the value in a message.
-
-        Raises:
-            RemoteProtocolError: If the message is damaged; the connection is closed.
-            PhysxError: If the message is an error of the service.
-        """
+        """Return the value in a message."""
         try:
             if frame.kind is not Kind.REFUSAL:
                 return decode(frame.payload)

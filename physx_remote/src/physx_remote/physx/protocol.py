@@ -49,10 +49,6 @@ class Physx(Protocol):
             max_clients: How many clients may be connected; further ones are closed at once.
             max_snapshots: How many snapshots are kept at most.
             options: Must be empty.
-
-        Raises:
-            ConfigError: If a value is out of range, or the file cannot be used.
-            UnknownOptionError: If the protocol does not have an option.
         """
         super().__init__(**options)
         positive("handshake_timeout", handshake_timeout)
@@ -71,12 +67,7 @@ class Physx(Protocol):
         }
 
     def service(self, worlds: Worlds | Scene, *, address: str, port: int) -> PhysxService:
-        """Return a listening service; see `Protocol.service`.
-
-        Raises:
-            UsageError: If it is an `RLEnvironment`, or a space has no fixed layout.
-            RemoteError: If it cannot listen there.
-        """
+        """Return a listening service; see `Protocol.service`."""
         if not isinstance(worlds, Worlds):
             raise UsageError(
                 f"{type(worlds).__name__} is an RLEnvironment, which need not define spaces: "

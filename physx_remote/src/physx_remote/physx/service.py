@@ -64,11 +64,7 @@ class PhysxService(SocketService):
         max_clients: int,
         max_snapshots: int,
     ) -> None:
-        """Take the worlds; the options are those of `Physx`.
-
-        Raises:
-            UsageError: If a space has no fixed layout.
-        """
+        """Take the worlds; the options are those of `Physx`."""
         super().__init__(max_clients=max_clients)
         self.token = token
         self._worlds = worlds
@@ -172,11 +168,7 @@ class PhysxService(SocketService):
         self.send(connection, pack_value(Kind.SETUP, self._introduction, "introduction"))
 
     def _admit(self, connection: RequestConnection, role: int) -> None:
-        """Assign a client its role.
-
-        Raises:
-            RemoteError: Another one acts, or it wants what there is not.
-        """
+        """Assign a client its role."""
         if role == OBSERVE:
             LOG.info("%s looks on", connection.name)
             connection.limit_backlog(_BACKLOG)
@@ -201,11 +193,7 @@ class PhysxService(SocketService):
     # Requests -------------------------------------------------------------------------------
 
     def _carry_out(self, connection: RequestConnection, number: int, request: Any) -> Work | None:
-        """Carry out a request; return the remaining work if it is not done at once.
-
-        Raises:
-            Exception: It cannot be done.
-        """
+        """Carry out a request; return the remaining work if it is not done at once."""
         if not isinstance(request, dict):
             raise RequestError("A request is a dictionary.")
         what = request.get("do")

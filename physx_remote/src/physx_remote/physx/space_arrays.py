@@ -26,9 +26,6 @@ class SpaceArrays(SpaceTree):
         Args:
             space: Space of one world's values.
             prefix: What the arrays' names begin with.
-
-        Raises:
-            UsageError: If the values of a part have no fixed shape.
         """
         super().__init__(space)
         self.names = [f"{prefix}{number}" for number in range(len(self.leaves))]
@@ -45,11 +42,7 @@ class SpaceArrays(SpaceTree):
         return {name: np.zeros((count, *shape), dtype) for name, dtype, shape, _ in self._parts}
 
     def put(self, arrays: Sequence[Array], row: int, value: Any) -> None:
-        """Write one world's value into a row of the arrays; shapes are not broadcast.
-
-        Raises:
-            ValueError, LookupError or TypeError: If the value is not in the space.
-        """
+        """Write one world's value into a row of the arrays; shapes are not broadcast."""
         if self.is_leaf:  # in every step of most environments
             _put(arrays[0], row, value)
             return
@@ -57,11 +50,7 @@ class SpaceArrays(SpaceTree):
             _put(array, row, part)
 
     def check(self, arrays: Mapping[str, Any], count: int) -> None:
-        """Check received arrays of `count` worlds.
-
-        Raises:
-            RequestError: If one is missing, or has another type or shape.
-        """
+        """Check received arrays of `count` worlds."""
         for name, dtype, shape, _ in self._parts:
             array = arrays.get(name)
             if not isinstance(array, np.ndarray):
@@ -98,9 +87,6 @@ class SpaceArrays(SpaceTree):
         Args:
             value: Value of Gymnasium's batched space, or of the space itself.
             one: Whether it is the value of one world.
-
-        Raises:
-            ActionError: If it does not have the structure, shapes or types of the space.
         """
         arrays = {}
         try:

@@ -54,9 +54,6 @@ def split_infos(value: Any, count: int) -> tuple[list[dict[str, Any]], list[str]
     Args:
         value: The decoded value of `encode_infos`.
         count: Number of worlds.
-
-    Raises:
-        RemoteProtocolError: If the value does not hold infos of so many worlds.
     """
     if isinstance(value, dict):
         infos, left_out = value.get("infos"), value.get("left_out")

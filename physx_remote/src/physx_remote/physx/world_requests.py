@@ -47,11 +47,7 @@ class WorldRequests:
     """
 
     def __init__(self, worlds: Worlds, max_snapshots: int) -> None:
-        """Take the worlds.
-
-        Raises:
-            UsageError: If a space has no fixed layout.
-        """
+        """Take the worlds."""
         self._worlds = worlds
         self._actions = SpaceArrays(worlds.action_space, "action")
         observations = SpaceArrays(worlds.observation_space, "observation")
@@ -68,9 +64,6 @@ class WorldRequests:
 
         Args:
             arrays: The actions, and ``worlds`` with the worlds' numbers; all worlds without it.
-
-        Raises:
-            RequestError: If a world does not exist, or an action is not in the space.
         """
         chosen = arrays.pop(WORLDS, None)
         worlds = self._all if chosen is None else self._chosen(chosen)
@@ -98,9 +91,6 @@ class WorldRequests:
         Args:
             request: Any of ``worlds``, a list, ``seeds``, one or None for each of them, and
                 ``options``.
-
-        Raises:
-            RequestError: If a world does not exist, or a value is not valid.
         """
         chosen = request.get("worlds")
         worlds = self._all if chosen is None else self._chosen(chosen)
@@ -132,11 +122,7 @@ class WorldRequests:
     # Snapshots --------------------------------------------------------------------------------
 
     def restore(self, request: Mapping[str, Any]) -> int:
-        """Restore a snapshot, of any world, into a world; return the world's number.
-
-        Raises:
-            RequestError: If the world or the snapshot does not exist.
-        """
+        """Restore a snapshot, of any world, into a world; return the world's number."""
         world, number = self._world(request), request.get("snapshot")
         if not isinstance(number, int) or number not in self._snapshots:
             raise RequestError(
@@ -154,11 +140,7 @@ class WorldRequests:
         self._snapshots.clear()
 
     def answer(self, what: Any, request: Mapping[str, Any]) -> Any:
-        """Carry out a request that changes no world, and return the answer.
-
-        Raises:
-            RequestError: If the request is unknown or cannot be carried out.
-        """
+        """Carry out a request that changes no world, and return the answer."""
         if what == "snapshot":
             return self._snapshot(self._world(request))
         if what == "forget":
@@ -191,11 +173,7 @@ class WorldRequests:
         return self._chosen([request.get("world", 0)])[0]
 
     def _chosen(self, given: Any) -> list[int]:
-        """Return numbers of worlds as a list.
-
-        Raises:
-            RequestError: If there is none, one does not exist, or one is named twice.
-        """
+        """Return numbers of worlds as a list."""
         if isinstance(given, np.ndarray) and given.ndim == 1 and given.dtype.kind in "iu":
             given = given.tolist()
         count = len(self._all)

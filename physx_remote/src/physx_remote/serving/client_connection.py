@@ -34,10 +34,6 @@ class ClientConnection:
         Args:
             connect: Connects within a time in s.
             patience: How long to try, in s.
-
-        Raises:
-            RemoteTimeoutError: If nothing listens at the address in time.
-            RemoteError: If the address does not exist.
         """
         try:
             return retry(connect, patience, _RETRY, ConnectionRefusedError, TimeoutError)
@@ -50,11 +46,7 @@ class ClientConnection:
             raise RemoteError(f"{self.name} cannot be reached: {error}.") from error
 
     def _check_open(self) -> None:
-        """Check that the connection is not closed.
-
-        Raises:
-            RemoteClosedError: If it is; the message says why.
-        """
+        """Check that the connection is not closed."""
         if self._why_closed:
             raise RemoteClosedError(f"The connection to {self.name} is closed: {self._why_closed}.")
 

@@ -34,11 +34,6 @@ class RequestLink(ClientConnection):
             timeout: How long an answer may take, in s; None: forever.
             connect_timeout: How long to try to connect, in s.
             max_answer: Longest answer in bytes that is accepted.
-
-        Raises:
-            ConfigError: If a time or size is not a positive number.
-            RemoteTimeoutError: If nothing listens at the address in time.
-            RemoteError: If the address does not exist.
         """
         if timeout is not None:
             _check_time("timeout", timeout)
@@ -58,13 +53,7 @@ class RequestLink(ClientConnection):
         return self._reach(lambda left: socket.create_connection(address, left), patience)
 
     def exchange(self, body: bytes) -> bytes:
-        """Send a message and return the answer to it.
-
-        Raises:
-            RemoteTimeoutError: If there is no answer in time.
-            RemoteClosedError: If the other side ended the connection, or it is closed already.
-            RemoteProtocolError: If the answer is too long.
-        """
+        """Send a message and return the answer to it."""
         self._check_open()
         try:
             self._socket.sendall(add_prefix(body))

@@ -42,9 +42,6 @@ def check_names(owner: str, options: Mapping[str, Any], known: Iterable[str]) ->
         owner: What takes the options, for the error.
         options: The options by name.
         known: The names of the options that `owner` takes.
-
-    Raises:
-        UnknownOptionError: If one is not.
     """
     names = list(known)
     if not options.keys() <= set(names):

@@ -22,11 +22,7 @@ _MOST_UNREAD = 1 << 20
 
 
 def add_prefix(body: bytes) -> bytes:
-    """Return prefix and body as one piece: some clients read the prefix with one plain call.
-
-    Raises:
-        RemoteProtocolError: If the length of the body does not fit into 4 bytes.
-    """
+    """Return prefix and body as one piece: some clients read the prefix with one plain call."""
     try:
         return PREFIX.pack(len(body)) + body
     except struct.error:
@@ -76,11 +72,7 @@ class PrefixReader(BufferReader):
         self.limit = limit
 
     def take(self) -> bytes | None:
-        """Return the next whole body, or None until more has arrived.
-
-        Raises:
-            RemoteProtocolError: If the next body is longer than the limit.
-        """
+        """Return the next whole body, or None until more has arrived."""
         buffer = self.buffer
         if len(buffer) < PREFIX.size:
             return None

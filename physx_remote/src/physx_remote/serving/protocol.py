@@ -94,11 +94,7 @@ class Protocol(ABC):
 
 
 def find_protocol(reference: str | type[Protocol]) -> type[Protocol]:
-    """Return the protocol of a name or of ``"package.module:Class"``, or the class itself.
-
-    Raises:
-        ConfigError: If there is no protocol of that name, or the reference names something else.
-    """
+    """Return the protocol of a name or of ``"package.module:Class"``, or the class itself."""
     if isinstance(reference, str) and ":" not in reference:
         if reference not in PROTOCOLS:
             raise ConfigError(

@@ -182,11 +182,7 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         return instance
 
     def _zeros(self, given: Sequence[Field]) -> Sample:
-        """Return an action of zeros.
-
-        Raises:
-            ConfigError: If an action field is not a training field.
-        """
+        """Return an action of zeros."""
         fields = {field.name: field for field in given if field.role == "training"}
         for name in self._action_fields:
             if name not in fields:

@@ -32,11 +32,7 @@ class SpaceTree:
     """
 
     def __init__(self, space: Space) -> None:
-        """Find the leaves.
-
-        Raises:
-            UsageError: If the values of a part have no fixed shape.
-        """
+        """Find the leaves."""
         found = list(_leaves(space))
         self.space = space
         self.paths: list[Path] = [path for path, _ in found]
@@ -44,11 +40,7 @@ class SpaceTree:
         self.is_leaf = self.paths == [()]
 
     def split(self, value: Any) -> list[Any]:
-        """Return the leaves' values in a value of the space.
-
-        Raises:
-            LookupError or TypeError: If the value has another structure.
-        """
+        """Return the leaves' values in a value of the space."""
         return [value] if self.is_leaf else [reduce(getitem, p, value) for p in self.paths]
 
     def join(self, values: Iterable[Any]) -> Any:
@@ -85,11 +77,7 @@ def _no_layout(space: Space) -> UsageError:
 
 
 def cast_exactly(value: Any, dtype: np.dtype[Any]) -> Array:
-    """Return numbers as an array of a type; some programs send whole numbers as 1.0.
-
-    Raises:
-        ValueError: If these are not numbers, or the type cannot hold one of them.
-    """
+    """Return numbers as an array of a type; some programs send whole numbers as 1.0."""
     array = np.asarray(value)
     if array.dtype == dtype:
         return array
@@ -105,11 +93,7 @@ def cast_exactly(value: Any, dtype: np.dtype[Any]) -> Array:
 
 
 def describe_space(space: Space) -> dict[str, Any]:
-    """Return a space as plain data for JSON.
-
-    Raises:
-        UsageError: If its values have no fixed shape.
-    """
+    """Return a space as plain data for JSON."""
     kind = type(space).__name__
     match space:
         case spaces.Box():
@@ -132,11 +116,7 @@ def describe_space(space: Space) -> dict[str, Any]:
 
 
 def build_space(plain: Mapping[str, Any]) -> Space:
-    """Return the space that a description of `describe_space` stands for.
-
-    Raises:
-        RemoteProtocolError: If the description is not valid.
-    """
+    """Return the space that a description of `describe_space` stands for."""
     try:
         return _build(plain)
     except (KeyError, TypeError, ValueError, AssertionError, AttributeError) as error:
@@ -194,11 +174,7 @@ def to_json(space: Space, value: Any) -> Any:
 
 
 def from_json(space: Space, plain: Any, place: str = "The action") -> Any:
-    """Return the value of a space that JSON data stand for.
-
-    Raises:
-        RequestError: If they do not have the structure, shape or type of the space.
-    """
+    """Return the value of a space that JSON data stand for."""
     try:
         if isinstance(space, spaces.Dict):
             return {n: from_json(s, plain[n], f'{place}["{n}"]') for n, s in space.items()}

@@ -222,11 +222,7 @@ def _make_world(
 
 
 def call_with(maker: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
-    """Call a function or class with arguments.
-
-    Raises:
-        ConfigError: If it does not take them.
-    """
+    """Call a function or class with arguments."""
     try:
         return maker(**arguments)
     except TypeError as error:

@@ -64,9 +64,6 @@ def parse_rgb(color: Color) -> tuple[float, float, float]:
 
     Args:
         color: A name of `NAMES`, ``#rrggbb``, or three numbers in [0, 1].
-
-    Raises:
-        ConfigError: If it is not one of these.
     """
     if not isinstance(color, str):
         return _from_numbers(color)
@@ -90,11 +87,7 @@ def _from_numbers(color: Sequence[float]) -> tuple[float, float, float]:
 
 
 def rgba(color: Color, alpha: float = 1.0) -> Array:
-    """Return one color as a number 0xRRGGBBAA, shape (1,).
-
-    Raises:
-        ConfigError: If the color or its opacity is invalid.
-    """
+    """Return one color as a number 0xRRGGBBAA, shape (1,)."""
     if not isinstance(alpha, (int, float, np.number)) or not 0 <= alpha <= 1:
         raise ConfigError(f"alpha is {alpha!r} but must be a number in [0, 1].")
     return pack_rgba(np.array([[*parse_rgb(color), alpha]]))
@@ -111,9 +104,6 @@ def map_values(values: Array, limits: tuple[float, float], colormap: str, alpha:
 
     Returns:
         Colors 0xRRGGBBAA, shape (n,).
-
-    Raises:
-        ConfigError: If there is no such colormap.
     """
     if colormap not in COLORMAPS:
         raise ConfigError(

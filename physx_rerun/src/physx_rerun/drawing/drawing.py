@@ -86,12 +86,7 @@ class Drawing:
         }
 
     def draw(self, events: Iterable[Event], times: Times) -> None:
-        """Draw the events of one step.
-
-        Raises:
-            VisualizerError: If an event is of an unknown kind, or of an object that was not added.
-            ConfigError: If a color or colormap does not exist.
-        """
+        """Draw the events of one step."""
         for event in events:
             self._draw(event, times)
         self._follow()

@@ -35,9 +35,6 @@ def draw_robot(
 
     Returns:
         The shapes drawn, and the bodies' poses with all joints at zero, shape (bodies, 7).
-
-    Raises:
-        VisualizerError: If the URDF file cannot be read.
     """
     model = read(values["urdf"], values["bodies"], values.get("package_dirs") or {})
     if model.missing:
@@ -67,9 +64,6 @@ def tint_robot(rows: ChunkBuilder, values: dict[str, Any], times: Times) -> None
         rows: Collects the rows.
         values: The robot's values, with its ``shapes``.
         times: Time of the change.
-
-    Raises:
-        ConfigError: If the color does not exist.
     """
     color, alpha = values.get("color"), values.get("alpha")
     for path, shape in values["shapes"]:

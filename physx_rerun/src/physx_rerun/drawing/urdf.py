@@ -72,9 +72,6 @@ def read(urdf: str | Path, bodies: Sequence[str], package_dirs: Mapping[str, str
         bodies: Names of the links that are placed; a link that is not among them moves with the
             nearest of its ancestors that is, its joints at zero.
         package_dirs: Folder of each package that mesh names begin with.
-
-    Raises:
-        VisualizerError: If the file cannot be read or has no link with a body's name.
     """
     path = Path(urdf).absolute()
     try:

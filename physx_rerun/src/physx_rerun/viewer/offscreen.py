@@ -32,9 +32,6 @@ class OffscreenViewer:
         Args:
             size: Width and height of its pictures, in pixels.
             memory_limit: Memory of the viewer, beyond which it drops the oldest rows.
-
-        Raises:
-            VisualizerError: If there is no graphics driver, or the viewer does not start.
         """
         self._size = size
         self._folder = tempfile.TemporaryDirectory(prefix="physx-rerun-")
@@ -56,9 +53,6 @@ class OffscreenViewer:
             step: Position on the timeline ``step`` to draw.
             mark: Timeline of the last row that must have arrived.
             number: Its position on that timeline.
-
-        Raises:
-            VisualizerError: If there is no scene, or the viewer ended or takes too long.
         """
         deadline = time.monotonic() + _PATIENCE
         try:

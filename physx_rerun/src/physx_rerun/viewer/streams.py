@@ -45,9 +45,6 @@ class RecordingStreams:
             address: Address of a live viewer, ``HOST:PORT``; None: none.
             owns_viewer: Whether the viewer was started for this run, so that its layout can be
                 replaced.
-
-        Raises:
-            VisualizerError: If the file cannot be written.
         """
         self._owns_viewer = owns_viewer
         recording_id = str(uuid.uuid4())

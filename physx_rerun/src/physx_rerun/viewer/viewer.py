@@ -24,11 +24,7 @@ NO_VULKAN = (
 
 
 def find_executable() -> Path:
-    """Return the viewer's executable; ending the command ``rerun``, a script, leaves it running.
-
-    Raises:
-        VisualizerError: If the package `rerun-sdk` lacks it.
-    """
+    """Return the viewer's executable; ending the command ``rerun``, a script, leaves it running."""
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
     path = Path(rerun_cli.__file__).parent / name
     if not path.is_file():
@@ -101,11 +97,7 @@ class Viewer:
         )
 
     def wait_until_ready(self, timeout: float = 30.0) -> None:
-        """Wait until the viewer listens.
-
-        Raises:
-            VisualizerError: If it ended, or does not listen in time.
-        """
+        """Wait until the viewer listens."""
         deadline = time.monotonic() + timeout
         while not is_listening(self.address):
             self.check()
@@ -119,9 +111,6 @@ class Viewer:
 
         Args:
             wait: Time in s to wait for its end.
-
-        Raises:
-            VisualizerError: If it ended; the message tells how to install a graphics driver.
         """
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(wait)

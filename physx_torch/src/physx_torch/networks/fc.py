@@ -161,9 +161,6 @@ def check_layer_sizes(
         option: Name of the option, for the message.
         given: At least two positive integers.
         example: Example for the message.
-
-    Raises:
-        ConfigError: If it is anything else.
     """
     sizes = () if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
     right = all(type(size) is int and size > 0 for size in sizes)

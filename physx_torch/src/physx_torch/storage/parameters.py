@@ -22,9 +22,6 @@ def write_tensors(
         path: The file; an existing one is replaced.
         tensors: Tensors by name. Those that share memory are written separately.
         metadata: Further strings to write.
-
-    Raises:
-        CheckpointError: If an entry is not a tensor, or the file cannot be written.
     """
     for name, value in tensors.items():
         if not isinstance(value, torch.Tensor):
@@ -43,11 +40,7 @@ def write_tensors(
 
 
 def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Return the tensors, on the processor, and the metadata of a safetensors file.
-
-    Raises:
-        CheckpointError: If the file is missing or damaged.
-    """
+    """Return the tensors, on the processor, and the metadata of a safetensors file."""
     if not path.is_file():
         raise CheckpointError(f"There is no file {path}.")
     try:
@@ -67,9 +60,6 @@ def check_match(path: Path, name: str, found: Mapping[str, Any], own: Mapping[st
         name: The network's name, for the message.
         found: Tensors of the file.
         own: Tensors of the network.
-
-    Raises:
-        CheckpointError: If they differ; the message lists the differences.
     """
     lines = [f"{key}: not in the file" for key in own if key not in found]
     lines += [f"{key}: only in the file" for key in found if key not in own]

@@ -16,22 +16,14 @@ _KEY = "state"
 
 
 def write_state(path: Path, state: Mapping[str, Any]) -> None:
-    """Write nested dictionaries, lists, numbers, strings and tensors.
-
-    Raises:
-        CheckpointError: If the state contains anything else, or the file cannot be written.
-    """
+    """Write nested dictionaries, lists, numbers, strings and tensors."""
     tensors: dict[str, torch.Tensor] = {}
     plain = _split(state, "", tensors)
     write_tensors(path, tensors, {_KEY: json.dumps(plain)})
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Return the state that `write_state` wrote, with tuples as lists.
-
-    Raises:
-        CheckpointError: If the file is missing, damaged or does not contain a state.
-    """
+    """Return the state that `write_state` wrote, with tuples as lists."""
     tensors, texts = read_tensors(path)
     try:
         state: dict[str, Any] = _join(json.loads(texts[_KEY]), tensors)

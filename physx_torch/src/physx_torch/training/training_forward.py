@@ -21,10 +21,6 @@ def compile_forward(forward: Forward, backend: str) -> Forward:
     Args:
         forward: The function.
         backend: Name of a backend of ``torch.compile``, for example ``"inductor"``.
-
-    Raises:
-        ConfigError: If there is no such backend, or, by the returned function, if compiling fails
-            on this machine.
     """
     known = torch.compiler.list_backends(exclude_tags=())
     if backend not in known:

@@ -39,13 +39,7 @@ class Client:
 
 
 def run(words: Sequence[str]) -> None:
-    """Run the client, and print what it does.
-
-    Raises:
-        ConfigError: If there is no token, or an option is invalid.
-        ConnectionRefusedByPeerError: If the run rejects the client.
-        SystemExit: If the environment fails or the server is gone, which the client has printed.
-    """
+    """Run the client, and print what it does."""
     options = tyro.cli(Client, args=words, prog="physx client")
     token = find_token(options.token_file)
     if token is None:

@@ -43,11 +43,7 @@ class Export:
 
 
 def run(words: Sequence[str]) -> None:
-    """Export a dataset and print the number of exported samples.
-
-    Raises:
-        PhysxError: If the dataset cannot be read, or does not fit the format.
-    """
+    """Export a dataset and print the number of exported samples."""
     options = tyro.cli(Export, args=words, prog="physx export")
     form = ExportOptions(
         options.compression, options.observations, options.actions, options.rewards

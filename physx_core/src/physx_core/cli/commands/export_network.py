@@ -34,13 +34,7 @@ class ExportNetwork:
 
 
 def run(words: Sequence[str]) -> None:
-    """Export a network and print its fields and the file.
-
-    Raises:
-        CheckpointError: If there is no such checkpoint.
-        ConfigError: If the network cannot be exported in this format.
-        MissingLibraryError: If a library that the format needs is not installed.
-    """
+    """Export a network and print its fields and the file."""
     options = tyro.cli(ExportNetwork, args=words, prog="physx export-network")
     place = Path(options.directory)
     path = checkpoint.find(place, options.network_name, options.which_network)

@@ -33,11 +33,7 @@ class Import:
 
 
 def run(words: Sequence[str]) -> None:
-    """Import a file and print the number of stored samples.
-
-    Raises:
-        PhysxError: If the file's arrays do not fit a dataset, or the dataset cannot be written.
-    """
+    """Import a file and print the number of stored samples."""
     options = tyro.cli(Import, args=words, prog="physx import")
     bar = ProgressBar()
     bar.begin("import", None, "B")

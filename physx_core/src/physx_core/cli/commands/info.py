@@ -25,12 +25,7 @@ class Info:
 
 
 def run(words: Sequence[str]) -> None:
-    """Print the dataset and the checkpoints of a folder.
-
-    Raises:
-        DatasetNotFoundError: If the folder contains neither a dataset nor checkpoints.
-        DatasetError: If the dataset's manifest cannot be read.
-    """
+    """Print the dataset and the checkpoints of a folder."""
     options = tyro.cli(Info, args=words, prog="physx info")
     place = Path(options.directory)
     checkpoints = [p.parent for p in sorted(place.glob(f"network/*/{checkpoint.DESCRIPTION}"))]

@@ -9,11 +9,7 @@ from physx_core.errors import PhysxError, UsageError
 
 
 def run(words: Sequence[str]) -> None:
-    """Print each plugin with its components, or with the reason why it is broken.
-
-    Raises:
-        UsageError: If there are words after the command.
-    """
+    """Print each plugin with its components, or with the reason why it is broken."""
     if words and words[0] in ("-h", "--help"):
         print("usage: physx plugins\n\nLists the plugins, and loads each to list its components.")
         return

@@ -21,10 +21,6 @@ def run(words: Sequence[str]) -> None:
     The environment is the second word, or else the one that the dataset was generated with. It is
     drawn with the given visualizer, or else with that of the only installed visualizer plugin.
     ``--mode`` is short for ``--dataset.mode``.
-
-    Raises:
-        UsageError: If no visualizer is given, and there is not exactly one visualizer plugin.
-        PhysxError: If there are no such samples, or the environment fails.
     """
     words = ["--dataset.mode" if word == "--mode" else word for word in words]
     place = ("dataset.existing_dir", "environment.environment")

@@ -36,12 +36,7 @@ class Stats:
 
 
 def run(words: Sequence[str]) -> None:
-    """Print a line for each statistic, or start TensorBoard.
-
-    Raises:
-        SessionError: If the session has no statistics, or none for TensorBoard.
-        MissingLibraryError: If TensorBoard is not installed.
-    """
+    """Print a line for each statistic, or start TensorBoard."""
     options = tyro.cli(Stats, args=words, prog="physx stats")
     if options.tensorboard:
         _start_tensorboard(Path(options.session), options.port)

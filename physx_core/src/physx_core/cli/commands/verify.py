@@ -25,11 +25,7 @@ class Verify:
 
 
 def run(words: Sequence[str]) -> None:
-    """Print the repairs and each remaining problem.
-
-    Raises:
-        DatasetError: If there is no dataset, or it has problems.
-    """
+    """Print the repairs and each remaining problem."""
     options = tyro.cli(Verify, args=words, prog="physx verify")
     if options.repair:
         for text in Dataset.repair(options.directory):

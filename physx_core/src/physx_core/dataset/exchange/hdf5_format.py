@@ -108,11 +108,7 @@ class Hdf5Column:
 
 @contextlib.contextmanager
 def open_columns(path: Path) -> Iterator[tuple[dict[str, Column], Notes]]:
-    """Open a file; yield its datasets by their paths, and the notes in its attributes.
-
-    Raises:
-        ExchangeError: If it is not an HDF5 file, is damaged, or refers to other files.
-    """
+    """Open a file; yield its datasets by their paths, and the notes in its attributes."""
     import h5py
 
     with contextlib.ExitStack() as files:

@@ -48,12 +48,7 @@ class Roles:
 
     @classmethod
     def choose(cls, table: Table, options: ExportOptions) -> Roles:
-        """Complete what a user chose.
-
-        Raises:
-            ConfigError: If a field does not exist or is chosen twice, no field is left for the
-                observations, or the reward is not one number.
-        """
+        """Complete what a user chose."""
         observations, actions, rewards = options.observations, options.actions, options.rewards
         chosen = [*observations, *actions, *([] if rewards is None else [rewards])]
         for name in chosen:
@@ -80,11 +75,6 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
 
     Returns:
         How many rows are in no episode, because each is a trajectory of its own.
-
-    Raises:
-        ConfigError: If the fields cannot have the chosen roles.
-        MissingLibraryError: If Minari is not installed.
-        ExchangeError: If a field does not fit, or no trajectory has two rows.
     """
     (table,) = tables
     roles = Roles.choose(table, options)

@@ -62,9 +62,6 @@ class NpzColumn:
             name: Name of the array.
             file: Its bytes.
             size: How many bytes there are according to the archive.
-
-        Raises:
-            ExchangeError: If the header is damaged, or promises more than there is.
         """
         self._place, self._file = f'The array "{name}" of {path}', file
         try:
@@ -102,11 +99,7 @@ class NpzColumn:
 
 @contextlib.contextmanager
 def open_columns(path: Path) -> Iterator[tuple[dict[str, Column], Notes]]:
-    """Open an archive; yield its arrays by name, and the notes in its comment.
-
-    Raises:
-        ExchangeError: If it is not an archive of arrays, or is damaged.
-    """
+    """Open an archive; yield its arrays by name, and the notes in its comment."""
     columns: dict[str, Column] = {}
     with contextlib.ExitStack() as files:
         try:

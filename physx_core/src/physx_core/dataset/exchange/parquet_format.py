@@ -28,12 +28,7 @@ _ROW_GROUP = 2 * BLOCK
 
 
 def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
-    """Write the rows of one mode.
-
-    Raises:
-        MissingLibraryError: If pyarrow is not installed.
-        ExchangeError: If Parquet has no type for a field.
-    """
+    """Write the rows of one mode."""
     (table,) = tables
     arrow = import_library("pyarrow", "Exporting to Parquet", "parquet")
     parquet = import_library("pyarrow.parquet", "Exporting to Parquet", "parquet")

@@ -104,11 +104,7 @@ class Column(Protocol):
     unit: str
 
     def read(self, start: int, count: int) -> Array:
-        """Return the next rows, those from `start` on.
-
-        Raises:
-            ExchangeError: If the file is damaged.
-        """
+        """Return the next rows, those from `start` on."""
         ...
 
 
@@ -170,9 +166,6 @@ def import_library(name: str, purpose: str, extra: str) -> Any:
         name: Name of the module.
         purpose: What needs it, for the error message.
         extra: Extra of physx-core that installs it.
-
-    Raises:
-        MissingLibraryError: If it is not installed.
     """
     try:
         return importlib.import_module(name)

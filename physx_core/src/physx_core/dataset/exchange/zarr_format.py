@@ -24,12 +24,7 @@ _CODECS = {"zstd": "ZstdCodec", "gzip": "GzipCodec", "blosc": "BloscCodec"}
 
 
 def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
-    """Write the modes as groups of arrays.
-
-    Raises:
-        MissingLibraryError: If zarr is not installed.
-        ExchangeError: If Zarr has no type for a field.
-    """
+    """Write the modes as groups of arrays."""
     zarr = import_library("zarr", "Exporting to Zarr", "zarr")
     codecs = import_library("zarr.codecs", "Exporting to Zarr", "zarr")
     codec = _CODECS.get(options.compression)

@@ -39,9 +39,6 @@ def find_episodes(view: ModeView, total: int) -> list[Episode]:
 
     Returns:
         The trajectories in the order of their first rows.
-
-    Raises:
-        DatasetError: If the rows have neither ``step`` nor ``episode``.
     """
     columns, order, begins = _cut(view, total)
     parts = np.split(order, begins[1:]) if total else []

@@ -13,11 +13,7 @@ Statistics = dict[str, RunningStatistics]
 
 
 def compute_statistics(reader: Reader, mode_name: str) -> Statistics:
-    """Return the statistics of a mode's floating fields, over all its committed rows.
-
-    Raises:
-        DatasetError: If there is no such mode, or a partition is missing or damaged.
-    """
+    """Return the statistics of a mode's floating fields, over all its committed rows."""
     mode = reader.mode(mode_name)
     for partition in mode.partitions:
         if not partition.counted:

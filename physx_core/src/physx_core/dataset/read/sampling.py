@@ -56,10 +56,6 @@ class BatchReader:
         """Check the options, which are those of `Dataset.batches`; `subset` is ascending.
 
         Here `normalize` is the normalization to use, by field, or False.
-
-        Raises:
-            ConfigError: If an option is out of range, or no field is asked for.
-            DatasetError: If a field does not exist, or there are no samples.
         """
         if batch_size < 1:
             raise ConfigError(f"batch_size is {batch_size} but must be at least 1.")

@@ -29,11 +29,7 @@ Group = dict[str, Inspection]
 
 
 def locate(directory: str | Path) -> Path:
-    """Return the folder of a dataset, given that folder or the session's folder around it.
-
-    Raises:
-        DatasetNotFoundError: If there is no dataset; the message lists what is there.
-    """
+    """Return the folder of a dataset, given that folder or the session's folder around it."""
     given = Path(directory)
     for folder in (given, given / "dataset"):
         if holds_dataset(folder):
@@ -62,9 +58,6 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
     Args:
         directory: The dataset's folder.
         edited: Whether to accept a manifest that was edited by hand.
-
-    Raises:
-        DatasetError: If the manifest is not valid, or is missing and a partition is damaged.
     """
     for _ in range(_ATTEMPTS):
         before = _state(directory)
@@ -81,11 +74,7 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
 
 
 def load_from_files(directory: Path) -> Manifest:
-    """Build a manifest from the partition files alone; nothing on the disk is changed.
-
-    Raises:
-        DatasetError: If a partition is damaged.
-    """
+    """Build a manifest from the partition files alone; nothing on the disk is changed."""
     manifest = Manifest()
     _adopt(directory, manifest, strict=True)
     count_rows(directory, manifest)
@@ -107,10 +96,6 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
 
     Returns:
         What was sealed, completed or removed from the manifest, as texts.
-
-    Raises:
-        DatasetError: If a partition is missing or damaged.
-        OSError: If a partition cannot be rewritten; nothing is lost.
     """
     if manifest.problems:
         raise next(iter(manifest.problems.values()))
@@ -148,12 +133,7 @@ def _clear_dropped(directory: Path, manifest: Manifest) -> None:
 
 
 def complete_checksums(directory: Path, manifest: Manifest) -> bool:
-    """Compute the checksums that updates in place have invalidated; return whether any were.
-
-    Raises:
-        DatasetError: If a partition is missing or damaged.
-        OSError: If the rows cannot be synced to the disk.
-    """
+    """Compute the checksums that updates in place have invalidated; return whether any were."""
     changed = False
     for mode in manifest.modes.values():
         for partition in [p for p in mode.partitions if p.sealed and not p.checksums]:

@@ -18,9 +18,6 @@ def compare_fields(what: str, known: Mapping[str, Field], given: Mapping[str, Fi
         what: Owner of the known fields, for the error message.
         known: Fields that are defined.
         given: Fields to compare with them.
-
-    Raises:
-        FieldsMismatchError: If they differ; lists each difference.
     """
     differences = dict.fromkeys(given.keys() - known.keys(), "is not one of its fields")
     differences |= dict.fromkeys(known.keys() - given.keys(), "is missing")

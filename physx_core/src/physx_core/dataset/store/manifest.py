@@ -71,11 +71,7 @@ class Partition:
         return Identity(self.session, self.mode, of, self.index, self.first_row)
 
     def inspect(self, directory: Path, of: Field) -> Inspection:
-        """Return what a field's file says of itself.
-
-        Raises:
-            DatasetError: If the file is missing, truncated or not a partition file.
-        """
+        """Return what a field's file says of itself."""
         return inspect(self.path(directory, of.name), self.offsets.get(of.name), of.nbytes)
 
     def segment(self, directory: Path, of: Field, start: int = 0) -> Segment:
@@ -253,11 +249,7 @@ class Manifest:
 
 
 def to_plain_info(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values as the manifest will return them: tuples and arrays become lists.
-
-    Raises:
-        ConfigError: If JSON cannot represent a value.
-    """
+    """Return values as the manifest will return them: tuples and arrays become lists."""
 
     def convert(value: Any) -> Any:
         if isinstance(value, (np.ndarray, np.generic)):

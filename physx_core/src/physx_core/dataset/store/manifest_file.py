@@ -34,11 +34,7 @@ _INVALID = (
 
 
 def save(directory: Path, manifest: Manifest) -> None:
-    """Write the manifest atomically.
-
-    Raises:
-        OSError: If it cannot be written; the old one is still there.
-    """
+    """Write the manifest atomically."""
     plain = {
         "format": FORMAT,
         "format_version": VERSION,
@@ -57,10 +53,6 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
     Args:
         directory: The dataset's folder.
         edited: Whether to accept it although its checksum is missing or wrong.
-
-    Raises:
-        FileNotFoundError: If there is none.
-        DatasetError: If it is not the manifest of a dataset, or of another version.
     """
     path = directory / FILE
     try:

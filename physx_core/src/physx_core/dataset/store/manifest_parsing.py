@@ -25,13 +25,7 @@ T = TypeVar("T")
 
 
 def parse_manifest(plain: Mapping[str, Any]) -> Manifest:
-    """Return the manifest that plain data of format version 1 describe.
-
-    Raises:
-        ValueError: If a value is invalid; names it.
-        KeyError: If a value is missing.
-        ConfigError: If a field is not valid.
-    """
+    """Return the manifest that plain data of format version 1 describe."""
     modes = {
         _name(name, "a mode"): _mode(name, mode)
         for name, mode in checked(dict, plain["modes"], "'modes'").items()
@@ -43,22 +37,14 @@ def parse_manifest(plain: Mapping[str, Any]) -> Manifest:
 
 
 def checked(kind: type[T], value: Any, what: str) -> T:
-    """Return a value that is of exactly one type.
-
-    Raises:
-        ValueError: If it is of another type.
-    """
+    """Return a value that is of exactly one type."""
     if type(value) is not kind:
         raise ValueError(f"{what} cannot be {value!r:.60}")
     return value
 
 
 def whole(value: Any, what: str, most: int = _MOST) -> int:
-    """Return an integer between 0 and `most`.
-
-    Raises:
-        ValueError: If it is out of range or not an integer.
-    """
+    """Return an integer between 0 and `most`."""
     if not 0 <= checked(int, value, what) <= most:
         raise ValueError(f"{what} cannot be {value!r:.60}")
     return int(value)

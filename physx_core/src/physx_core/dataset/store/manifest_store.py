@@ -31,11 +31,7 @@ class ManifestStore:
 
     @contextlib.contextmanager
     def change(self) -> Iterator[Manifest]:
-        """Give the manifest to be changed and store it at the end; after an error, restore it.
-
-        Raises:
-            OSError: If it cannot be stored.
-        """
+        """Give the manifest to be changed and store it at the end; after an error, restore it."""
         with files.lock_manifest(self.directory) if self.shared else contextlib.nullcontext():
             if self.shared:
                 self.reload(manifest_file.load(self.directory))

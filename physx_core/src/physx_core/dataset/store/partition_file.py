@@ -44,9 +44,6 @@ class PartitionFile:
             directory: The dataset's folder.
             identity: What the file is part of.
             capacity: How many rows fit in.
-
-        Raises:
-            OSError: If the file cannot be written; nothing of it is left.
         """
         header = make_header(identity, capacity)
         path = directory / identity.file_name
@@ -63,11 +60,7 @@ class PartitionFile:
         self._path.unlink(missing_ok=True)
 
     def reserve(self, rows: int) -> None:
-        """Allocate disk space for the first `rows` rows, and for some more.
-
-        Raises:
-            OSError: If the disk is full; nothing was changed.
-        """
+        """Allocate disk space for the first `rows` rows, and for some more."""
         needed = self.data_offset + rows * self._row_nbytes
         if needed <= self._reserved:
             return
@@ -131,9 +124,6 @@ def copy(
 
     Returns:
         Offset of the first row in the new file, and the CRC-32 of the rows.
-
-    Raises:
-        OSError: If the file cannot be written; nothing was changed.
     """
     header = make_header(identity, rows, rows)
     draft = files.temporary_path(path)

@@ -154,20 +154,13 @@ def inspect(path: Path, offset: int | None = None, row_nbytes: int = 0) -> Inspe
         path: The file.
         offset: Where its rows begin, if that is known; only for error messages.
         row_nbytes: Bytes of one row, likewise.
-
-    Raises:
-        DatasetError: If the file is missing, truncated or not a partition file.
     """
     with open_partition(path) as file:
         return inspect_open(file, path, offset, row_nbytes)
 
 
 def open_partition(path: Path) -> io.FileIO:
-    """Open a partition file for reading.
-
-    Raises:
-        DatasetError: If it is missing, cannot be opened, or is not a regular file.
-    """
+    """Open a partition file for reading."""
     try:
         return io.FileIO(str(path), opener=files.open_regular)
     except FileNotFoundError:

@@ -28,10 +28,6 @@ def seal(directory: Path, fields: Mapping[str, Field], partition: Partition) -> 
 
     Returns:
         The sealed partition, for the manifest.
-
-    Raises:
-        DatasetError: If a file is missing or damaged.
-        OSError: If a file cannot be rewritten; all rows are still there.
     """
     offsets = {}
     for name, field in fields.items():
@@ -46,11 +42,7 @@ def seal(directory: Path, fields: Mapping[str, Field], partition: Partition) -> 
 
 
 def scan(directory: Path, fields: Mapping[str, Field], partition: Partition) -> Partition:
-    """Return a sealed partition with checksums and statistics of its rows, read once for both.
-
-    Raises:
-        DatasetError: If a file is missing, truncated or damaged.
-    """
+    """Return a sealed partition with checksums and statistics of its rows, read once for both."""
     crc, running = dict.fromkeys(fields, 0), {}
     for name, field in fields.items():
         statistics = running[name] = RunningStatistics()

@@ -51,11 +51,7 @@ class Segment:
     checksum: int | None = None
 
     def open(self) -> tuple[FileIO, int]:
-        """Open the file; return it with the offset of the first row.
-
-        Raises:
-            DatasetError: If the file is missing, truncated or damaged.
-        """
+        """Open the file; return it with the offset of the first row."""
         file = open_partition(self.path)
         try:
             offset, row_nbytes = self.offset, self.field.nbytes
@@ -73,11 +69,7 @@ class Segment:
         return file, offset
 
     def read(self, file: FileIO, offset: int, view: memoryview) -> None:
-        """Fill a buffer from the open file.
-
-        Raises:
-            DatasetError: If the file has become shorter, or the disk fails.
-        """
+        """Fill a buffer from the open file."""
         try:
             complete = files.read_at(file.fileno(), view, offset)
         except OSError as error:
@@ -86,11 +78,7 @@ class Segment:
             raise DatasetError(f"{self.path} became shorter while it was being read.")
 
     def blocks(self) -> Iterator[Array]:
-        """Yield all rows in blocks of about a megabyte, each valid until the next.
-
-        Raises:
-            DatasetError: If the file is missing, truncated or damaged.
-        """
+        """Yield all rows in blocks of about a megabyte, each valid until the next."""
         row_nbytes = self.field.nbytes
         count = rows_per_block(row_nbytes)
         buffer = np.empty((min(count, self.rows), *(self.field.shape or ())), self.field.dtype)
@@ -105,9 +93,6 @@ class Segment:
         """Return the CRC-32 of all rows.
 
         zlib-ng computes it several times faster than Python's zlib, and lets other threads run.
-
-        Raises:
-            DatasetError: If the file is missing, truncated or damaged.
         """
         crc = 0
         for block in self.blocks():

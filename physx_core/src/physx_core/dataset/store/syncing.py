@@ -36,11 +36,7 @@ class Syncer:
                 self._thread.start()
 
     def check(self) -> None:
-        """Report a failure since the last call.
-
-        Raises:
-            OSError: If something that was written did not reach the disk.
-        """
+        """Report a failure since the last call."""
         if self._error is not None:
             error, self._error = self._error, None
             raise error
@@ -55,11 +51,7 @@ class Syncer:
         os.close(descriptor)
 
     def close(self) -> None:
-        """Sync everything that is left, and end the thread.
-
-        Raises:
-            OSError: If something that was written did not reach the disk.
-        """
+        """Sync everything that is left, and end the thread."""
         self._end.set()
         self._wake.set()
         if self._thread is not None:

@@ -27,9 +27,6 @@ def write_index(directory: Path, session: str, manifest: Manifest) -> None:
         directory: The dataset's folder.
         session: Session that writes it; it gets an index even if it has no rows yet.
         manifest: The dataset's manifest.
-
-    Raises:
-        OSError: If the index cannot be written; the old one is still there.
     """
     import h5py
 

@@ -29,10 +29,6 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
             partition.
         source: Folder of the other dataset.
         given: Manifest of the other dataset.
-
-    Raises:
-        DatasetError: If a partition of the other is missing or damaged.
-        OSError: If the disk is full or fails; nothing has changed.
     """
     pairs = _reserve(writer, given)
     try:
@@ -49,12 +45,7 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
 
 
 def drop_partition(writer: Writer, mode_name: str, session: str | None, index: int) -> int:
-    """Remove a partition and return how many rows it had.
-
-    Raises:
-        DatasetError: If there is no such partition, or there are several.
-        OSError: If the manifest cannot be written; nothing has changed.
-    """
+    """Remove a partition and return how many rows it had."""
     mode = writer.store.manifest.modes[mode_name]
     found = [p for p in mode.partitions if p.index == index and session in (None, p.session)]
     if len(found) != 1:

@@ -30,12 +30,7 @@ class WriterOptions:
     shared: bool
 
     def __post_init__(self) -> None:
-        """Check the options.
-
-        Raises:
-            ConfigError: If file names cannot begin with the session's name, or the size is not
-                positive.
-        """
+        """Check the options."""
         if self.session is not None and not SESSION.fullmatch(self.session):
             raise ConfigError(
                 f"File names cannot begin with {self.session!r}: "
@@ -52,13 +47,7 @@ class WriterOptions:
 
 
 def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> Writer:
-    """Create a dataset and return its writer.
-
-    Raises:
-        DatasetError: If there is one already, or the folder cannot be written.
-        DatasetLockedError: If another process is creating one there.
-        ConfigError: If the info cannot be stored.
-    """
+    """Create a dataset and return its writer."""
     manifest = Manifest(info=to_plain_info(info))
     with files.storing(f"A dataset in {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
@@ -80,12 +69,7 @@ def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> Wri
 
 
 def extend(folder: Path, options: WriterOptions) -> Writer:
-    """Lock an existing dataset, recover what its last writer left open, and return its writer.
-
-    Raises:
-        DatasetLockedError: If another process writes to it.
-        DatasetError: If it is damaged, or the folder cannot be written.
-    """
+    """Lock an existing dataset, recover what its last writer left open, and return its writer."""
     with (
         files.storing(f"Rows in {folder}"),
         files.lock_manifest(folder) if options.shared else contextlib.nullcontext(),

@@ -20,10 +20,6 @@ def infer_fields(values: Mapping[str, Any], axes: int = 1) -> list[Field]:
     Args:
         values: Field name to value.
         axes: How many axes come before the field's own: 1 for rows, 0 for a sample.
-
-    Raises:
-        FieldTypeError: If a value is not a number or an array of numbers.
-        FieldShapeError: If a value is ragged or has too few axes.
     """
     fields = []
     for name, value in values.items():
@@ -50,10 +46,6 @@ def check_rows(
         fields: The fields of the mode; a shape of None takes that of the rows.
         rows: Field name to rows, shape (n, *field shape).
         checked: Whether rows of the fields' types are known to be finite.
-
-    Raises:
-        SampleError: If a field is missing, unknown, of another shape, type or length, or not
-            finite.
     """
     check_names(fields, rows)
     block = {

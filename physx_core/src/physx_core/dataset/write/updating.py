@@ -31,9 +31,6 @@ def check_update(
         index: Numbers of the rows.
         values: Field name to rows; to one value if `single`.
         single: Whether the index was a single number.
-
-    Raises:
-        SampleError: If a field is unknown, none is given, or the rows do not fit.
     """
     if not values:
         raise MissingFieldError("No field to update is given.")
@@ -60,10 +57,6 @@ def update_rows(
         index: Numbers of the rows, all in range.
         rows: Field name to new rows, checked.
         durable: Whether to wait for the disk.
-
-    Raises:
-        DatasetError: If a partition is missing or damaged.
-        OSError: If the storage fails; some rows may have been updated.
     """
     mode = store.manifest.modes[mode_name]
     starts = np.cumsum([0, *(partition.rows for partition in mode.partitions)])

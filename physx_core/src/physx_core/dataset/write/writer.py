@@ -54,11 +54,7 @@ class OpenPartition:
         return self.capacity - self.partition.rows
 
     def append(self, rows: Batch, start: int, count: int) -> None:
-        """Write and commit rows `start` to `start + count` of a block; all of them, or none.
-
-        Raises:
-            OSError: If the disk is full; no row of the block was committed.
-        """
+        """Write and commit rows `start` to `start + count` of a block; all of them, or none."""
         if self._syncer is not None:
             self._syncer.check()
         first = self.partition.rows
@@ -138,9 +134,6 @@ class Writer:
             mode_name: Name of a mode whose fields all have shapes.
             rows: Field name to checked rows.
             count: How many rows there are.
-
-        Raises:
-            DatasetError: If the disk is full or fails; says how many of the rows are stored.
         """
         if self._sealing:
             with contextlib.suppress(OSError):  # noted later; storing the rows fails, too
@@ -162,33 +155,19 @@ class Writer:
                 raise files.storage_error(what, error, safe) from error
 
     def refresh(self) -> None:
-        """Learn what other writers have committed.
-
-        Raises:
-            DatasetError: If the manifest is no longer valid.
-        """
+        """Learn what other writers have committed."""
         if self.store.shared:
             with files.storing("What other writers did"), files.lock_manifest(self._directory):
                 self.store.reload(recovery.load(self._directory))
 
     def finish(self, mode_name: str) -> None:
-        """Seal the open partition of a mode, if there is one, and wait until all are sealed.
-
-        Raises:
-            DatasetError: If a partition is damaged.
-            OSError: If the storage fails; the rows can be read, and are sealed later.
-        """
+        """Seal the open partition of a mode, if there is one, and wait until all are sealed."""
         if mode_name in self._open:
             self._retire(mode_name)
         self.wait()
 
     def wait(self) -> None:
-        """Wait until all full partitions are sealed.
-
-        Raises:
-            DatasetError: If a partition is damaged.
-            OSError: If the storage fails; the rows can be read, and are sealed later.
-        """
+        """Wait until all full partitions are sealed."""
         self._collect(wait=True)
 
     def close(self) -> None:
@@ -196,9 +175,6 @@ class Writer:
 
         On a full disk the last partitions remain unsealed: all their rows can be read, and the
         next writer seals them.
-
-        Raises:
-            DatasetError: If a partition is damaged, or the storage fails.
         """
         try:
             with files.storing("The dataset's last partition"):

@@ -21,10 +21,6 @@ def read_last_checkpoint(
         session: The training's session.
         name: Name of the network.
         environment: The environment of the samples; all needed samples must be stored already.
-
-    Raises:
-        CheckpointError: If there is none, or it is damaged.
-        ConfigError: If environments would have to generate samples.
     """
     found = checkpoint.read(checkpoint.find(session.network_dir, name, -1))
     if environment is not None:

@@ -66,12 +66,6 @@ class TrainingData:
             seed: Seed of the order of samples.
             environment: Configuration of the source; None without one.
             data_type: Floating type of the batches that are read.
-
-        Raises:
-            ConfigError: If environments generate the samples, and `batch_nb` is missing or some are
-                to be held back; or if there are too few samples to hold some back.
-            DatasetError: If stored samples are needed, and the dataset has none of the mode.
-            FieldsMismatchError: If the environments have other fields than the samples to replay.
         """
         replay = environment is not None and environment.load_samples
         if source is not None and batch_nb is None and not replay:

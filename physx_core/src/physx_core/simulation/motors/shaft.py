@@ -86,9 +86,6 @@ class Rotors:
             motors: Those with elastic gears.
             period: The physics' period, in s.
             limits: Torque limits of the joints, in N m or N, at which the gears slip.
-
-        Raises:
-            ConfigError: If a gear is too stiff for the period.
         """
         self._period, self._limits = period, limits
         self._reduction = column(motors, "reduction")

@@ -184,13 +184,7 @@ class IdealEffortSensors:
 def ideal_sensors(
     kind: type[Sensor], sensors: Sequence[Any], simulation: Simulation, world: World
 ) -> IdealSensors:
-    """Return the ideal sensors of one kind.
-
-    Raises:
-        ComponentNotFoundError: If a joint or body is not in the simulation.
-        ConfigError: If the kind is unknown, or a joint's torque is not known.
-        FeatureNotSupportedError: If the engine lacks what the kind needs.
-    """
+    """Return the ideal sensors of one kind."""
     if kind is Imu:
         return IdealImus(sensors, simulation, world)
     kinds: dict[type[Sensor], Any] = {
@@ -262,11 +256,6 @@ def groups_of(
         every: Frames between two measurements of each.
         simulation: The simulation that they measure.
         world: The world that the simulation was built from.
-
-    Raises:
-        ComponentNotFoundError: If a joint or body is not in the simulation.
-        ConfigError: If a kind is unknown, or a joint's torque is not known.
-        FeatureNotSupportedError: If the engine lacks what a kind needs.
     """
     found, begin = [], 0
     for kind in dict.fromkeys(type(sensor) for sensor in sensors):

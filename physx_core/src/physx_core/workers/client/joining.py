@@ -36,10 +36,6 @@ def join(
 
     Returns:
         The connection, and the arguments of the instance.
-
-    Raises:
-        ConnectionRefusedByPeerError: If nothing, or not a server with this token, answers at the
-            address, or the server has no place for the instance.
     """
 
     def attempt(seconds: float) -> tuple[WorkerLink, dict[str, Any]]:

@@ -61,11 +61,7 @@ class WorkerLink:
         threading.Thread(target=self._watch, daemon=True).start()
 
     def send(self, message: bytes) -> None:
-        """Send a message.
-
-        Raises:
-            RunEnded: If the server is gone.
-        """
+        """Send a message."""
         try:
             self._connection.sendall(message)
         except OSError as error:
@@ -76,9 +72,6 @@ class WorkerLink:
 
         Args:
             parts: The bytes in their order; they may change once this returns.
-
-        Raises:
-            RunEnded: If the server is gone.
         """
         waiting = [memoryview(part) for part in parts if len(part)]
         try:
@@ -92,11 +85,7 @@ class WorkerLink:
             raise ServerGone from error
 
     def receive(self) -> Frame:
-        """Wait for the next message.
-
-        Raises:
-            RunEnded: If the server is gone.
-        """
+        """Wait for the next message."""
         self._spin()
         return self._postponed.popleft() if self._postponed else self._next()
 
@@ -118,10 +107,6 @@ class WorkerLink:
 
         Returns:
             The value of the answer.
-
-        Raises:
-            RunEnded: If the server ended the run instead.
-            PhysxError: If the request failed, or the value cannot be sent.
         """
         message = pack_value(kind, value, what, self._requests + 1)
         self._requests += 1

@@ -48,12 +48,7 @@ class Producer:
         self._sent_at = 0.0
 
     def run(self) -> None:
-        """Generate rows until the server ends the run.
-
-        Raises:
-            RunEnded: If the server ended the run or is gone, or there is a `failure`.
-            PhysxError: If a row cannot be generated; all rows before it were sent.
-        """
+        """Generate rows until the server ends the run."""
         while True:
             if self.made >= self._credit:
                 while self.made >= self._credit:
@@ -75,9 +70,6 @@ class Producer:
         """Send the rows that were not sent yet.
 
         If one holds NaN or an infinite number, those before it are sent, and `failure` names it.
-
-        Raises:
-            RunEnded: If there is a `failure`, or the server is gone. No environment can catch it.
         """
         self._send_rejected()
         buffer = self._buffer

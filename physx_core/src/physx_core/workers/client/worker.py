@@ -43,10 +43,6 @@ def run_client(
     Returns:
         Exit status of the process: 0 once the run has ended, 1 if the environment failed or the
         server is gone; the server knows why.
-
-    Raises:
-        ConnectionRefusedByPeerError: If nothing, or not a server with this token, answers at the
-            address, or the server has no place for the instance.
     """
     say(f"looks for the server at {address}")
     link, setup = join(address, token, instance or 0, patience)

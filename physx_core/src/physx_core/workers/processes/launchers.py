@@ -64,11 +64,7 @@ class ClientProcess(ClientHandle):
         self._tail = b""
 
     def start(self) -> None:
-        """Start the process.
-
-        Raises:
-            ClientError: If the operating system cannot start it.
-        """
+        """Start the process."""
         # Instances share the processor cores: a numerical library must not take all for each.
         environment = {"OMP_NUM_THREADS": "1", **os.environ, **self._variables}
         try:
@@ -147,9 +143,6 @@ class SubprocessLauncher(Launcher):
             affinity: Bind each client to one of the processor cores that this process may use, in
                 turn. It helps if there are as many busy clients as cores, and harms if the
                 environments use several threads.
-
-        Raises:
-            ConfigError: If this operating system cannot do so.
         """
         self._cores: list[int] = []
         self._watchdog = Watchdog()

@@ -79,13 +79,7 @@ class ClientGroup:
         )
 
     def open(self) -> None:
-        """Start the clients and wait until their environments are ready.
-
-        Raises:
-            ConfigError: If the server cannot listen there.
-            ClientError: If a client did not start.
-            PhysxError: If an environment failed.
-        """
+        """Start the clients and wait until their environments are ready."""
         self._encode(1)  # an argument that cannot be sent is an error before anything is started
         self.server.open()
         numbers = list(self._numbers)
@@ -110,10 +104,6 @@ class ClientGroup:
 
         Args:
             missing: Returns the instances that are waited for; called after each round.
-
-        Raises:
-            PhysxError: If a client exited, failed, or kept the server waiting for too long, and
-                none takes its place.
         """
         began = time.monotonic()
         if began - self._served > _TICK / 10:
@@ -135,9 +125,6 @@ class ClientGroup:
         Args:
             orderly: Wait for as long as a client may be silent, and raise errors; otherwise wait
                 for a moment and raise nothing.
-
-        Raises:
-            ClientError: If a client exited too early or is silent for too long.
         """
         patience = 0.0
         self._closing = True
@@ -246,9 +233,6 @@ class ClientGroup:
             number: The instance.
             error: How it was lost.
             left: Whether it closed the connection, as clients that were started by hand may.
-
-        Raises:
-            PhysxError: The error, if none takes its place.
         """
         absent = self._launcher.by_hand and self._find_peer(number) is None
         if absent or not self._replaces(number, None if left else error):

@@ -91,11 +91,7 @@ class Server:
         }
 
     def open(self) -> None:
-        """Start to listen.
-
-        Raises:
-            ConfigError: If the address is not one of this machine, or the port is in use.
-        """
+        """Start to listen."""
         try:
             self._listener.listen(self._ip_address, self._port)
         except OSError as error:

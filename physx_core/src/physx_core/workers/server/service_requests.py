@@ -62,10 +62,6 @@ class ServiceRequests:
 
         Errors of physx that the services raise are sent to the environment, others are raised.
         A request that the predecessor of this client made gets the same answer.
-
-        Raises:
-            ConnectionRefusedByPeerError: If the requests are not numbered from 1 or are malformed,
-                or earlier answers are not read.
         """
         if frame.kind is not Kind.SHOW:
             if len(peer.outgoing) > _MOST_UNREAD:

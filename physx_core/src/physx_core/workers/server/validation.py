@@ -25,11 +25,7 @@ _ACTIONS = ("add", "update")
 
 
 def parse_fields(payload: bytes | bytearray) -> list[Field]:
-    """Return the fields that a message lists.
-
-    Raises:
-        ConnectionRefusedByPeerError: If it lists something else, no fields, or a name twice.
-    """
+    """Return the fields that a message lists."""
     plain = decode(payload)
     try:
         if not isinstance(plain, list) or not all(map(_is_field, plain)):
@@ -57,11 +53,7 @@ def _is_field(plain: Any) -> bool:
 
 
 def check_environment_fields(fields: Sequence[Field]) -> None:
-    """Check the fields that an environment is said to define.
-
-    Raises:
-        ConnectionRefusedByPeerError: If one has a name that physx fills itself.
-    """
+    """Check the fields that an environment is said to define."""
     reserved = [field.name for field in fields if field.name in RESERVED]
     if reserved:
         raise ConnectionRefusedByPeerError(f'It defined the reserved field "{reserved[0]}".')
@@ -73,10 +65,6 @@ def check_row_fields(fields: Sequence[Field], environment: Sequence[Field]) -> N
     Args:
         fields: Fields of the rows.
         environment: Fields that the environment defined before, whose shapes may have been open.
-
-    Raises:
-        ConnectionRefusedByPeerError: If they are others, have an open shape, or a row of them is
-            longer than a message may be.
     """
     expected = [*environment, *ROW_FIELDS]
     if len(fields) != len(expected):
@@ -95,11 +83,7 @@ def check_row_fields(fields: Sequence[Field], environment: Sequence[Field]) -> N
 
 
 def parse_values(payload: bytes | bytearray) -> dict[str, Any]:
-    """Return the values of a request, by name.
-
-    Raises:
-        ConnectionRefusedByPeerError: If the message holds something else.
-    """
+    """Return the values of a request, by name."""
     values = decode(payload)
     if not isinstance(values, dict) or not {*map(type, values)} <= {str}:
         raise ConnectionRefusedByPeerError("It sent a request that is not a dictionary of names.")
@@ -107,11 +91,7 @@ def parse_values(payload: bytes | bytearray) -> dict[str, Any]:
 
 
 def parse_events(payload: bytes | bytearray) -> list[Event]:
-    """Return the drawing events of a message.
-
-    Raises:
-        ConnectionRefusedByPeerError: If it holds something else.
-    """
+    """Return the drawing events of a message."""
     plain = decode(payload)
     if not isinstance(plain, list) or not all(map(_is_event, plain)):
         raise ConnectionRefusedByPeerError("It sent malformed drawing events.")
@@ -138,10 +118,6 @@ def check_rows(block: Batch, fields: Sequence[Field], instance_id: int, last_ste
 
     Returns:
         Step of the last row.
-
-    Raises:
-        ConnectionRefusedByPeerError: If they are not of this instance, or their steps do not rise.
-        NotFiniteError: If one holds NaN or an infinite number.
     """
     steps, numbers = block["step"], block["env_id"]
     several = len(steps) > 1

@@ -28,11 +28,7 @@ class MassAndMomentum(Quantity):
     """
 
     def compute(self, moment: Moment) -> Vector:
-        """Return the numbers.
-
-        Raises:
-            FeatureNotSupportedError: If the robot's base does not float.
-        """
+        """Return the numbers."""
         if not moment.robot.floating:
             raise FeatureNotSupportedError(
                 "A robot with a fixed base", "a center of mass", (), "Its base must float."

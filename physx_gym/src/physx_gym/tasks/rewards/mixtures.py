@@ -73,11 +73,7 @@ class _Mixture(Reward):
 
 
 def _weighted(name: str, rewards: Any, weights: Sequence[float] | None) -> dict[Any, float]:
-    """Return the weight of each reward.
-
-    Raises:
-        ConfigError: If the number of weights is not that of the rewards.
-    """
+    """Return the weight of each reward."""
     if weights is None:
         return dict(rewards) if isinstance(rewards, Mapping) else dict.fromkeys(rewards, 1.0)
     if isinstance(rewards, Mapping) or len(weights) != len(rewards):

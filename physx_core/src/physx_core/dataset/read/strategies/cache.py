@@ -29,11 +29,7 @@ class MemoryColumn:
         self._array = np.empty(self.shape, dtype)
 
     def extend(self, rows: int) -> None:
-        """Read those of the first `rows` rows that are not there yet.
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged.
-        """
+        """Read those of the first `rows` rows that are not there yet."""
         have = self.shape[0]
         if rows > len(self._array):
             grown = np.empty((max(rows, 2 * have), *self.shape[1:]), self._array.dtype)
@@ -80,19 +76,12 @@ class ColumnCache:
             mode: Name of the mode.
             names: Names of the fields.
             dtype: Type that floating fields are converted to; None: each keeps its own.
-
-        Raises:
-            DatasetError: If there is no such mode or field.
         """
         fields = [self.reader.field(mode, name) for name in names]
         return choose_strategy(sum(self.missing(mode, name, dtype) for name in names), fields)
 
     def load(self, mode: str, name: str, dtype: np.dtype[Any] | None = None) -> MemoryColumn:
-        """Return all rows of a field that are committed now, in memory.
-
-        Raises:
-            DatasetError: If the field does not exist, or a partition is missing or damaged.
-        """
+        """Return all rows of a field that are committed now, in memory."""
         self._drop_stale()
         field = self.reader.field(mode, name)
         key = mode, name, converted_dtype(field, dtype)
@@ -106,11 +95,7 @@ class ColumnCache:
         return column
 
     def map(self, mode: str, name: str) -> MappedColumn:
-        """Return all rows of a field that are committed now, mapped into the address space.
-
-        Raises:
-            DatasetError: If the field does not exist, or a partition is missing or damaged.
-        """
+        """Return all rows of a field that are committed now, mapped into the address space."""
         self._drop_stale()
         field, rows = self.reader.field(mode, name), self.reader.rows(mode)
         column = self._mapped.get((mode, name))

@@ -46,11 +46,7 @@ class MappedColumn:
     """
 
     def __init__(self, segments: Sequence[Segment], field: Field) -> None:
-        """Map the partitions.
-
-        Raises:
-            DatasetError: If a partition is missing, truncated or damaged, or cannot be mapped.
-        """
+        """Map the partitions."""
         self.shape: tuple[int, ...] = (
             sum(segment.rows for segment in segments),
             *(field.shape or ()),
@@ -73,11 +69,7 @@ class MappedColumn:
         self._array.take(index, 0, out, "clip")
 
     def check(self) -> None:
-        """Check that no file became shorter: the system kills a process that reads past the end.
-
-        Raises:
-            DatasetError: If a file is truncated.
-        """
+        """Check that no file became shorter: the system kills a process that reads past the end."""
         for part in self._mapped:
             try:
                 now = os.stat(part.path)  # noqa: PTH116 (quicker, and this is done often)

@@ -45,11 +45,7 @@ def memory_budget() -> int:
 
 
 def check_strategy(choice: str) -> Strategy | None:
-    """Return the strategy that was chosen by name; None for ``auto``.
-
-    Raises:
-        ConfigError: If there is no such strategy.
-    """
+    """Return the strategy that was chosen by name; None for ``auto``."""
     if choice == "auto":
         return None
     if choice in get_args(Strategy):
