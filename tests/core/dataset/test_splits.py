@@ -321,7 +321,7 @@ def test_a_validation_mode_is_used_in_place_of_a_split(numbered):
 
 def test_generated_samples_cannot_be_held_back(folder):
     environment = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)
-    with pytest.raises(ConfigError, match="Make the samples first"):
+    with pytest.raises(ConfigError, match="Generate the samples first"):
         numbered_training(folder, environment=environment, validation_split=0.2).execute()
 
 
