@@ -279,7 +279,7 @@ def test_without_existing_dir_the_sessions_own_samples_are_replayed(source_dir):
     train(None, through(factor=5.0), "own", new_session=False)
     rows = rows_of("sessions/own")
     assert (rows["times"] == 2).all() and np.allclose(rows["y"][:, 0], 5 * rows["x"].sum(axis=1))
-    with pytest.raises(ConfigError, match="samples of its own already"):
+    with pytest.raises(ConfigError, match="already has samples of its own"):
         train(source_dir, through(), "own", new_session=False)
     with pytest.raises(DatasetError, match='no samples of mode "training" to send'):
         train(None, through(), "new")
@@ -305,7 +305,7 @@ def test_what_environments_kept_with_the_source_comes_along(source_dir):
 def test_sources_that_exclude_each_other_are_named(source_dir):
     with pytest.raises(ConfigError, match="set load_samples=True"):
         train(source_dir, environment())
-    with pytest.raises(ConfigError, match="always_produce makes new ones"):
+    with pytest.raises(ConfigError, match="always_produce generates new ones"):
         train(source_dir, through(always_produce=True))
     with pytest.raises(ConfigError, match="takes no load_samples"):
         DataGeneration(through(), batch_nb=1, batch_size=1).execute()
@@ -316,7 +316,7 @@ def test_sources_that_exclude_each_other_are_named(source_dir):
 
 def test_a_training_that_replays_is_resumed_only_where_it_can_be(source_dir):
     train(source_dir, through(only_first_epoch=False), "always", epoch_nb=2)
-    with pytest.raises(ConfigError, match="cannot be resumed while environments make"):
+    with pytest.raises(ConfigError, match="cannot be resumed while environments generate"):
         train(source_dir, through(only_first_epoch=False), "always", epoch_nb=3, resume=True)
     train(source_dir, through(), "once", epoch_nb=2)
     train(source_dir, through(), "once", epoch_nb=3, resume=True)

@@ -23,7 +23,7 @@ TEXTS = {
     "kill": r"Client 2 was killed by signal 9 \(SIGKILL\) after",
     "stop": r"Client 2 sent nothing for [\d.]+ s while the server waited for it",
     "spin": r"Client 2 sent nothing for [\d.]+ s while the server waited for it",
-    "garbage": r"Client 2 was cut off after \d+ rows\. .*no message of physx",
+    "garbage": r"Client 2 was cut off after \d+ rows\. .*not a physx message",
     "half": r"Client 2 sent nothing for [\d.]+ s while the server waited for it",
     "dribble": r"Client 2 sent nothing for [\d.]+ s while the server waited for it",
     "trickle": r"Client 2 sent nothing for [\d.]+ s while the server waited for it",
