@@ -307,7 +307,7 @@ def test_sources_that_exclude_each_other_are_named(source_dir):
         train(source_dir, environment())
     with pytest.raises(ConfigError, match="always_produce generates new ones"):
         train(source_dir, through(always_produce=True))
-    with pytest.raises(ConfigError, match="takes no load_samples"):
+    with pytest.raises(ConfigError, match="load_samples cannot be set"):
         DataGeneration(through(), batch_nb=1, batch_size=1).execute()
     with pytest.raises(FieldsMismatchError, match=r"cannot replay.*\n.*answer: is not one"):
         train(source_dir, through(name="Asking"))
