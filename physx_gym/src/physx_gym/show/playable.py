@@ -1,4 +1,4 @@
-"""What the tools that run and show environments need of one."""
+"""Protocols of environments, for the tools that run and show them."""
 
 from __future__ import annotations
 

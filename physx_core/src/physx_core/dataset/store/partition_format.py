@@ -182,7 +182,7 @@ def cannot_read(path: Path, error: OSError) -> DatasetError:
 def inspect_open(
     file: io.FileIO, path: Path, offset: int | None = None, row_nbytes: int = 0
 ) -> Inspection:
-    """Read what an open partition file says of itself: see `inspect`."""
+    """Return the header of an open partition file, as `inspect` does."""
     import h5py
 
     _check_superblock(file, path, offset, row_nbytes)

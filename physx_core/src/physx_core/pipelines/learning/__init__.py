@@ -1,1 +1,1 @@
-"""What a training is made of: learner, batches, records, and resuming."""
+"""Parts of a training: learner, batches, records, and resuming."""
