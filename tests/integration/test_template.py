@@ -1,5 +1,7 @@
 """The template of a plugin is installed as a user would do it, and selected by name."""
 
+import ast
+
 import pytest
 
 pytest.importorskip("torch")
@@ -26,3 +28,13 @@ def test_the_template_brings_an_environment_and_a_network(root, run, tmp_path):
     assert "training loss" in text
     predict = ("predict", "sessions/training", "template/cloud", "--step-nb", 3)
     assert "3 steps with template/mlp" in run(*physx, *predict, **path).stdout
+
+
+def test_the_template_imports_faces_only(root):
+    internal = ("checkpoint", "dataset", "observers", "session", "statistics", "toy")
+    for file in (root / "examples/plugin_template").rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("physx_"):
+                package, *rest = (node.module or "").split(".")
+                assert not rest or (package == "physx_core" and len(rest) == 1)
+                assert not rest or rest[0] not in internal
