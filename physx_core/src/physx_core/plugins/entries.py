@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +31,7 @@ OFFICIAL = {
 
 def find_entries(group: str) -> dict[str, list[EntryPoint]]:
     """Return the entry points of a group by name: more than one if several packages claim it."""
-    return _read_entries(group, tuple((entry, _last_change(entry)) for entry in sys.path))
+    return _read_entries(tuple((entry, _last_change(entry)) for entry in sys.path))[group]
 
 
 def _last_change(folder: str) -> int:
@@ -41,19 +42,24 @@ def _last_change(folder: str) -> int:
         return 0
 
 
-@functools.lru_cache(maxsize=2)
+@functools.lru_cache(maxsize=1)
 def _read_entries(
-    group: str, installed: tuple[tuple[str, int], ...]
-) -> dict[str, list[EntryPoint]]:
-    """Read the metadata of all packages, which takes some ms; cached until one is installed."""
+    installed: tuple[tuple[str, int], ...],
+) -> dict[str, dict[str, list[EntryPoint]]]:
+    """Read the metadata of all packages, once for both groups; cached until one is installed."""
     from importlib.metadata import entry_points
 
+    everything = entry_points()
+    return {group: _by_name(everything.select(group=group)) for group in (PLUGINS, COMMANDS)}
+
+
+def _by_name(entries: Iterable[EntryPoint]) -> dict[str, list[EntryPoint]]:
     found: dict[str, list[EntryPoint]] = {}
-    for entry in sorted(entry_points(group=group), key=lambda entry: entry.name):
+    for entry in sorted(entries, key=lambda entry: entry.name):
         found.setdefault(entry.name, []).append(entry)
-    for name, entries in found.items():
-        if len(entries) > 1:  # an editable package can be listed twice by its own metadata
-            found[name] = list({owner_of(entry): entry for entry in entries}.values())
+    for name, claims in found.items():
+        if len(claims) > 1:  # an editable package can be listed twice by its own metadata
+            found[name] = list({owner_of(entry): entry for entry in claims}.values())
     return found
 
 
