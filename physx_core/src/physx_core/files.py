@@ -1,24 +1,22 @@
-"""File operations of datasets: complete writes, atomic replacement, and the writers' locks.
+"""File operations: everything that datasets and checkpoints do to the disk goes through here.
 
-No link is ever followed, and only regular files are opened: a dataset may come from an untrusted
-source.
+Each function does one thing completely or raises; what survives a power cut is said by those that
+wait for the disk. No link is ever followed, and only regular files are opened: a dataset may come
+from an untrusted source.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import os
 import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from physx_core.errors import DatasetError, DatasetLockedError
+from physx_core.errors import DatasetError
 from physx_core.typing import Array
 
-LOCK = "dataset.lock"
-MANIFEST_LOCK = "dataset.json.lock"
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers of a disk that is full, a quota or a file size that is reached."""
 
@@ -68,8 +66,13 @@ def open_regular(path: Path | str, flags: int = os.O_RDONLY) -> int:
 
 def create_new(path: Path) -> int:
     """Create an empty file, replacing any of that name, and return its descriptor."""
-    path.unlink(missing_ok=True)
+    remove(path)
     return open_regular(path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
+
+
+def close(descriptor: int) -> None:
+    """Close a file."""
+    os.close(descriptor)
 
 
 def read_content(path: Path, limit: int) -> bytes:
@@ -132,6 +135,74 @@ def as_bytes(array: Array) -> memoryview:
     return array.reshape(-1).view("u1").data
 
 
+def resize(descriptor: int, size: int) -> None:
+    """Set the size of an open file; what is added reads as zeros and takes no space yet."""
+    os.ftruncate(descriptor, size)
+
+
+def reserve(descriptor: int, start: int, stop: int) -> None:
+    """Take the disk space of some bytes of an open file, so that writing them cannot lack it."""
+    os.posix_fallocate(descriptor, start, stop - start)
+
+
+def sync(descriptor: int) -> None:
+    """Wait until the content of an open file is on the disk."""
+    os.fdatasync(descriptor)
+
+
+def sync_file(path: Path) -> None:
+    """Wait until the content of a file is on the disk."""
+    descriptor = open_regular(path)
+    try:
+        os.fdatasync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk: of new, renamed and removed files."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder, with those around it, so that it is there after a power cut."""
+    missing = []
+    while not folder.is_dir():
+        missing.append(folder)
+        folder = folder.parent
+    for made in reversed(missing):
+        with contextlib.suppress(FileExistsError):  # another process was faster
+            os.mkdir(made)
+        sync_folder(made.parent)
+
+
+def rename(path: Path, target: Path) -> None:
+    """Rename a file or folder; a file of the new name is replaced."""
+    os.replace(path, target)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, if there is one of that name."""
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(path)
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder with everything in it, if there is one of that name."""
+    for root, folders, names in os.walk(folder, topdown=False):
+        for name in names:
+            os.unlink(os.path.join(root, name))
+        for name in folders:
+            path = os.path.join(root, name)
+            (os.unlink if os.path.islink(path) else os.rmdir)(path)
+    with contextlib.suppress(FileNotFoundError):
+        os.rmdir(folder)
+
+
 def temporary_path(path: Path) -> Path:
     """Return the path that a file is written to before it replaces `path`."""
     return path.with_name(path.name + ".tmp")
@@ -151,96 +222,13 @@ def replace(path: Path, content: bytes, *, sync: bool = True) -> None:
         try:
             write_at(descriptor, content, 0)
             if sync:
-                os.fsync(descriptor)
+                os.fdatasync(descriptor)
         finally:
             os.close(descriptor)
-        draft.replace(path)
+        rename(draft, path)
     except OSError:
         with contextlib.suppress(OSError):
-            draft.unlink(missing_ok=True)
+            remove(draft)
         raise
     if sync:
         sync_folder(path.parent)
-
-
-def sync_folder(folder: Path) -> None:
-    """Flush a folder's entries to the disk, so that a renamed file survives a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def lock(directory: Path) -> int:
-    """Acquire a dataset's lock for a single writer; closing the descriptor releases it.
-
-    Raises:
-        DatasetLockedError: If there is another writer.
-    """
-    descriptor = open_regular(directory / LOCK, os.O_RDWR | os.O_CREAT)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.ftruncate(descriptor, 0)
-        write_at(descriptor, str(os.getpid()).encode(), 0)
-    except BlockingIOError:
-        error = _locked(directory, descriptor)
-        os.close(descriptor)
-        raise error from None
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return descriptor
-
-
-def lock_shared(directory: Path) -> tuple[int, bool]:
-    """Acquire a dataset's lock for one of several writers.
-
-    Returns:
-        The descriptor, whose closing releases the lock, and whether there is no other writer: the
-        lock is then exclusive until `share` admits others.
-
-    Raises:
-        DatasetLockedError: If an exclusive writer has the dataset open.
-    """
-    with contextlib.suppress(DatasetLockedError):
-        return lock(directory), True
-    descriptor = open_regular(directory / LOCK, os.O_RDWR | os.O_CREAT)
-    try:
-        share(directory, descriptor)
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return descriptor, False
-
-
-def share(directory: Path, descriptor: int) -> None:
-    """Share the lock with other writers.
-
-    Raises:
-        DatasetLockedError: If an exclusive writer acquired it first.
-    """
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise _locked(directory, descriptor) from None
-
-
-@contextlib.contextmanager
-def lock_manifest(directory: Path) -> Iterator[None]:
-    """Hold the manifest's lock, which writers that share a dataset take in turn."""
-    descriptor = open_regular(directory / MANIFEST_LOCK, os.O_RDWR | os.O_CREAT)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def _locked(directory: Path, descriptor: int) -> DatasetLockedError:
-    owner = os.pread(descriptor, 20, 0).decode(errors="replace") or "unknown"
-    return DatasetLockedError(
-        f"Process {owner} is writing to the dataset in {directory}. Wait until it has closed the "
-        "dataset, or open it for reading only. For several writers at the same time, open it "
-        "with writable=True, shared=True in each."
-    )

@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
+from physx_core import files
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
@@ -101,7 +102,7 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
         raise next(iter(manifest.problems.values()))
     done = []
     for draft in chain(directory.glob("*.h5.tmp"), directory.glob(manifest_file.FILE + ".tmp")):
-        draft.unlink()
+        files.remove(draft)
     for name, mode in manifest.modes.items():
         for partition in [p for p in mode.partitions if not p.sealed]:
             if partition.rows:
@@ -121,7 +122,7 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
         done = done or ["The remains of removed partitions have been deleted."]
     for path in _unlisted(directory, manifest):
         if _is_partition(path) and not inspect(path).rows:
-            path.unlink()
+            files.remove(path)
     return done
 
 

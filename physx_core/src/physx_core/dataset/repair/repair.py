@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from physx_core.dataset.read.mode_statistics import compute_statistics
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.repair.report import find_problem, find_problems
-from physx_core.dataset.store import manifest_file
+from physx_core.dataset.store import locks, manifest_file
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition_file import copy
 from physx_core.dataset.store.virtual_index import write_index
@@ -49,11 +48,11 @@ def rebuild(folder: Path) -> None:
 @contextlib.contextmanager
 def _lock(folder: Path) -> Iterator[None]:
     with files.storing(f"The repaired dataset in {folder}"):
-        lock = files.lock(folder)
+        lock = locks.lock(folder)
         try:
             yield
         finally:
-            os.close(lock)
+            files.close(lock)
 
 
 def _store(folder: Path, manifest: Manifest) -> None:
@@ -93,7 +92,11 @@ def _load_sound_manifest(folder: Path) -> tuple[Manifest, list[str]]:
 def _keep_old(folder: Path) -> Path:
     """Rename the old manifest, if there is one; return its path."""
     path = folder / manifest_file.FILE
-    return path.rename(_unused(path)) if path.exists() else path
+    if not path.exists():
+        return path
+    kept = _unused(path)
+    files.rename(path, kept)
+    return kept
 
 
 def _unused(path: Path) -> Path:
@@ -135,9 +138,9 @@ def _has_sound_rows(folder: Path, partition: Partition, field: Field) -> bool:
 
 
 def _set_aside(folder: Path, paths: list[Path], problem: str, rows: int = 0) -> str:
-    (folder / ASIDE).mkdir(exist_ok=True)
+    files.make_folder(folder / ASIDE)
     for path in paths:
         with contextlib.suppress(FileNotFoundError):
-            path.rename(_unused(folder / ASIDE / path.name))
+            files.rename(path, _unused(folder / ASIDE / path.name))
     what = f"{rows} rows" if rows else "The remains"
     return f"{problem} {what} of the partition cannot be used and were moved to {folder / ASIDE}."

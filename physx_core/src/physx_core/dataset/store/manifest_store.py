@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from physx_core import files
-from physx_core.dataset.store import manifest_file
+from physx_core.dataset.store import locks, manifest_file
 from physx_core.dataset.store.manifest import Manifest, Mode
 
 
@@ -32,7 +31,7 @@ class ManifestStore:
     @contextlib.contextmanager
     def change(self) -> Iterator[Manifest]:
         """Give the manifest to be changed and store it at the end; after an error, restore it."""
-        with files.lock_manifest(self.directory) if self.shared else contextlib.nullcontext():
+        with locks.lock_manifest(self.directory) if self.shared else contextlib.nullcontext():
             if self.shared:
                 self.reload(manifest_file.load(self.directory))
             before = self.manifest.copy()

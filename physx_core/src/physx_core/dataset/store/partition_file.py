@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
 from pathlib import Path
 
 from zlib_ng.zlib_ng import crc32
@@ -51,13 +50,13 @@ class PartitionFile:
 
     def publish(self) -> None:
         """Give the file its name."""
-        files.temporary_path(self._path).rename(self._path)
+        files.rename(files.temporary_path(self._path), self._path)
 
     def discard(self) -> None:
         """Close the file and remove it, whether it is published or not."""
         self.close()
-        files.temporary_path(self._path).unlink(missing_ok=True)
-        self._path.unlink(missing_ok=True)
+        files.remove(files.temporary_path(self._path))
+        files.remove(self._path)
 
     def reserve(self, rows: int) -> None:
         """Allocate disk space for the first `rows` rows, and for some more."""
@@ -93,12 +92,12 @@ class PartitionFile:
 
     def sync(self) -> None:
         """Wait until everything written is on the disk."""
-        os.fdatasync(self.descriptor)
+        files.sync(self.descriptor)
 
     def close(self) -> None:
         """Close the file; calling it again does nothing."""
         if self.descriptor >= 0:
-            os.close(self.hand_over())
+            files.close(self.hand_over())
 
     def hand_over(self) -> int:
         """Return the open file to the caller, who closes it."""
@@ -106,7 +105,7 @@ class PartitionFile:
         return descriptor
 
     def _allocate(self, end: int) -> None:
-        os.posix_fallocate(self.descriptor, self._reserved, end - self._reserved)
+        files.reserve(self.descriptor, self._reserved, end)
         self._reserved = end
 
 
@@ -132,12 +131,12 @@ def copy(
         try:
             count = rows * identity.field.nbytes
             crc = _copy(source, source_offset, descriptor, header.data_offset, count)
-            os.fsync(descriptor)
+            files.sync(descriptor)
         finally:
-            os.close(descriptor)
-        draft.replace(path)
+            files.close(descriptor)
+        files.rename(draft, path)
     except OSError:
-        draft.unlink(missing_ok=True)
+        files.remove(draft)
         raise
     return header.data_offset, crc
 
@@ -145,11 +144,11 @@ def copy(
 def _write_header(path: Path, header: Header) -> int:
     descriptor = files.create_new(path)
     try:
-        os.ftruncate(descriptor, header.size)
+        files.resize(descriptor, header.size)
         files.write_at(descriptor, header.content, 0)
     except OSError:
-        os.close(descriptor)
-        path.unlink(missing_ok=True)
+        files.close(descriptor)
+        files.remove(path)
         raise
     return descriptor
 
@@ -169,5 +168,5 @@ def _copy(source: Path, source_offset: int, target: int, target_offset: int, cou
                 files.write_at(target, part, there)
             crc, done = crc32(part, crc), done + len(part)
     finally:
-        os.close(origin)
+        files.close(origin)
     return crc

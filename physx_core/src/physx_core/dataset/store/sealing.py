@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -56,14 +55,10 @@ def scan(directory: Path, fields: Mapping[str, Field], partition: Partition) -> 
 def sync_files(directory: Path, fields: Mapping[str, Field], partition: Partition) -> None:
     """Wait until the rows of a partition are on the disk."""
     for name in fields:
-        descriptor = files.open_regular(partition.path(directory, name))
-        try:
-            os.fdatasync(descriptor)
-        finally:
-            os.close(descriptor)
+        files.sync_file(partition.path(directory, name))
 
 
 def remove_files(directory: Path, fields: Mapping[str, Field], partition: Partition) -> None:
     """Remove the files of a partition that the manifest no longer lists."""
     for name in fields:
-        partition.path(directory, name).unlink(missing_ok=True)
+        files.remove(partition.path(directory, name))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 
 from physx_core import files
 from physx_core.dataset.repair import recovery
-from physx_core.dataset.store import manifest_file
+from physx_core.dataset.store import locks, manifest_file
 from physx_core.dataset.store.manifest import Manifest, to_plain_info
 from physx_core.dataset.store.manifest_parsing import SESSION
 from physx_core.dataset.store.manifest_store import ManifestStore
@@ -50,9 +49,9 @@ def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> Wri
     """Create a dataset and return its writer."""
     manifest = Manifest(info=to_plain_info(info))
     with files.storing(f"A dataset in {folder}"):
-        folder.mkdir(parents=True, exist_ok=True)
-        with files.lock_manifest(folder) if options.shared else contextlib.nullcontext():
-            lock = files.lock(folder)
+        files.make_folder(folder)
+        with locks.lock_manifest(folder) if options.shared else contextlib.nullcontext():
+            lock = locks.lock(folder)
             try:
                 if recovery.holds_dataset(folder):
                     raise DatasetError(
@@ -61,9 +60,9 @@ def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> Wri
                     )
                 manifest_file.save(folder, manifest)
                 if options.shared:
-                    files.share(folder, lock)
+                    locks.share(folder, lock)
             except BaseException:
-                os.close(lock)
+                files.close(lock)
                 raise
     return options.writer(folder, manifest, lock)
 
@@ -72,9 +71,9 @@ def extend(folder: Path, options: WriterOptions) -> Writer:
     """Lock an existing dataset, recover what its last writer left open, and return its writer."""
     with (
         files.storing(f"Rows in {folder}"),
-        files.lock_manifest(folder) if options.shared else contextlib.nullcontext(),
+        locks.lock_manifest(folder) if options.shared else contextlib.nullcontext(),
     ):
-        lock, alone = files.lock_shared(folder) if options.shared else (files.lock(folder), True)
+        lock, alone = locks.lock_shared(folder) if options.shared else (locks.lock(folder), True)
         try:
             manifest = recovery.load(folder)
             writer = options.writer(folder, manifest, lock)
@@ -83,8 +82,8 @@ def extend(folder: Path, options: WriterOptions) -> Writer:
                     write_index(folder, writer.session, manifest)
                 manifest_file.save(folder, manifest)
                 if options.shared:
-                    files.share(folder, lock)
+                    locks.share(folder, lock)
         except BaseException:
-            os.close(lock)
+            files.close(lock)
             raise
     return writer

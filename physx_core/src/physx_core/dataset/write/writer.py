@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,7 +13,7 @@ from physx_core import files
 from physx_core.dataset.read.mode_statistics import compute_statistics, count_sealed
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.repair import recovery
-from physx_core.dataset.store import manifest_file
+from physx_core.dataset.store import locks, manifest_file
 from physx_core.dataset.store.manifest import Mode, Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.partition_file import PartitionFile
@@ -157,7 +156,7 @@ class Writer:
     def refresh(self) -> None:
         """Learn what other writers have committed."""
         if self.store.shared:
-            with files.storing("What other writers did"), files.lock_manifest(self._directory):
+            with files.storing("What other writers did"), locks.lock_manifest(self._directory):
                 self.store.reload(recovery.load(self._directory))
 
     def finish(self, mode_name: str) -> None:
@@ -196,7 +195,7 @@ class Writer:
                     with files.storing("The last rows"):
                         self._syncer.close()
             finally:
-                os.close(self._lock)
+                files.close(self._lock)
 
     def _retire(self, mode_name: str) -> None:
         """Close the open partition of a mode and have it sealed in the background."""

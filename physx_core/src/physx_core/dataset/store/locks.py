@@ -1,0 +1,89 @@
+"""The locks of a dataset's writers: one alone, or several that take turns at the manifest."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from physx_core import files
+from physx_core.errors import DatasetLockedError
+
+LOCK = "dataset.lock"
+MANIFEST_LOCK = "dataset.json.lock"
+
+
+def lock(directory: Path) -> int:
+    """Acquire a dataset's lock for a single writer; closing the descriptor releases it.
+
+    Raises:
+        DatasetLockedError: If there is another writer.
+    """
+    descriptor = files.open_regular(directory / LOCK, os.O_RDWR | os.O_CREAT)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        files.resize(descriptor, 0)
+        files.write_at(descriptor, str(os.getpid()).encode(), 0)
+    except BlockingIOError:
+        error = _locked(directory, descriptor)
+        files.close(descriptor)
+        raise error from None
+    except BaseException:
+        files.close(descriptor)
+        raise
+    return descriptor
+
+
+def lock_shared(directory: Path) -> tuple[int, bool]:
+    """Acquire a dataset's lock for one of several writers.
+
+    Returns:
+        The descriptor, whose closing releases the lock, and whether there is no other writer: the
+        lock is then exclusive until `share` admits others.
+
+    Raises:
+        DatasetLockedError: If an exclusive writer has the dataset open.
+    """
+    with contextlib.suppress(DatasetLockedError):
+        return lock(directory), True
+    descriptor = files.open_regular(directory / LOCK, os.O_RDWR | os.O_CREAT)
+    try:
+        share(directory, descriptor)
+    except BaseException:
+        files.close(descriptor)
+        raise
+    return descriptor, False
+
+
+def share(directory: Path, descriptor: int) -> None:
+    """Share the lock with other writers.
+
+    Raises:
+        DatasetLockedError: If an exclusive writer acquired it first.
+    """
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise _locked(directory, descriptor) from None
+
+
+@contextlib.contextmanager
+def lock_manifest(directory: Path) -> Iterator[None]:
+    """Hold the manifest's lock, which writers that share a dataset take in turn."""
+    descriptor = files.open_regular(directory / MANIFEST_LOCK, os.O_RDWR | os.O_CREAT)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        files.close(descriptor)
+
+
+def _locked(directory: Path, descriptor: int) -> DatasetLockedError:
+    owner = os.pread(descriptor, 20, 0).decode(errors="replace") or "unknown"
+    return DatasetLockedError(
+        f"Process {owner} is writing to the dataset in {directory}. Wait until it has closed the "
+        "dataset, or open it for reading only. For several writers at the same time, open it "
+        "with writable=True, shared=True in each."
+    )
