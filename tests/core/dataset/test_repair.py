@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from physx_core import Dataset, Field
+from physx_core import Dataset, Field, files
 from physx_core.errors import (
     DatasetError,
     DatasetLockedError,
@@ -131,6 +131,127 @@ def test_a_rebuilt_manifest_keeps_the_old_one(folder, thousand):
     with Dataset.open(folder) as dataset:
         assert dataset.info == {}
         assert dataset.fields("training") == {field.name: field for field in thousand.fields}
+
+
+def torn(content, how):
+    """Content of a file of which only some sectors reached the disk."""
+    if how == "nothing":
+        return bytes(len(content))
+    if how == "no sector":
+        return b""
+    if how == "first sector":
+        return content[:512] + bytes(len(content) - 512)
+    return bytes(512) + content[512:]
+
+
+@pytest.mark.parametrize("how", ["nothing", "no sector", "first sector", "all but the first"])
+@pytest.mark.parametrize("call", ["open", "repair", "rebuild"])
+def test_a_torn_file_that_nobody_lists_is_set_aside(folder, call, how, thousand):
+    thousand.write(folder)
+    content = torn((folder / "run_training_x_0.h5").read_bytes(), how)
+    (folder / "run_training_x_9.h5").write_bytes(content)
+    if call == "open":
+        Dataset.open(folder, writable=True).close()
+    elif call == "repair":
+        assert "run_training_x_9.h5" in "".join(Dataset.repair(folder))
+    else:
+        Dataset.rebuild(folder)
+    assert (folder / "damaged" / "run_training_x_9.h5").read_bytes() == content
+    assert not (folder / "run_training_x_9.h5").exists()
+    thousand.check(folder, thousand.rows)
+    assert Dataset.repair(folder) == []
+
+
+def test_files_that_are_nobodys_stay_where_they_are(folder, tmp_path, thousand):
+    thousand.write(folder)
+    (tmp_path / "elsewhere").write_bytes(b"")
+    (folder / "run_training_x_8.h5").symlink_to(tmp_path / "elsewhere")
+    (folder / "notes.h5").write_bytes(b"")
+    with h5py.File(folder / "run_training_x_9.h5", "w") as file:
+        file["mine"] = 1
+    Dataset.open(folder, writable=True).close()
+    assert Dataset.repair(folder) == []
+    for name in ("run_training_x_8.h5", "notes.h5", "run_training_x_9.h5"):
+        assert (folder / name).exists()
+    thousand.check(folder, thousand.rows)
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_rebuilding_leaves_a_damaged_partition_to_repair(folder, listed, thousand):
+    thousand.write(folder)
+    (folder / "run_training_x_1.h5").write_bytes(b"")
+    if not listed:
+        (folder / "dataset.json").unlink()
+    with pytest.raises(DatasetError, match=r"run_training_x_1\.h5.*Nothing was rebuilt.*repair"):
+        Dataset.rebuild(folder)
+    assert not (folder / "damaged").exists()
+    Dataset.repair(folder)
+    assert (folder / "damaged" / "run_training_x_1.h5").exists()
+    with Dataset.open(folder) as dataset:
+        assert dataset.verify() == []
+
+
+class Killed(BaseException):
+    """What ends a process at an operation, in place of a signal."""
+
+
+class Mortal:
+    """Stands in for `os`; after some changes of the disk, nothing is done any more."""
+
+    CHANGES = ("pwrite", "ftruncate", "copy_file_range", "replace", "unlink", "mkdir")
+
+    def __init__(self, changes):
+        self.left = changes
+
+    def __getattr__(self, name):
+        found = getattr(os, name)
+        if not callable(found) or name == "close":  # which the end of a process does, too
+            return found
+
+        def call(*arguments, **options):
+            self.left -= name in self.CHANGES
+            if self.left < 0:
+                raise Killed
+            return found(*arguments, **options)
+
+        return call
+
+
+def killed_at(monkeypatch, changes, call):
+    """Let a call make so many changes, and then no more; return whether it was cut off."""
+    with monkeypatch.context() as patched:
+        patched.setattr(files, "os", Mortal(changes))
+        try:
+            call()
+        except Killed:
+            return True
+    return False
+
+
+@pytest.mark.parametrize("call", ["rebuild", "repair"])
+def test_a_manifest_is_there_whenever_rebuilding_is_killed(folder, call, thousand, monkeypatch):
+    left = folder.with_name("left")
+    thousand.write(left, thousand.part(0, 340), info={"a": 1})
+    with Dataset.open(left, writable=True, max_file_size=thousand.size) as dataset:
+        dataset.append("training", thousand.part(340, 500))
+        shutil.copytree(left, folder)  # with a partition that is open
+    if call == "repair":
+        text = (folder / "dataset.json").read_text()
+        (folder / "dataset.json").write_text(text.replace('"<f8"', '"<f4"'))
+    before = (folder / "dataset.json").read_bytes()
+    count, cut = 0, True
+    while cut:
+        copy = shutil.copytree(folder, folder.with_name("copy"))
+        cut = killed_at(monkeypatch, count, lambda copy=copy: getattr(Dataset, call)(copy))
+        assert (copy / "dataset.json").exists(), count
+        now = (copy / "dataset.json").read_bytes()
+        assert before in (now, *(path.read_bytes() for path in copy.glob("dataset.json.?")))
+        if now == before and call == "repair":
+            Dataset.repair(copy)
+        thousand.check(copy, thousand.part(0, 500), counted=False)
+        shutil.rmtree(copy)
+        count += 1
+    assert count > 20
 
 
 # Versions ---------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from itertools import chain
 from pathlib import Path
 
 from physx_core import files
+from physx_core.dataset.repair.aside import set_aside
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
@@ -120,10 +121,7 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
         manifest_file.save(directory, manifest)  # from now on nothing refers to the files
         _clear_dropped(directory, manifest)
         done = done or ["The remains of removed partitions have been deleted."]
-    for path in _unlisted(directory, manifest):
-        if _is_partition(path) and not inspect(path).rows:
-            files.remove(path)
-    return done
+    return done + _clear_unlisted(directory, manifest)
 
 
 def _clear_dropped(directory: Path, manifest: Manifest) -> None:
@@ -131,6 +129,19 @@ def _clear_dropped(directory: Path, manifest: Manifest) -> None:
         for partition in mode.dropped:
             remove_files(directory, mode.fields, partition)
         mode.dropped.clear()
+
+
+def _clear_unlisted(directory: Path, manifest: Manifest) -> list[str]:
+    """Remove partition files without rows that the manifest does not list; set torn ones aside."""
+    done = []
+    for path in _unlisted(directory, manifest):
+        try:
+            if not inspect(path).rows:
+                files.remove(path)
+        except DatasetError as error:
+            if _is_torn(path):
+                done.append(f"{error} It was moved to {set_aside(directory, [path])}.")
+    return done
 
 
 def complete_checksums(directory: Path, manifest: Manifest) -> bool:
@@ -241,6 +252,15 @@ def _role(item: tuple[str, Inspection]) -> tuple[bool, str]:
 def _unlisted(directory: Path, manifest: Manifest) -> list[Path]:
     known = manifest.file_names | {f"{session}.h5" for session in manifest.sessions}
     return [path for path in sorted(directory.glob("*.h5")) if path.name not in known]
+
+
+def _is_torn(path: Path) -> bool:
+    """Return whether a file is what a power cut may leave of a partition that nobody lists."""
+    try:
+        open_partition(path).close()
+    except DatasetError:  # a link, a pipe, or no permission to read it
+        return False
+    return not _is_foreign(path)
 
 
 def _is_foreign(path: Path) -> bool:

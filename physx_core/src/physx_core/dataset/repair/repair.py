@@ -10,6 +10,7 @@ from physx_core import files
 from physx_core.dataset.read.mode_statistics import compute_statistics
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.repair import recovery
+from physx_core.dataset.repair.aside import set_aside, unused
 from physx_core.dataset.repair.report import find_problem, find_problems
 from physx_core.dataset.store import locks, manifest_file
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
@@ -17,8 +18,6 @@ from physx_core.dataset.store.partition_file import copy
 from physx_core.dataset.store.virtual_index import write_index
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
-
-ASIDE = "damaged"
 
 
 def repair(folder: Path) -> list[str]:
@@ -39,10 +38,27 @@ def repair(folder: Path) -> list[str]:
 def rebuild(folder: Path) -> None:
     """Rebuild the manifest from the partition files alone: see `Dataset.rebuild`."""
     with _lock(folder):
+        if torn := list(_unlisted_damaged_files(folder)):
+            set_aside(folder, torn)
         manifest = recovery.load_from_files(folder)
-        recovery.recover(folder, manifest)
         _keep_old(folder)
+        recovery.recover(folder, manifest)
         _store(folder, manifest)
+
+
+def _unlisted_damaged_files(folder: Path) -> Iterator[Path]:
+    """Yield the damaged files that the manifest does not list; one that it lists is an error."""
+    try:
+        listed = recovery.load(folder, edited=True).file_names
+    except DatasetError:
+        listed = None
+    for path, error in recovery.damaged_files(folder):
+        if listed is None or path.name in listed:
+            raise DatasetError(
+                f"{error} Nothing was rebuilt. `physx verify --repair` or "
+                "Dataset.repair(directory) moves what cannot be used aside and keeps the rest."
+            ) from error
+        yield path
 
 
 @contextlib.contextmanager
@@ -90,22 +106,18 @@ def _load_sound_manifest(folder: Path) -> tuple[Manifest, list[str]]:
 
 
 def _keep_old(folder: Path) -> Path:
-    """Rename the old manifest, if there is one; return its path."""
+    """Copy the manifest, if there is one, so that it can be replaced; return the copy's path."""
     path = folder / manifest_file.FILE
     if not path.exists():
         return path
-    kept = _unused(path)
-    files.rename(path, kept)
+    kept = unused(path)
+    try:
+        content = manifest_file.read(folder)
+    except OSError:  # a link, or far too large: it was of no use
+        files.rename(path, kept)
+    else:
+        files.replace(kept, content)
     return kept
-
-
-def _unused(path: Path) -> Path:
-    """Return a path that does not exist: the given one, or with a number appended."""
-    found, number = path, 0
-    while found.exists():
-        number += 1
-        found = path.with_name(f"{path.name}.{number}")
-    return found
 
 
 def _repair_partition(folder: Path, mode: Mode, partition: Partition) -> list[str]:
@@ -138,9 +150,6 @@ def _has_sound_rows(folder: Path, partition: Partition, field: Field) -> bool:
 
 
 def _set_aside(folder: Path, paths: list[Path], problem: str, rows: int = 0) -> str:
-    files.make_folder(folder / ASIDE)
-    for path in paths:
-        with contextlib.suppress(FileNotFoundError):
-            files.rename(path, _unused(folder / ASIDE / path.name))
+    place = set_aside(folder, paths)
     what = f"{rows} rows" if rows else "The remains"
-    return f"{problem} {what} of the partition cannot be used and were moved to {folder / ASIDE}."
+    return f"{problem} {what} of the partition cannot be used and were moved to {place}."

@@ -47,6 +47,11 @@ def save(directory: Path, manifest: Manifest) -> None:
     files.replace(directory / FILE, body + end)
 
 
+def read(directory: Path) -> bytes:
+    """Return the manifest as it is on the disk."""
+    return files.read_content(directory / FILE, _LARGEST)
+
+
 def load(directory: Path, *, edited: bool = False) -> Manifest:
     """Read the manifest.
 
@@ -56,7 +61,7 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
     """
     path = directory / FILE
     try:
-        content = files.read_content(path, _LARGEST)
+        content = read(directory)
     except FileNotFoundError:
         raise
     except OSError as error:
