@@ -57,6 +57,22 @@ def test_two_halves_equal_the_whole(training):
     assert [p.name for p in Path("sessions").iterdir() if p.name.startswith("halves")] == ["halves"]
 
 
+@pytest.mark.parametrize("name", [PARAMETERS, "optimization.safetensors", "checkpoint.toml"])
+def test_a_damaged_checkpoint_is_stepped_over(training, name):
+    training(5, session_name="whole").execute()
+    training(2, session_name="run").execute()
+    training(4, session_name="run", resume=True).execute()
+    file = Path("sessions/run/network/network_1") / name
+    damaged = bytearray(file.read_bytes())
+    damaged[len(damaged) // 2] ^= 4
+    file.write_bytes(damaged)
+    with pytest.warns(UserWarning, match=f"network_0 is used.*\n.*network_1: {name}"):
+        training(5, session_name="run", resume=True).execute()
+    assert parameters("run", 2) == parameters("whole", 0)
+    assert file.read_bytes() == damaged
+    training(5, session_name="run", resume=True).execute()  # from network_2, without a warning
+
+
 def test_ctrl_c_within_an_epoch_and_resume(training):
     process = subprocess.Popen([sys.executable, "script.py"], stderr=subprocess.PIPE, text=True)
     stats, deadline = Path("sessions/cut/stats/scalars.csv"), time.monotonic() + 60

@@ -14,7 +14,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from physx_core.errors import DatasetError
+from physx_core.errors import DatasetError, PhysxError
 from physx_core.typing import Array
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -32,18 +32,26 @@ def storing(what: str) -> Iterator[None]:
         raise storage_error(what, error, "All rows committed before") from error
 
 
-def storage_error(what: str, error: OSError, safe: str) -> DatasetError:
+def storage_error(
+    what: str,
+    error: OSError,
+    safe: str,
+    kind: type[PhysxError] = DatasetError,
+    advice: str = "continue, or open the dataset again",
+) -> PhysxError:
     """Return the error for something that could not be stored.
 
     Args:
         what: What was to be stored.
         error: The system's error.
         safe: What is intact nevertheless.
+        kind: Class of the returned error.
+        advice: What to do after having freed some space, if the disk is full.
     """
     full = error.errno in FULL
     reason = "the disk is full" if full else (error.strerror or str(error))
-    advice = " Free some space and continue, or open the dataset again." if full else ""
-    return DatasetError(f"{what} cannot be stored: {reason}. {safe} are intact.{advice}")
+    then = f" Free some space and {advice}." if full else ""
+    return kind(f"{what} cannot be stored: {reason}. {safe} are intact.{then}")
 
 
 def open_regular(path: Path | str, flags: int = os.O_RDONLY) -> int:
@@ -86,6 +94,21 @@ def read_content(path: Path, limit: int) -> bytes:
         if size > limit:
             raise OSError(errno.EFBIG, f"it has {size} bytes, more than {limit}", str(path))
         return file.read(size)
+
+
+def read_blocks(path: Path, nbytes: int = 2**20) -> Iterator[memoryview]:
+    """Yield the bytes of a file in blocks; each is valid until the next one.
+
+    Raises:
+        OSError: If it cannot be read.
+    """
+    descriptor = open_regular(path)
+    try:
+        buffer = memoryview(bytearray(nbytes))
+        while count := os.readv(descriptor, [buffer]):
+            yield buffer[:count]
+    finally:
+        os.close(descriptor)
 
 
 def write_at(descriptor: int, content: bytes | memoryview, offset: int) -> None:
@@ -150,6 +173,15 @@ def sync(descriptor: int) -> None:
     os.fdatasync(descriptor)
 
 
+def start_sync(path: Path) -> None:
+    """Have the content of a file written to the disk, without waiting for it."""
+    descriptor = open_regular(path)
+    try:
+        os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+    finally:
+        os.close(descriptor)
+
+
 def sync_file(path: Path) -> None:
     """Wait until the content of a file is on the disk."""
     descriptor = open_regular(path)
@@ -178,6 +210,21 @@ def make_folder(folder: Path) -> None:
         with contextlib.suppress(FileExistsError):  # another process was faster
             os.mkdir(made)
         sync_folder(made.parent)
+
+
+def create_folder(folder: Path, *, sync: bool = True) -> None:
+    """Create a folder in an existing one.
+
+    Args:
+        folder: The folder.
+        sync: Whether to wait for the disk, so that it is there after a power cut.
+
+    Raises:
+        FileExistsError: If there is something of that name.
+    """
+    os.mkdir(folder)
+    if sync:
+        sync_folder(folder.parent)
 
 
 def rename(path: Path, target: Path) -> None:

@@ -13,6 +13,7 @@ from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
+from physx_core import files
 from physx_core.config import read_toml, write_toml
 from physx_core.errors import SessionError, listed, nearest
 
@@ -71,12 +72,12 @@ class Session:
         root = Path(session_dir)
         path = root / session_name
         try:
-            root.mkdir(parents=True, exist_ok=True)
+            files.make_folder(root)
             if not new_session and path.is_dir():
                 return cls(path)
             while True:
                 try:
-                    path.mkdir()
+                    files.create_folder(path)
                     return cls(path, is_new=True)
                 except FileExistsError:
                     path = root / f"{session_name}_{_last_number(root, session_name) + 1}"

@@ -127,7 +127,7 @@ def test_the_checkpoint_of_a_scripts_class_is_restored_in_a_new_process(tmp_path
         dataset.append("training", rows)
     Path("script.py").write_text(SCRIPT)
     subprocess.run([sys.executable, "script.py"], check=True, timeout=120)
-    path = checkpoint.find(Path("sessions/training"), "network", -1)
+    path = checkpoint.find(Path("sessions/training"), "network", -1).path
     assert "script.py:Mixture" in (path / checkpoint.DESCRIPTION).read_text()
     learner = load_learner(path)
     assert learner.network.module.first.out_features == 6

@@ -351,12 +351,15 @@ class Training(NewSessionPipeline):
 
     def _load_parameters(self, last: checkpoint.Checkpoint | None) -> None:
         config = self.network_config
+        found = last
         if last is not None:
             self.learner.resume(last)
         elif config.network_dir is not None:
             place = Path(config.network_dir)
-            path = checkpoint.find(place, config.network_name, config.which_network)
-            self.learner.network.load_parameters(path / self.learner.network.parameters_file)
+            found = checkpoint.find(place, config.network_name, config.which_network)
+            self.learner.load_parameters(found)
+        if found is not None and found.notice and self._leads:
+            self.session.note(found.notice)
 
     def _open_environments(
         self, resources: contextlib.ExitStack, config: EnvironmentConfig, dataset: Dataset

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -29,14 +31,27 @@ def write_tensors(
                 f'"{name}" is a {type(value).__name__}; a checkpoint contains tensors only. '
                 "Register it as a buffer of the module, or pass it to the constructor."
             )
-    plain = {
-        name: value.detach().clone(memory_format=torch.contiguous_format).cpu()
-        for name, value in tensors.items()
-    }
     try:
-        safetensors.torch.save_file(plain, path, metadata)
+        safetensors.torch.save_file(_separate(tensors), path, metadata)
     except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} cannot be written: {error}.") from error
+        raise CheckpointError(f"{path} cannot be written: {error}.") from _system_error(error)
+
+
+def _separate(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Return the tensors on the processor, contiguous, copied only if two of them share memory."""
+    separate, places = {}, set()
+    for name, value in tensors.items():
+        plain = value.detach().resolve_conj().resolve_neg().cpu().contiguous()
+        place = plain.untyped_storage().data_ptr()
+        separate[name] = plain.clone() if place in places else plain
+        places.add(place)
+    return separate
+
+
+def _system_error(error: Exception) -> Exception:
+    """Return the error of the system, such as a full disk, that the library tells as text only."""
+    number = re.search(r"\(os error (\d+)\)", str(error))
+    return OSError(int(number[1]), os.strerror(int(number[1]))) if number else error
 
 
 def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:

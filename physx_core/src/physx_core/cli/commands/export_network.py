@@ -37,7 +37,7 @@ def run(words: Sequence[str]) -> None:
     """Export a network and print its fields and the file."""
     options = tyro.cli(ExportNetwork, args=words, prog="physx export-network")
     place = Path(options.directory)
-    path = checkpoint.find(place, options.network_name, options.which_network)
+    path = checkpoint.find(place, options.network_name, options.which_network).path
     learner = load_learner(path, NetworkConfig(device="cpu"))
     file = Path(options.output) if options.output else place / f"{path.name}.{options.to}"
     learner.export(file, options.to)

@@ -11,7 +11,7 @@ import tyro
 
 from physx_core import checkpoint
 from physx_core.cli.dataset_tables import print_dataset
-from physx_core.errors import DatasetNotFoundError
+from physx_core.errors import CheckpointError, DatasetNotFoundError
 
 
 @dataclass
@@ -28,15 +28,23 @@ def run(words: Sequence[str]) -> None:
     """Print the dataset and the checkpoints of a folder."""
     options = tyro.cli(Info, args=words, prog="physx info")
     place = Path(options.directory)
-    checkpoints = [p.parent for p in sorted(place.glob(f"network/*/{checkpoint.DESCRIPTION}"))]
+    checkpoints = checkpoint.list_all(place / "network")
     try:
         print_dataset(place, verify=options.verify)
     except DatasetNotFoundError:
         if not checkpoints:
             raise
+    problems = 0
     for path in checkpoints:
-        found = checkpoint.read(path)
+        try:
+            found = checkpoint.read(path, content=options.verify)
+        except CheckpointError as error:
+            problems += 1
+            print(f"checkpoint {path.name}: {error}")
+            continue
         print(
             f"checkpoint {path.name}: {found.network['network']}, {found.progress.epoch} epochs, "
             f"fields {', '.join(found.fields)}"
         )
+    if problems and problems == len(checkpoints):
+        raise CheckpointError(f"None of the checkpoints in {place / 'network'} can be read.")

@@ -270,13 +270,22 @@ class Learner:
         write = import_component("exporter", network.exporter)
         write(Path(path), form, network, self._predict_tensors, self.fields)
 
+    def load_parameters(self, found: checkpoint.Checkpoint) -> None:
+        """Read the network's parameters from a checkpoint.
+
+        Raises:
+            CheckpointError: If it belongs to another network, or was replaced meanwhile.
+        """
+        self.network.load_parameters(found.path / self.network.parameters_file)
+        checkpoint.check_unchanged(found)
+
     def resume(self, found: checkpoint.Checkpoint) -> None:
         """Continue a training exactly where a checkpoint was written; the fields are bound.
 
         Raises:
             CheckpointError: If it is damaged, or belongs to another network or optimization.
         """
-        self.network.load_parameters(found.path / self.network.parameters_file)
+        self.load_parameters(found)
         optimization = self._trainer()
         if optimization.state_file:
             optimization.load_state(found.path / optimization.state_file)
@@ -295,7 +304,7 @@ def load_learner(folder: str | Path, config: NetworkConfig | None = None) -> Lea
     """
     config = config or NetworkConfig()
     place = Path(config.network_dir or folder)
-    found = checkpoint.read(checkpoint.find(place, config.network_name, config.which_network))
+    found = checkpoint.find(place, config.network_name, config.which_network)
     kept = dict(found.network)
     if config.network is not None:
         kept |= {"network": config.network, "network_kwargs": config.network_kwargs}
@@ -306,7 +315,7 @@ def load_learner(folder: str | Path, config: NetworkConfig | None = None) -> Lea
         }
     learner = Learner(dataclasses.replace(config, **kept), trains=False)
     learner.bind(found.fields, found.normalization)
-    learner.network.load_parameters(found.path / learner.network.parameters_file)
+    learner.load_parameters(found)
     learner.network.set_eval()
     return learner
 

@@ -22,7 +22,7 @@ def read_last_checkpoint(
         name: Name of the network.
         environment: The environment of the samples; all needed samples must be stored already.
     """
-    found = checkpoint.read(checkpoint.find(session.network_dir, name, -1))
+    found = checkpoint.find(session.network_dir, name, -1)
     if environment is not None:
         replays = environment.load_samples and not environment.only_first_epoch
         if environment.always_produce or replays or found.progress.epoch == 0:
