@@ -94,6 +94,16 @@ def test_index_arrays_across_partitions(dataset):
     assert_array_equal(dataset["training"]["y"][::-1], np.arange(N)[::-1] * 2.0)
 
 
+@pytest.mark.parametrize("kind", ["int8", "uint8", "int16", "uint64"])
+def test_index_arrays_of_any_integer_type(dataset, kind):
+    index = np.array([0, 127, 5, 5], kind)
+    for rows in (index, index[:1]) if kind[0] == "u" else (index, -1 - index):
+        expected = np.arange(N)[rows]
+        assert_array_equal(dataset["training"]["id"][rows], expected)
+        dataset.update("training", rows, {"id": expected})
+    assert_array_equal(dataset["training"]["id"], np.arange(N))
+
+
 @pytest.mark.parametrize("options", [{"batch_size": 0}, {"batch_size": -1},
                                      {"batch_size": 1, "epochs": -1},
                                      {"batch_size": 1, "fields": []}])  # fmt: skip

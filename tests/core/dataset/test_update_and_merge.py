@@ -182,6 +182,7 @@ def test_an_invalid_merge_changes_nothing(folder, tmp_path, thousand):
     thousand.write(folder)
     thousand.write(tmp_path / "other")
     with Dataset.create(tmp_path / "fields") as dataset:
+        dataset.append("another", {"x": np.ones((2, 4))})
         dataset.append("training", {"x": np.ones((2, 4))})
     path = tmp_path / "other" / "run_training_x_2.h5"
     damaged = bytearray(path.read_bytes())
@@ -190,6 +191,7 @@ def test_an_invalid_merge_changes_nothing(folder, tmp_path, thousand):
     with Dataset.open(folder, writable=True) as dataset:
         with pytest.raises(FieldsMismatchError):
             dataset.merge(tmp_path / "fields")
+        assert dataset.modes == ["training"]
         with pytest.raises(DatasetError, match=r"run_training_x_2\.h5 was changed.*Nothing was m"):
             dataset.merge(tmp_path / "other")
         with pytest.raises(DatasetError, match="itself"):
@@ -236,7 +238,9 @@ def test_a_missing_partition_cannot_be_removed(folder, thousand):
                 dataset.remove_partition("training", index, session)
         with pytest.raises(DatasetError, match="no mode"):
             dataset.remove_partition("other", 0)
-    thousand.check(folder, thousand.stacked(thousand.rows, (0, 10)))
+        dataset.append("training", thousand.part(10, 20))  # to the same partition
+        assert dataset.describe()[0]["partitions"] == 4
+    thousand.check(folder, thousand.stacked(thousand.rows, (0, 20)))
 
 
 def test_an_interrupted_removal_is_completed(folder, thousand):

@@ -460,8 +460,8 @@ class Dataset(Closeable):
         if given.problems:
             raise next(iter(given.problems.values()))
         with files.storing(f"The rows of {source}"):
-            for name, mode in given.modes.items():
-                appender.define_fields(name, mode.fields.values())
+            appender.define_modes({n: mode.fields.values() for n, mode in given.modes.items()})
+            for name in given.modes:
                 appender.writer.finish(name)
             add_partitions(appender.writer, source, given)
 
@@ -483,7 +483,6 @@ class Dataset(Closeable):
         writer = self._as_only_writer("remove partitions")
         self._reader.mode(mode)
         with files.storing(f"Mode {mode!r} without partition {index}"):
-            writer.finish(mode)
             return drop_partition(writer, mode, session, index)
 
     @staticmethod

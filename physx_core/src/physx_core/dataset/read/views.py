@@ -145,4 +145,5 @@ def row_numbers(index: Any, total: int) -> Index:
         )
     if numbers.min() < -total or numbers.max() >= total:
         raise IndexError(f"Row numbers are out of range: there are {total} rows.")
-    return np.where(numbers < 0, numbers + total, numbers).astype(np.intp, copy=False)
+    numbers = numbers.astype(np.intp, copy=False)  # in a small type the sum would overflow
+    return np.where(numbers < 0, numbers + total, numbers)

@@ -10,7 +10,7 @@ from physx_core.dataset.store.definitions import compare_fields, complete_shapes
 from physx_core.dataset.store.manifest import Mode
 from physx_core.dataset.write.row_validation import check_rows, infer_fields
 from physx_core.dataset.write.writer import Writer
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, listed
 from physx_core.fields import Field
 from physx_core.rows import RowBuffer, infer_shapes
 
@@ -29,16 +29,29 @@ class Appender:
 
     def define_fields(self, mode: str, fields: Iterable[Field]) -> None:
         """Define the fields of a mode: see `Dataset.define_fields`."""
-        given = {field.name: field for field in fields}
-        if not mode.isidentifier() or not given:
-            names = sorted(given) or "no fields"
-            raise ConfigError(f"A mode needs an identifier and fields, not {mode!r} with {names}.")
-        known = self._manifest.modes.get(mode)
-        if known is not None and _complete(mode, known, given) == known.fields:
+        self.define_modes({mode: fields})
+
+    def define_modes(self, modes: Mapping[str, Iterable[Field]]) -> None:
+        """Define the fields of several modes; of none if one of them has other fields already."""
+        wanted = {name: {field.name: field for field in fields} for name, fields in modes.items()}
+        for name, given in wanted.items():
+            if not name.isidentifier() or not given:
+                names = sorted(given) or "no fields"
+                raise ConfigError(
+                    f"A mode needs an identifier and fields, not {name!r} with {names}."
+                )
+        known = self._manifest.modes
+        if all(
+            n in known and _complete(n, known[n], g) == known[n].fields for n, g in wanted.items()
+        ):
             return
-        with files.storing(f"The fields of mode {mode!r}"), self._store.change() as manifest:
-            known = manifest.modes.setdefault(mode, Mode(given))
-            known.fields = _complete(mode, known, given)
+        with (
+            files.storing(f"The fields of mode {listed(wanted)}"),
+            self._store.change() as manifest,
+        ):
+            for name, given in wanted.items():
+                mode = manifest.modes.setdefault(name, Mode(given))
+                mode.fields = _complete(name, mode, given)
 
     def append(self, mode: str, rows: Mapping[str, Any], *, checked: bool = False) -> None:
         """Store and commit rows: see `Dataset.append`."""

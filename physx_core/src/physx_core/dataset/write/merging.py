@@ -45,25 +45,32 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
 
 
 def drop_partition(writer: Writer, mode_name: str, session: str | None, index: int) -> int:
-    """Remove a partition and return how many rows it had."""
-    mode = writer.store.manifest.modes[mode_name]
-    found = [p for p in mode.partitions if p.index == index and session in (None, p.session)]
-    if len(found) != 1:
-        there = ", ".join(f"{p.index} of {p.session!r}" for p in mode.partitions) or "none"
-        what = "several partitions" if found else "no partition"
-        raise DatasetError(
-            f"Mode {mode_name!r} has {what} {index}"
-            f"{'' if session is None else f' of session {session!r}'}. Partitions: {there}."
-        )
+    """Seal all partitions of a mode, remove one, and return how many rows it had."""
+    _find(writer, mode_name, session, index)  # an invalid call changes nothing
+    writer.finish(mode_name)
+    found = _find(writer, mode_name, session, index)
     with writer.store.change() as manifest:
         mode = manifest.modes[mode_name]
-        del mode.partitions[mode.place(found[0])]
-        mode.dropped.append(found[0])
-        if found[0].counted:
+        del mode.partitions[mode.place(found)]
+        mode.dropped.append(found)
+        if found.counted:
             mode.forget_statistics()
     writer.store.manifest.generation += 1
-    _forget(writer, {mode_name: [found[0]]})
-    return found[0].rows
+    _forget(writer, {mode_name: [found]})
+    return found.rows
+
+
+def _find(writer: Writer, mode_name: str, session: str | None, index: int) -> Partition:
+    mode = writer.store.manifest.modes[mode_name]
+    found = [p for p in mode.partitions if p.index == index and session in (None, p.session)]
+    if len(found) == 1:
+        return found[0]
+    there = ", ".join(f"{p.index} of {p.session!r}" for p in mode.partitions) or "none"
+    what = "several partitions" if found else "no partition"
+    raise DatasetError(
+        f"Mode {mode_name!r} has {what} {index}"
+        f"{'' if session is None else f' of session {session!r}'}. Partitions: {there}."
+    )
 
 
 def _reserve(writer: Writer, given: Manifest) -> dict[str, Pairs]:
