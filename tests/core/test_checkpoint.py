@@ -509,6 +509,20 @@ def test_the_folder_of_a_session_that_was_deleted_does_not_come_back(tmp_path):
     assert names(tmp_path) == []
 
 
+def test_a_training_notices_that_its_session_was_deleted(trained):
+    class Deletes(Training):
+        def epoch_end(self):
+            super().epoch_end()
+            if self.epoch_id == 5:
+                shutil.rmtree(self.session.path)
+
+    config, data = NetworkConfig("toy/linear"), DatasetConfig(existing_dir="data")
+    run = Deletes(config, data, epoch_nb=10**9, batch_size=5)
+    with pytest.raises(SessionError, match="sessions/training_1 is gone"):
+        run.execute()
+    assert names(Path("sessions")) == ["training"]
+
+
 def test_a_training_whose_session_is_deleted_ends_with_an_error_that_says_so(trained):
     class Deletes(Training):
         def epoch_end(self):

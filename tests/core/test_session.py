@@ -52,6 +52,13 @@ def test_a_file_in_the_way_is_an_error(tmp_path):
         Session.create(tmp_path / "sessions", "run")
 
 
+def test_a_session_that_cannot_be_written_to_is_named(tmp_path):
+    session = Session.create(tmp_path, "run")
+    (session.path / "config.toml.tmp").mkdir()
+    with pytest.raises(SessionError, match="session .*run cannot be written to"):
+        session.record("training", {"epoch_nb": 1}, 5)
+
+
 def test_record_adds_to_info_and_keeps_the_notes(tmp_path):
     session = Session.create(tmp_path, "run")
     session.record("training", {"epoch_nb": 1}, 5)

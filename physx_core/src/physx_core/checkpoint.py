@@ -159,7 +159,7 @@ def save(
         },
     }
     try:
-        _check_session(network_dir)
+        check_session(network_dir)
         if not network_dir.is_dir():
             files.make_folder(network_dir)
         elif not numbers and not path.is_dir():  # whoever made it may not have waited for the disk
@@ -181,7 +181,7 @@ def save(
             files.remove_folder(partial)
             _settle(path, finish=not isinstance(cause, OSError))
         if isinstance(error, Exception):
-            _check_session(network_dir)
+            check_session(network_dir)
         if isinstance(cause, OSError):
             others = [f"{name}_{number}" for number in numbers]
             safe = f"The checkpoints {listed(others)}" if others else "The session's samples"
@@ -191,11 +191,16 @@ def save(
     return path
 
 
-def _check_session(network_dir: Path) -> None:
+def check_session(network_dir: Path) -> None:
+    """Check that a session's folder, in which checkpoints are or will be stored, is still there.
+
+    Raises:
+        SessionError: If it is not.
+    """
     if not network_dir.parent.is_dir():
         raise SessionError(
             f"The session's folder {network_dir.parent} is gone: it was deleted or renamed during "
-            "the run. The checkpoint cannot be stored, and no new folder is created in its place."
+            "the run. Checkpoints cannot be stored; no new folder is created in its place."
         )
 
 
@@ -246,8 +251,8 @@ def _describe_files(folder: Path, known: Container[str] = ()) -> dict[str, Any]:
     found = {}
     for path in sorted(folder.iterdir()):
         if path.name not in known:
-            found[path.name] = _measure(path)
             files.start_sync(path)
+            found[path.name] = _measure(path)
     return found
 
 

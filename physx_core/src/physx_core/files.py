@@ -96,7 +96,7 @@ def read_content(path: Path, limit: int) -> bytes:
         return file.read(size)
 
 
-def read_blocks(path: Path, nbytes: int = 2**20) -> Iterator[memoryview]:
+def read_blocks(path: Path, nbytes: int = 2**18) -> Iterator[memoryview]:
     """Yield the bytes of a file in blocks; each is valid until the next one.
 
     Raises:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from physx_core import files
-from physx_core.config import read_toml, write_toml
+from physx_core.config import read_toml
 from physx_core.errors import SessionError, listed, nearest
 
 NOTES = "Notes\n-----\n(Write here what this run is about; physx never changes these lines.)\n"
@@ -113,15 +113,23 @@ class Session:
             pipeline: Name of the pipeline, the table in ``config.toml``.
             plain: Its configuration as plain data.
             seed: The seed of the run.
+
+        Raises:
+            SessionError: If the folder cannot be written to.
         """
         import tomli_w
 
-        file = self.path / "config.toml"
+        file, info = self.path / "config.toml", self.path / "info.txt"
         tables = read_toml(file) if file.exists() else {}
-        write_toml(file, {**tables, pipeline: plain})
-        info = self.path / "info.txt"
-        if not info.exists():
-            info.write_text(f"Session {self.name}\n\n{NOTES}\n", encoding="utf-8")
+        try:
+            files.replace(file, tomli_w.dumps({**tables, pipeline: plain}).encode())
+            if not info.exists():
+                info.write_text(f"Session {self.name}\n\n{NOTES}\n", encoding="utf-8")
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise SessionError(
+                f"The session {self.path} cannot be written to: {reason}."
+            ) from error
         now = datetime.datetime.now(datetime.UTC).astimezone().isoformat(timespec="seconds")
         versions = ", ".join(f"{name} {version}" for name, version in installed_versions().items())
         title = f"{pipeline}, {now}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
@@ -34,6 +35,9 @@ from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
+
+_SESSION_INTERVAL = 1.0
+"""Time in s between checks that the session's folder is still there."""
 
 
 @options
@@ -112,6 +116,7 @@ class Training(NewSessionPipeline):
     validation_loss: float = field(init=False, repr=False, default=float("nan"))
     best: BestEpoch = field(init=False, repr=False)
     checkpoint_path: Path | None = field(init=False, repr=False, default=None)
+    _checked: float = field(init=False, repr=False, default=0.0)
 
     def execute(self) -> None:
         """Train. Ctrl-C ends the training after the current batch, with a checkpoint to resume.
@@ -183,6 +188,9 @@ class Training(NewSessionPipeline):
         number = self.epoch_id * self._epoch_batches + self.batch_id
         self.observers.scalars(values, number, "batch")
         self.observers.advance(1)
+        if self._leads and time.monotonic() > self._checked + _SESSION_INTERVAL:
+            checkpoint.check_session(self.session.network_dir)
+            self._checked = time.monotonic()
 
     def batch_end(self) -> None:
         """Called after each batch."""
