@@ -48,6 +48,17 @@ def storage_error(
         kind: Class of the returned error.
         advice: What to do after having freed some space, if the disk is full.
     """
+    if isinstance(error, SyncError):
+        return DatasetError(
+            f"{what} cannot be stored: the disk has failed ({error.strerror}), and rows of the last "
+            "seconds may be lost. Close the dataset and open it again: it then has all rows that "
+            "are intact."
+        )
+    if isinstance(error, RemovedError):
+        return DatasetError(
+            f"{what} cannot be stored: {error.filename} was removed while it was being written, and "
+            "the rows in it are lost."
+        )
     full = error.errno in FULL
     reason = "the disk is full" if full else (error.strerror or str(error))
     then = f" Free some space and {advice}." if full else ""
@@ -78,9 +89,24 @@ def create_new(path: Path) -> int:
     return open_regular(path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
 
 
+def duplicate(descriptor: int) -> int:
+    """Return another descriptor of an open file."""
+    return os.dup(descriptor)
+
+
 def close(descriptor: int) -> None:
     """Close a file."""
     os.close(descriptor)
+
+
+def size(descriptor: int) -> int:
+    """Return how many bytes an open file has."""
+    return os.fstat(descriptor).st_size
+
+
+def is_removed(descriptor: int) -> bool:
+    """Return whether an open file has no name any more: somebody has removed it."""
+    return os.fstat(descriptor).st_nlink == 0
 
 
 def read_content(path: Path, limit: int) -> bytes:
@@ -168,9 +194,27 @@ def reserve(descriptor: int, start: int, stop: int) -> None:
     os.posix_fallocate(descriptor, start, stop - start)
 
 
+class SyncError(OSError):
+    """A sync has failed: what of the writes before it is on the disk, nobody knows.
+
+    Another sync may succeed nevertheless, because the system has dropped what it could not write.
+    """
+
+
+class RemovedError(OSError):
+    """A file that is being written has no name any more, because somebody removed it."""
+
+
 def sync(descriptor: int) -> None:
-    """Wait until the content of an open file is on the disk."""
-    os.fdatasync(descriptor)
+    """Wait until the content of an open file is on the disk.
+
+    Raises:
+        SyncError: If the disk fails.
+    """
+    try:
+        os.fdatasync(descriptor)
+    except OSError as error:
+        raise SyncError(error.errno, error.strerror) from error
 
 
 def start_sync(path: Path) -> None:
@@ -183,19 +227,31 @@ def start_sync(path: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Wait until the content of a file is on the disk."""
+    """Wait until the content of a file is on the disk.
+
+    Raises:
+        SyncError: If the disk fails.
+        OSError: If there is no such file.
+    """
     descriptor = open_regular(path)
     try:
-        os.fdatasync(descriptor)
+        sync(descriptor)
     finally:
         os.close(descriptor)
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk: of new, renamed and removed files."""
+    """Wait until the names in a folder are on the disk: of new, renamed and removed files.
+
+    Raises:
+        SyncError: If the disk fails.
+        OSError: If there is no such folder.
+    """
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        raise SyncError(error.errno, error.strerror) from error
     finally:
         os.close(descriptor)
 
@@ -232,6 +288,14 @@ def rename(path: Path, target: Path) -> None:
     os.replace(path, target)
 
 
+def link(path: Path, target: Path) -> None:
+    """Give a file a second name, or where that is not possible, copy it."""
+    try:
+        os.link(path, target)
+    except OSError:
+        replace(target, path.read_bytes())
+
+
 def remove(path: Path) -> None:
     """Remove a file, if there is one of that name."""
     with contextlib.suppress(FileNotFoundError):
@@ -255,21 +319,21 @@ def temporary_path(path: Path) -> Path:
     return path.with_name(path.name + ".tmp")
 
 
-def replace(path: Path, content: bytes, *, sync: bool = True) -> None:
+def replace(path: Path, content: bytes, *, wait: bool = True) -> None:
     """Replace a file atomically: if the process dies, either the old or the new one is there.
 
     Args:
         path: The file.
         content: Its new content.
-        sync: Whether to wait for the disk, so that this holds after a power cut, too.
+        wait: Whether to wait for the disk, so that this holds after a power cut, too.
     """
     draft = temporary_path(path)
     try:
         descriptor = create_new(draft)
         try:
             write_at(descriptor, content, 0)
-            if sync:
-                os.fdatasync(descriptor)
+            if wait:
+                sync(descriptor)
         finally:
             os.close(descriptor)
         rename(draft, path)
@@ -277,5 +341,5 @@ def replace(path: Path, content: bytes, *, sync: bool = True) -> None:
         with contextlib.suppress(OSError):
             remove(draft)
         raise
-    if sync:
+    if wait:
         sync_folder(path.parent)

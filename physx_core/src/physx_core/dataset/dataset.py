@@ -24,7 +24,7 @@ from physx_core.dataset.store.manifest import Manifest, to_plain_info
 from physx_core.dataset.write.appender import Appender
 from physx_core.dataset.write.merging import add_partitions, drop_partition
 from physx_core.dataset.write.opening import WriterOptions, create, extend
-from physx_core.dataset.write.updating import check_update, update_rows
+from physx_core.dataset.write.updating import check_update
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
@@ -437,8 +437,7 @@ class Dataset(Closeable):
         single = not isinstance(index, slice) and np.ndim(index) == 0
         values = check_update(fields, numbers, rows, single=single)
         with files.storing(f"{len(numbers)} updated rows of mode {mode!r}"):
-            writer.wait()
-            update_rows(writer.store, mode, numbers, values, durable=writer.durable)
+            writer.update(mode, numbers, values)
 
     def merge(self, directory: str | Path) -> None:
         """Append all rows of another dataset, which is not changed; all of them, or none.

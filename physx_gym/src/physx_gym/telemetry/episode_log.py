@@ -128,7 +128,7 @@ class Log:
         path = Path(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            replace(path, self._content(), sync=False)
+            replace(path, self._content(), wait=False)
         except (OSError, TypeError, ValueError) as error:
             raise LogError(f"The log {path} cannot be written: {error}.") from error
 

@@ -18,7 +18,19 @@ def set_aside(directory: Path, paths: Iterable[Path]) -> Path:
     for path in paths:
         with contextlib.suppress(FileNotFoundError):
             files.rename(path, unused(folder / path.name))
+    files.sync_folder(folder)
+    files.sync_folder(directory)
     return folder
+
+
+def keep(directory: Path, paths: Iterable[Path]) -> None:
+    """Give files that are about to be replaced, if they are there, a second name in that folder."""
+    folder = directory / FOLDER
+    for path in paths:
+        if path.exists():
+            files.make_folder(folder)
+            files.link(path, unused(folder / path.name))
+            files.sync_folder(folder)
 
 
 def unused(path: Path) -> Path:

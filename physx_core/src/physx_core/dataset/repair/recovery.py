@@ -9,7 +9,7 @@ from itertools import chain
 from pathlib import Path
 
 from physx_core import files
-from physx_core.dataset.repair.aside import set_aside
+from physx_core.dataset.repair.aside import FOLDER, keep, set_aside
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
@@ -17,6 +17,7 @@ from physx_core.dataset.store.partition_format import (
     FORMAT,
     UNREADABLE,
     Inspection,
+    count_intact,
     inspect,
     open_partition,
 )
@@ -99,6 +100,7 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
     Returns:
         What was sealed, completed or removed from the manifest, as texts.
     """
+    count_rows(directory, manifest, thorough=True)
     if manifest.problems:
         raise next(iter(manifest.problems.values()))
     done = []
@@ -106,14 +108,8 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
         files.remove(draft)
     for name, mode in manifest.modes.items():
         for partition in [p for p in mode.partitions if not p.sealed]:
-            if partition.rows:
-                mode.swap(seal(directory, mode.fields, partition))
-                what = f"of {partition.rows} rows was left open and has been sealed."
-            else:
-                mode.partitions.remove(partition)
-                mode.dropped.append(partition)
-                what = "had no committed row and has been removed."
             label = f"Partition {partition.index} of session {partition.session!r}"
+            what = _close(directory, mode, partition)
             done.append(f"{label} and mode {name!r} {what}")
     if complete_checksums(directory, manifest):
         done.append("Rows were being updated in place: their checksums have been recomputed.")
@@ -122,6 +118,33 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
         _clear_dropped(directory, manifest)
         done = done or ["The remains of removed partitions have been deleted."]
     return done + _clear_unlisted(directory, manifest)
+
+
+def _close(directory: Path, mode: Mode, partition: Partition) -> str:
+    """Seal an open partition whose writer is gone, or remove it; return what was done."""
+    lost = _count_lost(directory, mode, partition)
+    if lost:  # the files are kept as they are
+        keep(directory, [partition.path(directory, name) for name in mode.fields])
+    if partition.rows:
+        mode.swap(seal(directory, mode.fields, partition, rewrite=True))
+        what = f"of {partition.rows} rows was left open and has been sealed."
+    else:
+        mode.partitions.remove(partition)
+        mode.dropped.append(partition)
+        what = "had no committed row and has been removed."
+    if lost:
+        what += f" {lost} Its files are kept in {directory / FOLDER}."
+    return what
+
+
+def _count_lost(directory: Path, mode: Mode, partition: Partition) -> str:
+    """Return which rows of an open partition cannot be used; empty if all can."""
+    if partition.problem:
+        return partition.problem
+    counted = min(partition.inspect(directory, field).rows for field in mode.fields.values())
+    if counted == partition.rows:
+        return ""
+    return f"{counted - partition.rows} rows behind them did not reach the disk."
 
 
 def _clear_dropped(directory: Path, manifest: Manifest) -> None:
@@ -158,28 +181,58 @@ def complete_checksums(directory: Path, manifest: Manifest) -> bool:
     return changed
 
 
-def count_rows(directory: Path, manifest: Manifest) -> None:
-    """Count what is committed; modes whose rows cannot be counted are noted as problems."""
+def count_rows(directory: Path, manifest: Manifest, *, thorough: bool = False) -> None:
+    """Count what is committed; modes whose rows cannot be counted are noted as problems.
+
+    Args:
+        directory: The dataset's folder.
+        manifest: The manifest; gets the counts.
+        thorough: Whether to compare the rows of all open partitions with their digests, not only
+            those that were written before the machine was started.
+    """
     for name, mode in manifest.modes.items():
         try:
             for partition in mode.partitions:
                 if not partition.sealed:
-                    partition.rows = _committed_rows(directory, mode, partition)
+                    _count_open(directory, mode, partition, thorough)
+            _discard_behind_lost_rows(mode)
         except DatasetError as error:
             manifest.problems[name] = error
 
 
-def _committed_rows(directory: Path, mode: Mode, partition: Partition) -> int:
-    """Return how many rows are committed in all files of an open partition."""
-    rows = []
+def _count_open(directory: Path, mode: Mode, partition: Partition, thorough: bool) -> None:
+    """Count the rows of an open partition that are committed in all its files.
+
+    The headers of the files are on the disk before the manifest lists them. Should one be missing
+    or unreadable nevertheless, the partition has no rows, and the others are not affected.
+    """
+    rows, partition.problem = [], ""
     for name, field in mode.fields.items():
-        found = partition.inspect(directory, field)
+        path = partition.path(directory, name)
+        try:
+            found = partition.inspect(directory, field)
+        except DatasetError as error:
+            partition.rows, partition.problem = 0, str(error)
+            return
         have = found.identity.field
         if have != field and field.shape is not None:
-            path = partition.path(directory, name)
             raise DatasetError(f"{path} holds {have}, but the dataset says {field}.")
-        rows.append(found.rows)
-    return min(rows)
+        certain = found.certain and not thorough
+        rows.append(found.rows if certain else count_intact(path, found))
+    partition.rows = min(rows)
+
+
+def _discard_behind_lost_rows(mode: Mode) -> None:
+    """Let open partitions have no rows if rows of the one that its writer filled before are lost.
+
+    Otherwise these would follow upon a gap.
+    """
+    for partition in mode.partitions:
+        if partition.follows is not None and not partition.sealed:
+            index, rows = partition.follows
+            key = partition.session, index
+            if any(p.key == key and p.rows < rows for p in mode.partitions):
+                partition.rows = 0
 
 
 def _is_partition(path: Path) -> bool:

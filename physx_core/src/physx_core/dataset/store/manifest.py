@@ -38,6 +38,9 @@ class Partition:
             updated in place.
         counted: Whether the mode's statistics include its rows.
         writing: Whether this process writes it, so that `offsets` are right though not sealed.
+        follows: While it is not sealed, number of the partition that its writer filled before it,
+            and how many rows that one got: without all of these, its own rows do not count.
+        problem: Why it counts no rows, if a file of it cannot be read; not stored.
         running: Statistics of its first rows while it is not counted, by field; not stored.
     """
 
@@ -51,6 +54,8 @@ class Partition:
     checksums: dict[str, int] = field(default_factory=dict)
     counted: bool = False
     writing: bool = False
+    follows: tuple[int, int] | None = None
+    problem: str = field(default="", compare=False)
     running: dict[str, RunningStatistics] = field(default_factory=dict, compare=False)
 
     @property
@@ -98,6 +103,8 @@ class Partition:
         if self.sealed:
             crc32 = {name: f"{value:08x}" for name, value in self.checksums.items()}
             plain |= {"rows": self.rows, "crc32": crc32, "counted": self.counted}
+        elif self.follows is not None:
+            plain["follows"] = list(self.follows)
         return plain
 
 

@@ -102,6 +102,10 @@ def _partition(mode_name: str, plain: Any, fields: Mapping[str, Field]) -> Parti
     if sealed and any(field.shape is None for field in fields.values()):
         raise ValueError("a sealed partition has fields of unknown shape")
     rows = whole(plain["rows"], "a number of rows") if sealed else 0
+    follows = None if sealed else plain.get("follows")
+    if follows is not None:
+        index, count = checked(list, follows, "'follows'")
+        follows = whole(index, "the number of a partition", 2**31), whole(count, "a row count")
     for name, offset in offsets.items():
         whole(whole(offset, "an offset") + rows * fields[name].nbytes, "the end of the rows")
     return Partition(
@@ -114,6 +118,7 @@ def _partition(mode_name: str, plain: Any, fields: Mapping[str, Field]) -> Parti
         offsets=offsets,
         checksums={n: int(checked(str, crc, "a checksum"), 16) for n, crc in crc32.items()},
         counted=sealed and plain.get("counted") is True,
+        follows=follows,
     )
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from physx_core import files
 from physx_core.dataset.store import locks, manifest_file
 from physx_core.dataset.store.manifest import Manifest, Mode
 
@@ -22,16 +23,31 @@ class ManifestStore:
         directory: The dataset's folder.
         manifest: What the dataset holds, as far as this process knows.
         shared: Whether other processes write to it too.
+        failure: The first sync that failed. Afterwards nothing is changed any more: what was
+            written before may be lost, though it can still be read.
     """
 
     directory: Path
     manifest: Manifest
     shared: bool = False
+    failure: files.SyncError | None = None
+
+    @contextlib.contextmanager
+    def syncing(self) -> Iterator[None]:
+        """Do something only if no sync has failed yet, and note whether one fails now."""
+        if self.failure is not None:
+            raise self.failure
+        try:
+            yield
+        except files.SyncError as error:
+            self.failure = error
+            raise
 
     @contextlib.contextmanager
     def change(self) -> Iterator[Manifest]:
         """Give the manifest to be changed and store it at the end; after an error, restore it."""
-        with locks.lock_manifest(self.directory) if self.shared else contextlib.nullcontext():
+        turn = locks.lock_manifest(self.directory) if self.shared else contextlib.nullcontext()
+        with self.syncing(), turn:
             if self.shared:
                 self.reload(manifest_file.load(self.directory))
             before = self.manifest.copy()

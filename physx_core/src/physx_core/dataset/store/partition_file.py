@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import errno
+import threading
 from pathlib import Path
 
+from xxhash import xxh3_64
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
+from physx_core.dataset.store.commits import COUNT, RECORD, Commit, encode
 from physx_core.dataset.store.partition_format import Header, Identity, make_header
 from physx_core.typing import Array
 
@@ -19,16 +22,25 @@ _COPY = 2**23
 class PartitionFile:
     """Writes rows to their offsets and commits them with the row count.
 
+    A thread beside the writer may `mark` and sync the file meanwhile.
+
     Attributes:
         identity: What the file is part of.
         data_offset: Offset of the first row.
         descriptor: The open file; -1 if it is closed.
+        path: Its path, once it is published.
+        committed: The newest commit.
     """
 
     def __init__(self, path: Path, identity: Identity, header: Header, descriptor: int) -> None:
         self.identity = identity
         self.data_offset = header.data_offset
-        self._path = path
+        self.path = path
+        self.committed = Commit.unchecked(0)
+        self._pending = self.committed
+        self._digest = self._written = xxh3_64()
+        self._next_mark = self._pending_mark = 0
+        self._lock = threading.Lock()
         self._row_nbytes = identity.field.nbytes
         self._rows_offset = header.rows_offset
         self._size = header.size
@@ -37,7 +49,7 @@ class PartitionFile:
 
     @classmethod
     def create(cls, directory: Path, identity: Identity, capacity: int) -> PartitionFile:
-        """Write an empty partition file under a temporary name.
+        """Write an empty partition file under a temporary name and wait until it is on the disk.
 
         Args:
             directory: The dataset's folder.
@@ -46,17 +58,23 @@ class PartitionFile:
         """
         header = make_header(identity, capacity)
         path = directory / identity.file_name
-        return cls(path, identity, header, _write_header(files.temporary_path(path), header))
+        file = cls(path, identity, header, _write_header(files.temporary_path(path), header))
+        try:
+            file.sync()
+        except OSError:
+            file.discard()
+            raise
+        return file
 
     def publish(self) -> None:
         """Give the file its name."""
-        files.rename(files.temporary_path(self._path), self._path)
+        files.rename(files.temporary_path(self.path), self.path)
 
     def discard(self) -> None:
         """Close the file and remove it, whether it is published or not."""
         self.close()
-        files.remove(files.temporary_path(self._path))
-        files.remove(self._path)
+        files.remove(files.temporary_path(self.path))
+        files.remove(self.path)
 
     def reserve(self, rows: int) -> None:
         """Allocate disk space for the first `rows` rows, and for some more."""
@@ -82,13 +100,65 @@ class PartitionFile:
             row: Number of the first one in the file.
             block: Contiguous rows of the field's own type, shape (count, *field shape).
         """
+        self._written = self._digest.copy()
         if self._row_nbytes:
+            content = files.as_bytes(block)
             offset = self.data_offset + row * self._row_nbytes
-            files.write_at(self.descriptor, files.as_bytes(block), offset)
+            files.write_at(self.descriptor, content, offset)
+            self._written.update(content)
 
-    def commit(self, rows: int) -> None:
-        """Make the first `rows` rows part of the dataset."""
-        files.write_at(self.descriptor, rows.to_bytes(8, "little"), self._rows_offset)
+    def commit(self, rows: int, *, durable: bool) -> None:
+        """Make the first `rows` rows part of the dataset, the last of which were just written.
+
+        The commit stands once it is accepted; until then it can be withdrawn.
+
+        Args:
+            rows: How many rows.
+            durable: Whether the caller syncs the file before accepting the commit.
+        """
+        pending = Commit(rows, self.committed.base, self._written.intdigest())
+        content = COUNT.pack(rows) + RECORD.pack(*pending)
+        if durable:
+            marks = [pending, self.committed]
+            content += b"".join(RECORD.pack(*mark) for mark in marks[:: 1 - 2 * self._next_mark])
+        files.write_at(self.descriptor, content, self._rows_offset)
+        self._pending, self._pending_mark = pending, self._next_mark ^ durable
+
+    def accept(self, *, durable: bool) -> None:
+        """Let the last commit stand; calling it again does nothing."""
+        self.committed, self._digest = self._pending, self._written
+        if durable:
+            self._next_mark = self._pending_mark
+
+    def withdraw(self, *, durable: bool) -> None:
+        """Return to the commit that was accepted last."""
+        records = 1 + 2 * durable
+        content = COUNT.pack(self.committed.rows) + RECORD.pack(*self.committed) * records
+        files.write_at(self.descriptor, content, self._rows_offset)
+
+    def mark(self) -> int:
+        """Make the newest commit a mark, which the next sync is to bring to the disk.
+
+        Returns:
+            Another descriptor of the file, to sync it with; -1 if the file is closed.
+        """
+        with self._lock:
+            if self.descriptor < 0:
+                return -1
+            place = COUNT.size + RECORD.size * (1 + self._next_mark)
+            content = RECORD.pack(*self.committed)
+            files.write_at(self.descriptor, content, self._rows_offset + place)
+            self._next_mark ^= 1
+            return files.duplicate(self.descriptor)
+
+    def settle(self) -> None:
+        """Bring all rows to the disk and take their digest away, so that they may be updated."""
+        with self._lock:
+            files.sync(self.descriptor)
+            settled = Commit.unchecked(self.committed.rows)
+            files.write_at(self.descriptor, encode(settled), self._rows_offset)
+            files.sync(self.descriptor)
+            self.committed, self._digest = settled, xxh3_64()
 
     def sync(self) -> None:
         """Wait until everything written is on the disk."""
@@ -97,12 +167,9 @@ class PartitionFile:
     def close(self) -> None:
         """Close the file; calling it again does nothing."""
         if self.descriptor >= 0:
-            files.close(self.hand_over())
-
-    def hand_over(self) -> int:
-        """Return the open file to the caller, who closes it."""
-        descriptor, self.descriptor = self.descriptor, -1
-        return descriptor
+            with self._lock:
+                descriptor, self.descriptor = self.descriptor, -1
+            files.close(descriptor)
 
     def _allocate(self, end: int) -> None:
         files.reserve(self.descriptor, self._reserved, end)

@@ -1,9 +1,10 @@
 """The partition file: an ordinary HDF5 file whose rows are written without HDF5.
 
-It holds two contiguous datasets: ``data`` (capacity, *field shape) and the scalar ``rows``, the
-number of committed rows. Its attributes say what it is part of. h5py makes the header once, in
-memory; from then on rows are written at known offsets of the file, so that HDF5 never runs while
-samples arrive, and h5py can open the file at any moment.
+It holds three contiguous datasets: ``data`` (capacity, *field shape), the scalar ``rows``, the
+number of committed rows, and ``commits``, the records that tell which rows have reached the disk.
+Its attributes say what it is part of. h5py makes the header once, in memory; from then on rows are
+written at known offsets of the file, so that HDF5 never runs while samples arrive, and h5py can
+open the file at any moment.
 """
 
 from __future__ import annotations
@@ -18,13 +19,22 @@ from typing import Any
 import numpy as np
 
 from physx_core import files
+from physx_core.dataset.store.commits import (
+    COUNT,
+    NBYTES,
+    RECORDS,
+    SECTOR,
+    Commit,
+    boot_id,
+    find_intact,
+)
 from physx_core.errors import DatasetError, PhysxError
 from physx_core.fields import Field
 
 FORMAT = "physx partition"
-VERSION = 1
-READABLE = (1,)
-"""Versions of the partition file that can be read."""
+VERSION = 2
+READABLE = (1, 2)
+"""Versions of the partition file that can be read; those of version 1 have no ``commits``."""
 UNREADABLE = (
     OSError, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError,
     MemoryError,
@@ -80,7 +90,7 @@ class Header:
 
     Attributes:
         content: Beginning of the file; the rows may begin before its end.
-        rows_offset: Offset of the committed row count, 8 bytes.
+        rows_offset: Offset of the committed row count, behind which the records lie.
         data_offset: Offset of the first row.
         size: Size of the whole file in bytes.
     """
@@ -100,12 +110,46 @@ class Inspection:
         capacity: How many rows fit in.
         rows: How many rows are committed.
         data_offset: Offset of the first row.
+        commits: The records of committed rows, the newest first.
+        boot: What `boot_id` returned when the file was made.
     """
 
     identity: Identity
     capacity: int
     rows: int
     data_offset: int
+    commits: tuple[Commit, ...] = ()
+    boot: str = ""
+
+    @property
+    def certain(self) -> bool:
+        """Whether all rows that the file counts can be read: the machine has not been off since."""
+        if not self.commits:
+            return True
+        return self.rows == self.commits[0].rows and self.boot == boot_id() != ""
+
+
+def count_intact(path: Path, found: Inspection) -> int:
+    """Return how many rows of an unsealed partition file really are what was written.
+
+    Args:
+        path: The file.
+        found: What it says of itself.
+    """
+    row_nbytes = found.identity.field.nbytes
+    if not found.commits:
+        return found.rows
+    with open_partition(path) as file:
+        try:
+            intact = find_intact(file.fileno(), found.data_offset, row_nbytes, found.commits)
+        except OSError as error:
+            raise cannot_read(path, error) from error
+    if intact is None or intact.rows > found.capacity:
+        raise DatasetError(
+            f"{path} was changed or is damaged: its rows have other checksums than its records. "
+            "Restore it from a copy, or set it aside with `physx verify --repair`."
+        )
+    return intact.rows
 
 
 def partition_file(session: str, mode: str, field: str, index: int) -> str:
@@ -134,14 +178,21 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
     with h5py.File(
         image, "w", libver=("earliest", "v110"), alignment_threshold=2048, alignment_interval=_PAGE
     ) as file:
-        for name, value in identity.attributes.items():
+        for name, value in (identity.attributes | {"boot": boot_id()}).items():
             file.attrs[name] = value
-        scalar = h5s.create(h5s.SCALAR)
+        scalar, table = h5s.create(h5s.SCALAR), h5s.create_simple((RECORDS, len(Commit._fields)))
         counter = h5d.create(file.id, b"rows", h5t.STD_U64LE, scalar, layout)
         counter.write(h5s.ALL, h5s.ALL, np.array(rows, "<u8"))
+        records = h5d.create(file.id, b"commits", h5t.STD_U64LE, table, layout)
+        records.write(h5s.ALL, h5s.ALL, np.array([Commit.unchecked(rows)] * RECORDS, "<u8"))
         space = h5s.create_simple((capacity, *(field.shape or ())))
         data = h5d.create(file.id, b"data", kind, space, layout)
         rows_offset, data_offset = counter.get_offset(), data.get_offset() or 0
+        if (
+            records.get_offset() != rows_offset + COUNT.size
+            or rows_offset // SECTOR != (rows_offset + NBYTES - 1) // SECTOR
+        ):
+            raise RuntimeError("HDF5 has put the row count and the records into different sectors.")
     content = image.getvalue()
     size = max(len(content), data_offset + capacity * field.nbytes)
     return Header(content, rows_offset, data_offset, size)
@@ -251,7 +302,16 @@ def _inspection(content: Any) -> Inspection:
         capacity=data.shape[0],
         rows=min(int(counter[()]), data.shape[0]),
         data_offset=data_offset or 0,
+        commits=_commits(content) if version > 1 else (),
+        boot=str(attributes["boot"]) if version > 1 else "",
     )
+
+
+def _commits(content: Any) -> tuple[Commit, ...]:
+    records = _plain_dataset(content, "commits")
+    if records.shape != (RECORDS, len(Commit._fields)) or records.dtype != np.dtype("<u8"):
+        raise ValueError("its records do not have the shape or type of a partition's")
+    return tuple(Commit(*record) for record in records[()].tolist())
 
 
 def _plain_dataset(content: Any, name: str) -> Any:

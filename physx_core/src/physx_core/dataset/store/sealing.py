@@ -15,15 +15,19 @@ from physx_core.fields import Field
 from physx_core.statistics import RunningStatistics
 
 
-def seal(directory: Path, fields: Mapping[str, Field], partition: Partition) -> Partition:
+def seal(
+    directory: Path, fields: Mapping[str, Field], partition: Partition, *, rewrite: bool = False
+) -> Partition:
     """Rewrite a partition's files at their exact size, if they are not full, and checksum them.
 
-    If the process dies meanwhile, the files still hold all rows, some already in their final form.
+    Everything is on the disk when this returns. If the process dies meanwhile, the files still
+    hold all rows, some already in their final form.
 
     Args:
         directory: The dataset's folder.
         fields: The fields of the mode.
         partition: The partition; nothing writes to it any more.
+        rewrite: Whether to rewrite full files, too.
 
     Returns:
         The sealed partition, for the manifest.
@@ -32,11 +36,14 @@ def seal(directory: Path, fields: Mapping[str, Field], partition: Partition) -> 
     for name, field in fields.items():
         found = partition.inspect(directory, field)
         offsets[name] = found.data_offset
-        if found.capacity != partition.rows or found.rows != partition.rows:
-            path, identity = partition.path(directory, name), partition.identity(field)
+        path = partition.path(directory, name)
+        if rewrite or found.capacity != partition.rows or found.rows != partition.rows:
+            identity = partition.identity(field)
             offsets[name], _ = copy(path, found.data_offset, path, identity, partition.rows)
+        else:
+            files.sync_file(path)
     files.sync_folder(directory)
-    sealed = replace(partition, offsets=offsets, sealed=True, writing=False)
+    sealed = replace(partition, offsets=offsets, sealed=True, writing=False, follows=None)
     return scan(directory, fields, sealed)
 
 
@@ -59,6 +66,7 @@ def sync_files(directory: Path, fields: Mapping[str, Field], partition: Partitio
 
 
 def remove_files(directory: Path, fields: Mapping[str, Field], partition: Partition) -> None:
-    """Remove the files of a partition that the manifest no longer lists."""
+    """Remove the files of a partition that the manifest no longer lists, also from the disk."""
     for name in fields:
         files.remove(partition.path(directory, name))
+    files.sync_folder(directory)

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-import os
+import contextlib
+import errno
 import threading
+from pathlib import Path
+
+from physx_core import files
+from physx_core.dataset.store.partition_file import PartitionFile
 
 PERIOD = 1.0
 """Seconds between two syncs of the same file."""
@@ -18,37 +23,49 @@ class Syncer:
 
     def __init__(self, period: float = PERIOD) -> None:
         self._period = period
-        self._changed: dict[int, None] = {}
-        self._retired: list[int] = []
+        self._files: dict[PartitionFile, None] = {}
+        self._paths: dict[Path, None] = {}
         self._lock = threading.Lock()
         self._wake, self._end = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
         self._error: OSError | None = None
 
-    def note(self, descriptor: int) -> None:
-        """Schedule a file for the next sync."""
-        if descriptor not in self._changed:
+    def note(self, file: PartitionFile) -> None:
+        """Schedule an open partition file, whose rows are synced and marked."""
+        if file not in self._files:
             with self._lock:
-                self._changed[descriptor] = None
-            self._wake.set()
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="physx-sync", daemon=True)
-                self._thread.start()
+                self._files[file] = None
+            self._start()
+
+    def note_path(self, path: Path) -> None:
+        """Schedule a file by its path."""
+        if path not in self._paths:
+            with self._lock:
+                self._paths[path] = None
+            self._start()
 
     def check(self) -> None:
-        """Report a failure since the last call."""
-        if self._error is not None:
-            error, self._error = self._error, None
-            raise error
+        """Report the first failure of all.
 
-    def retire(self, descriptor: int) -> None:
-        """Close a file, after a last sync if it needs one."""
+        Once a sync has failed, nothing that was written before may be taken for stored.
+        """
+        if self._error is not None:
+            raise self._error
+
+    def sync(self) -> None:
+        """Sync everything that is scheduled now; a failure is reported by `check`."""
         with self._lock:
-            if descriptor in self._changed:
-                del self._changed[descriptor]
-                self._retired.append(descriptor)
-                return
-        os.close(descriptor)
+            opened, paths = list(self._files), list(self._paths)
+            self._files.clear()
+            self._paths.clear()
+        try:
+            for file in opened:
+                _sync_marked(file)
+            for path in paths:
+                with contextlib.suppress(FileNotFoundError):  # its partition has been removed
+                    files.sync_file(path)
+        except OSError as error:
+            self._error = self._error or error
 
     def close(self) -> None:
         """Sync everything that is left, and end the thread."""
@@ -57,28 +74,31 @@ class Syncer:
         if self._thread is not None:
             self._thread.join()
             self._thread = None
-        self._sync()
+        self.sync()
         self.check()
+
+    def _start(self) -> None:
+        self._wake.set()
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="physx-sync", daemon=True)
+            self._thread.start()
 
     def _run(self) -> None:
         while not self._end.is_set():
             self._wake.wait()
             self._wake.clear()
             if not self._end.wait(self._period):
-                self._sync()
+                self.sync()
 
-    def _sync(self) -> None:
-        with self._lock:
-            copies, self._retired = self._retired, []
-            try:
-                copies.extend(os.dup(descriptor) for descriptor in self._changed)
-            except OSError as error:
-                self._error = error
-            self._changed.clear()
-        for descriptor in copies:
-            try:
-                os.fdatasync(descriptor)
-            except OSError as error:
-                self._error = error
-            finally:
-                os.close(descriptor)
+
+def _sync_marked(file: PartitionFile) -> None:
+    """Sync a partition file with a mark of its newest commit."""
+    descriptor = file.mark()
+    if descriptor < 0:
+        return
+    try:
+        files.sync(descriptor)
+        if files.is_removed(descriptor):
+            raise files.RemovedError(errno.ENOENT, "it was removed", str(file.path))
+    finally:
+        files.close(descriptor)

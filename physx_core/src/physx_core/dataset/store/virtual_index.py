@@ -20,13 +20,14 @@ from physx_core.fields import Field
 FORMAT = "physx index"
 
 
-def write_index(directory: Path, session: str, manifest: Manifest) -> None:
+def write_index(directory: Path, session: str, manifest: Manifest, *, wait: bool = False) -> None:
     """Write the index of all rows that are sealed.
 
     Args:
         directory: The dataset's folder.
         session: Session that writes it; it gets an index even if it has no rows yet.
         manifest: The dataset's manifest.
+        wait: Whether to wait for the disk.
     """
     import h5py
 
@@ -39,7 +40,7 @@ def write_index(directory: Path, session: str, manifest: Manifest) -> None:
                 if field.shape is not None:
                     _add(group, mode, field)
     for name in {session, *manifest.sessions}:
-        files.replace(directory / f"{name}.h5", image.getvalue(), sync=False)
+        files.replace(directory / f"{name}.h5", image.getvalue(), wait=wait)
 
 
 def _add(group: Any, mode: Mode, field: Field) -> None:

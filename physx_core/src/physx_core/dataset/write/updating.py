@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from physx_core import files
 from physx_core.dataset.store.manifest import Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.write.row_validation import check_rows
-from physx_core.errors import FieldShapeError, MissingFieldError
+from physx_core.errors import DatasetError, FieldShapeError, MissingFieldError
 from physx_core.fields import Field
 from physx_core.rows import check_names
 from physx_core.typing import Array, Batch, Index
@@ -46,9 +46,18 @@ def check_update(
     return rows
 
 
+class Opened(Protocol):
+    """The partition that is being written."""
+
+    partition: Partition
+
+    def settle(self, names: Iterable[str], last: int) -> None:
+        """Prepare some fields for an update of rows up to `last`."""
+
+
 def update_rows(
-    store: ManifestStore, mode_name: str, index: Index, rows: Batch, *, durable: bool
-) -> None:
+    store: ManifestStore, mode_name: str, index: Index, rows: Batch, opened: Opened | None
+) -> set[Path]:
     """Overwrite rows; sealed partitions lose their checksums until the dataset is closed.
 
     Args:
@@ -56,39 +65,51 @@ def update_rows(
         mode_name: Name of the mode.
         index: Numbers of the rows, all in range.
         rows: Field name to new rows, checked.
-        durable: Whether to wait for the disk.
+        opened: The partition of the mode that is being written.
+
+    Returns:
+        The files that were written to.
     """
     mode = store.manifest.modes[mode_name]
     starts = np.cumsum([0, *(partition.rows for partition in mode.partitions)])
     owners = np.searchsorted(starts, index, side="right") - 1
     touched = [mode.partitions[owner] for owner in np.unique(owners)]
     _invalidate(store, mode_name, touched)
+    updated = set()
     for place in map(mode.place, touched):
         partition = mode.partitions[place]
         here = np.flatnonzero(owners == place)
+        places = index[here] - starts[place]
+        if opened is not None and partition is opened.partition:
+            opened.settle(rows, int(places.max()))
+        elif not partition.sealed:
+            raise DatasetError(
+                f"Partition {partition.index} of mode {mode_name!r} could not be sealed. Free some "
+                "space on the disk and open the dataset again before you update its rows."
+            )
         for name, block in rows.items():
-            path, offset = partition.path(store.directory, name), partition.offsets.get(name)
-            if offset is None or not (partition.sealed or partition.writing):
-                offset = partition.inspect(store.directory, mode.fields[name]).data_offset
-            _write(path, offset, index[here] - starts[place], block[here], durable=durable)
+            path = partition.path(store.directory, name)
+            updated.add(path)
+            _write(path, partition.offsets[name], places, block[here])
+    return updated
 
 
 def _invalidate(store: ManifestStore, mode_name: str, touched: list[Partition]) -> None:
     """Drop, before anything is written, the checksums and statistics of the rows."""
-    mode = store.manifest.modes[mode_name]
     for partition in touched:
         partition.running = {}
-    if any(partition.checksums or partition.counted for partition in touched):
+    sealed = [partition for partition in touched if partition.checksums or partition.counted]
+    if sealed:
         with store.change() as manifest:
             mode = manifest.modes[mode_name]
-            if any(partition.counted for partition in touched):
+            if any(partition.counted for partition in sealed):
                 mode.forget_statistics()
-            for partition in touched:
+            for partition in sealed:
                 mode.swap(replace(partition, checksums={}, counted=False))
     store.manifest.generation += 1
 
 
-def _write(path: Path, offset: int, places: Index, rows: Array, *, durable: bool) -> None:
+def _write(path: Path, offset: int, places: Index, rows: Array) -> None:
     """Write rows to places counted from `offset`, consecutive ones at once."""
     row_nbytes = rows[:1].nbytes
     descriptor = files.open_regular(path, os.O_WRONLY)
@@ -96,10 +117,8 @@ def _write(path: Path, offset: int, places: Index, rows: Array, *, durable: bool
         for first, last in _runs(places) if row_nbytes else ():
             place = offset + int(places[first]) * row_nbytes
             files.write_at(descriptor, files.as_bytes(rows[first:last]), place)
-        if durable:
-            os.fdatasync(descriptor)
     finally:
-        os.close(descriptor)
+        files.close(descriptor)
 
 
 def _runs(places: Index) -> Iterator[tuple[int, int]]:

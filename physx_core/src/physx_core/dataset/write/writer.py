@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +20,10 @@ from physx_core.dataset.store.partition_file import PartitionFile
 from physx_core.dataset.store.sealing import remove_files, seal
 from physx_core.dataset.store.syncing import Syncer
 from physx_core.dataset.store.virtual_index import write_index
+from physx_core.dataset.write.updating import update_rows
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
-from physx_core.typing import Batch
+from physx_core.typing import Batch, Index
 
 _HEADER = 2**14
 
@@ -54,41 +55,52 @@ class OpenPartition:
 
     def append(self, rows: Batch, start: int, count: int) -> None:
         """Write and commit rows `start` to `start + count` of a block; all of them, or none."""
-        if self._syncer is not None:
-            self._syncer.check()
+        parts, durable = self._files.values(), self._syncer is None
         first = self.partition.rows
         last = first + count
-        for file in self._files.values():
+        for file in parts:
             file.reserve(last)
         for name, file in self._files.items():
             file.write(first, rows[name][start : start + count])
-        self._wait()
         try:
-            for file in self._files.values():
-                file.commit(last)
-            self._wait()
+            for file in parts:
+                file.commit(last, durable=durable)
+            if durable:
+                self._sync()
         except BaseException:  # an interrupt, too: the next rows go to the same offsets
-            for file in self._files.values():
-                file.commit(first)
+            for file in parts:
+                file.withdraw(durable=durable)
             raise
-        self.partition.rows = last
-        if self._syncer is not None:
-            for file in self._files.values():
-                self._syncer.note(file.descriptor)
+        try:
+            self._accept(last)
+        except BaseException:
+            self._accept(last)
+            raise
+
+    def settle(self, names: Iterable[str], last: int) -> None:
+        """Prepare some fields for an update of rows up to `last`."""
+        for name in names:
+            if last >= self._files[name].committed.base:
+                self._files[name].settle()
 
     def close(self) -> None:
-        """Close the files, immediately or after their last sync."""
+        """Close the files; the syncer syncs them once more."""
         for file in self._files.values():
+            file.close()
             if self._syncer is not None:
-                self._syncer.retire(file.hand_over())
-            else:
-                file.close()
+                self._syncer.note_path(file.path)
 
-    def _wait(self) -> None:
-        """Wait for the disk, unless a syncer does."""
-        if self._syncer is None:
+    def _accept(self, rows: int) -> None:
+        for file in self._files.values():
+            file.accept(durable=self._syncer is None)
+        self.partition.rows = rows
+        if self._syncer is not None:
             for file in self._files.values():
-                file.sync()
+                self._syncer.note(file)
+
+    def _sync(self) -> None:
+        for file in self._files.values():
+            file.sync()
 
 
 class Writer:
@@ -122,6 +134,7 @@ class Writer:
         self._syncer = None if durable else Syncer()
         self._reader = Reader(store.directory, store.manifest)
         self._open: dict[str, OpenPartition] = {}
+        self._filled: dict[str, Partition] = {}
         self._sealing: deque[Future[Partition]] = deque()
         self._sealed: list[Partition] = []
         self._sealer = ThreadPoolExecutor(1, "physx-seal")
@@ -134,12 +147,12 @@ class Writer:
             rows: Field name to checked rows.
             count: How many rows there are.
         """
-        if self._sealing:
-            with contextlib.suppress(OSError):  # noted later; storing the rows fails, too
-                self._collect(wait=False)
         done = 0
         while done < count:
             try:
+                self._check()
+                if self._sealing:
+                    self._collect(wait=False)
                 partition = self._open.get(mode_name)
                 if partition is None or not partition.free:
                     if partition is not None:
@@ -149,9 +162,29 @@ class Writer:
                 partition.append(rows, done, part)
                 done += part
             except OSError as error:
+                self._note(error)
                 what = f"{count - done} of {count} rows of mode {mode_name!r}"
                 safe = f"The {self.store.manifest.modes[mode_name].rows} samples before them"
                 raise files.storage_error(what, error, safe) from error
+
+    def update(self, mode_name: str, index: Index, rows: Batch) -> None:
+        """Overwrite rows in place.
+
+        Args:
+            mode_name: Name of the mode.
+            index: Numbers of the rows, all in range.
+            rows: Field name to new rows, checked.
+        """
+        self.wait()
+        with self.store.syncing():
+            self._check()
+            opened = self._open.get(mode_name)
+            updated = update_rows(self.store, mode_name, index, rows, opened)
+            for path in updated:
+                if self._syncer is not None:
+                    self._syncer.note_path(path)
+                else:
+                    files.sync_file(path)
 
     def refresh(self) -> None:
         """Learn what other writers have committed."""
@@ -173,10 +206,11 @@ class Writer:
         """Seal what is open, write manifest and index, and release the lock.
 
         On a full disk the last partitions remain unsealed: all their rows can be read, and the
-        next writer seals them.
+        next writer seals them. So do those of a disk that has failed.
         """
         try:
             with files.storing("The dataset's last partition"):
+                self._check()
                 for mode_name in list(self._open):
                     self._retire(mode_name)
                 self._collect(wait=True)
@@ -197,12 +231,25 @@ class Writer:
             finally:
                 files.close(self._lock)
 
+    def _check(self) -> None:
+        """Refuse to go on after a sync has failed."""
+        if self._syncer is not None:
+            self._syncer.check()
+        if self.store.failure is not None:
+            raise self.store.failure
+
+    def _note(self, error: OSError) -> None:
+        """Remember that a sync has failed."""
+        if self.store.failure is None and isinstance(error, files.SyncError):
+            self.store.failure = error
+
     def _retire(self, mode_name: str) -> None:
         """Close the open partition of a mode and have it sealed in the background."""
         opened = self._open.pop(mode_name)
         entry = opened.partition
         entry.writing = not opened.free  # one that is full keeps its files as they are
         opened.close()
+        self._filled[mode_name] = entry
         fields = self.store.manifest.modes[mode_name].fields
         work = self._sealer.submit(_seal, self._directory, fields, replace(entry))
         self._sealing.append(work)
@@ -210,7 +257,12 @@ class Writer:
     def _collect(self, *, wait: bool) -> None:
         """Note in the manifest which partitions have been sealed."""
         while self._sealing and (wait or self._sealing[0].done()):
-            self._sealed.append(self._sealing.popleft().result())
+            try:
+                self._sealed.append(self._sealing.popleft().result())
+            except OSError as error:
+                self._note(error)
+                if wait or error.errno not in files.FULL:
+                    raise
         if not self._sealed:
             return
         with self.store.change() as manifest:
@@ -237,12 +289,14 @@ class Writer:
                 capacity = max(1, self._max_nbytes // row_nbytes)
                 entry = self.new_partition(mode_name, mode)
                 entry.writing = True
+                entry.follows = self._find_unsealed_before(mode_name, mode)
                 for name, field in mode.fields.items():
                     identity = entry.identity(field)
                     parts[name] = PartitionFile.create(self._directory, identity, capacity)
                     entry.offsets[name] = parts[name].data_offset
                 for part in parts.values():
                     part.publish()
+                files.sync_folder(self._directory)
                 mode.partitions.append(entry)
         except BaseException:
             for part in parts.values():
@@ -259,6 +313,14 @@ class Writer:
             entry = replace(entry, index=entry.index + 1)
         return entry
 
+    def _find_unsealed_before(self, mode_name: str, mode: Mode) -> tuple[int, int] | None:
+        """Return number and rows of the partition before a new one, if it is still unsealed."""
+        before = self._filled.get(mode_name)
+        if before is None:
+            return None
+        listed = any(p.key == before.key and not p.sealed for p in mode.partitions)
+        return (before.index, before.rows) if listed else None
+
     def _complete(self) -> None:
         """Compute what is missing: checksums of updated partitions, statistics, the index."""
         if self.store.shared:
@@ -272,7 +334,7 @@ class Writer:
                     compute_statistics(self._reader, name)
         if changed:
             manifest_file.save(self._directory, manifest)
-        write_index(self._directory, self.session, manifest)
+        write_index(self._directory, self.session, manifest, wait=True)
 
 
 def _seal(directory: Path, fields: Mapping[str, Field], partition: Partition) -> Partition:
