@@ -50,14 +50,14 @@ def storage_error(
     """
     if isinstance(error, SyncError):
         return DatasetError(
-            f"{what} cannot be stored: the disk has failed ({error.strerror}), and rows of the last "
-            "seconds may be lost. Close the dataset and open it again: it then has all rows that "
-            "are intact."
+            f"{what} cannot be stored: the disk has failed ({error.strerror}), and rows of the "
+            "last seconds may be lost. Close the dataset and open it again: it then has all rows "
+            "that are intact."
         )
     if isinstance(error, RemovedError):
         return DatasetError(
-            f"{what} cannot be stored: {error.filename} was removed while it was being written, and "
-            "the rows in it are lost."
+            f"{what} cannot be stored: {error.filename} was removed while it was being written, "
+            "and the rows in it are lost."
         )
     full = error.errno in FULL
     reason = "the disk is full" if full else (error.strerror or str(error))
@@ -135,6 +135,11 @@ def read_blocks(path: Path, nbytes: int = 2**18) -> Iterator[memoryview]:
             yield buffer[:count]
     finally:
         os.close(descriptor)
+
+
+def read_head(descriptor: int, limit: int) -> bytes:
+    """Return the first bytes of an open file, at most `limit`."""
+    return os.pread(descriptor, limit, 0)
 
 
 def write_at(descriptor: int, content: bytes | memoryview, offset: int) -> None:

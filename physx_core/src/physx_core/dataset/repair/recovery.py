@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import chain
@@ -15,9 +16,9 @@ from physx_core.dataset.store.definitions import compare_fields
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition_format import (
     FORMAT,
-    UNREADABLE,
+    MAGIC,
+    SIGNATURE,
     Inspection,
-    count_intact,
     inspect,
     open_partition,
 )
@@ -73,6 +74,9 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
             count_rows(directory, manifest)
         if _state(directory) == before:  # otherwise a writer has replaced it meanwhile
             break
+    for partition in chain.from_iterable(mode.partitions for mode in manifest.modes.values()):
+        if partition.problem:
+            warnings.warn(f"{directory}: {_label(partition)}: {partition.problem}", stacklevel=3)
     return manifest
 
 
@@ -106,11 +110,9 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
     done = []
     for draft in chain(directory.glob("*.h5.tmp"), directory.glob(manifest_file.FILE + ".tmp")):
         files.remove(draft)
-    for name, mode in manifest.modes.items():
+    for mode in manifest.modes.values():
         for partition in [p for p in mode.partitions if not p.sealed]:
-            label = f"Partition {partition.index} of session {partition.session!r}"
-            what = _close(directory, mode, partition)
-            done.append(f"{label} and mode {name!r} {what}")
+            done.append(f"{_label(partition)} {_close(directory, mode, partition)}")
     if complete_checksums(directory, manifest):
         done.append("Rows were being updated in place: their checksums have been recomputed.")
     if any(mode.dropped for mode in manifest.modes.values()):
@@ -120,9 +122,15 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
     return done + _clear_unlisted(directory, manifest)
 
 
+def _label(partition: Partition) -> str:
+    return (
+        f"Partition {partition.index} of session {partition.session!r} and mode {partition.mode!r}"
+    )
+
+
 def _close(directory: Path, mode: Mode, partition: Partition) -> str:
     """Seal an open partition whose writer is gone, or remove it; return what was done."""
-    lost = _count_lost(directory, mode, partition)
+    lost = partition.problem
     if lost:  # the files are kept as they are
         keep(directory, [partition.path(directory, name) for name in mode.fields])
     if partition.rows:
@@ -133,18 +141,8 @@ def _close(directory: Path, mode: Mode, partition: Partition) -> str:
         mode.dropped.append(partition)
         what = "had no committed row and has been removed."
     if lost:
-        what += f" {lost} Its files are kept in {directory / FOLDER}."
+        what += f" {lost} Its files, as they were, are in {directory / FOLDER}."
     return what
-
-
-def _count_lost(directory: Path, mode: Mode, partition: Partition) -> str:
-    """Return which rows of an open partition cannot be used; empty if all can."""
-    if partition.problem:
-        return partition.problem
-    counted = min(partition.inspect(directory, field).rows for field in mode.fields.values())
-    if counted == partition.rows:
-        return ""
-    return f"{counted - partition.rows} rows behind them did not reach the disk."
 
 
 def _clear_dropped(directory: Path, manifest: Manifest) -> None:
@@ -201,25 +199,36 @@ def count_rows(directory: Path, manifest: Manifest, *, thorough: bool = False) -
 
 
 def _count_open(directory: Path, mode: Mode, partition: Partition, thorough: bool) -> None:
-    """Count the rows of an open partition that are committed in all its files.
+    """Count the rows of an open partition that can be read in all its files.
 
-    The headers of the files are on the disk before the manifest lists them. Should one be missing
-    or unreadable nevertheless, the partition has no rows, and the others are not affected.
+    The headers of the files are on the disk before the manifest lists them, and thus before any row
+    is committed. A partition that has none in any file does not bar the mode, whatever it lacks.
     """
-    rows, partition.problem = [], ""
+    counted, rows, unreadable = [], [], None
     for name, field in mode.fields.items():
         path = partition.path(directory, name)
         try:
-            found = partition.inspect(directory, field)
+            found, count = partition.count(directory, field, thorough=thorough)
         except DatasetError as error:
-            partition.rows, partition.problem = 0, str(error)
-            return
+            unreadable = error
+            continue
         have = found.identity.field
         if have != field and field.shape is not None:
             raise DatasetError(f"{path} holds {have}, but the dataset says {field}.")
-        certain = found.certain and not thorough
-        rows.append(found.rows if certain else count_intact(path, found))
-    partition.rows = min(rows)
+        if count is None:
+            raise DatasetError(
+                f"{path} was changed or is damaged: its rows do not have the checksums of its "
+                "records. Restore it from a copy, or set it aside with `physx verify --repair`."
+            )
+        counted.append(found.rows)
+        rows.append(count)
+    if unreadable is not None and any(counted):
+        raise unreadable
+    partition.rows = 0 if unreadable is not None else min(rows)
+    missing = min(counted, default=0) - partition.rows
+    partition.problem = f"The last {missing} rows of it did not reach the disk." if missing else ""
+    if unreadable is not None:
+        partition.problem = str(unreadable)
 
 
 def _discard_behind_lost_rows(mode: Mode) -> None:
@@ -231,7 +240,8 @@ def _discard_behind_lost_rows(mode: Mode) -> None:
         if partition.follows is not None and not partition.sealed:
             index, rows = partition.follows
             key = partition.session, index
-            if any(p.key == key and p.rows < rows for p in mode.partitions):
+            if any(p.key == key and p.rows < rows for p in mode.partitions) and partition.rows:
+                partition.problem = "It comes after rows that did not reach the disk."
                 partition.rows = 0
 
 
@@ -239,7 +249,7 @@ def _is_partition(path: Path) -> bool:
     """Return whether a file claims to be a partition, judging by its first bytes."""
     try:
         with open_partition(path) as file:
-            return FORMAT.encode() in (file.read(2**14) or b"")
+            return MAGIC in (file.read(2**14) or b"")
     except DatasetError:  # a link, a pipe, or no permission to read it
         return False
 
@@ -304,7 +314,11 @@ def _role(item: tuple[str, Inspection]) -> tuple[bool, str]:
 
 def _unlisted(directory: Path, manifest: Manifest) -> list[Path]:
     known = manifest.file_names | {f"{session}.h5" for session in manifest.sessions}
-    return [path for path in sorted(directory.glob("*.h5")) if path.name not in known]
+    return [
+        path
+        for path in sorted(directory.glob("*.h5"))
+        if path.name not in known and _NAME.fullmatch(path.name)
+    ]
 
 
 def _is_torn(path: Path) -> bool:
@@ -317,13 +331,12 @@ def _is_torn(path: Path) -> bool:
 
 
 def _is_foreign(path: Path) -> bool:
-    """Return whether a file is not a partition, by its name or because it is other, sound HDF5."""
-    import h5py
-
+    """Return whether a file is not a partition, by its name or because it is other HDF5."""
     if not _NAME.fullmatch(path.name):
         return True
     try:
-        with open_partition(path) as raw, h5py.File(raw, "r") as file:
-            return bool(file.attrs.get("format") != FORMAT)
-    except (DatasetError, *UNREADABLE):
+        with open_partition(path) as file:
+            head = file.read(2**14) or b""
+    except DatasetError:
         return False
+    return head.startswith(SIGNATURE) and not (MAGIC in head or FORMAT.encode() in head)

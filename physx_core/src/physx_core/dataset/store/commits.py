@@ -58,6 +58,12 @@ def encode(commit: Commit) -> bytes:
     return COUNT.pack(commit.rows) + RECORD.pack(*commit) * RECORDS
 
 
+def decode(content: bytes) -> tuple[int, tuple[Commit, ...]]:
+    """Return the row count and the records, the newest first."""
+    records = RECORD.iter_unpack(content[COUNT.size :])
+    return COUNT.unpack_from(content)[0], tuple(Commit(*record) for record in records)
+
+
 def find_intact(
     descriptor: int, data_offset: int, row_nbytes: int, commits: Iterable[Commit]
 ) -> Commit | None:

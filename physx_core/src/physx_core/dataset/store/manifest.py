@@ -15,7 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset.store.partition_format import Identity, Inspection, inspect, partition_file
+from physx_core.dataset.store.partition_format import (
+    Identity,
+    Inspection,
+    count_rows,
+    inspect,
+    partition_file,
+)
 from physx_core.dataset.store.segment import Segment
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.fields import RESERVED, Field
@@ -40,7 +46,7 @@ class Partition:
         writing: Whether this process writes it, so that `offsets` are right though not sealed.
         follows: While it is not sealed, number of the partition that its writer filled before it,
             and how many rows that one got: without all of these, its own rows do not count.
-        problem: Why it counts no rows, if a file of it cannot be read; not stored.
+        problem: Why rows of it cannot be read though its files count them; not stored.
         running: Statistics of its first rows while it is not counted, by field; not stored.
     """
 
@@ -78,6 +84,11 @@ class Partition:
     def inspect(self, directory: Path, of: Field) -> Inspection:
         """Return what a field's file says of itself."""
         return inspect(self.path(directory, of.name), self.offsets.get(of.name), of.nbytes)
+
+    def count(self, directory: Path, of: Field, *, thorough: bool) -> tuple[Inspection, int | None]:
+        """Return what a field's file says of itself, and how many of its rows can be read."""
+        path, offset = self.path(directory, of.name), self.offsets.get(of.name)
+        return count_rows(path, offset, of.nbytes, thorough=thorough)
 
     def segment(self, directory: Path, of: Field, start: int = 0) -> Segment:
         """Return the rows of a field, of which the first is row `start` of the mode."""

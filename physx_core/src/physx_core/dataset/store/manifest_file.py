@@ -16,7 +16,8 @@ from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
 from physx_core.dataset.store.manifest import Manifest
-from physx_core.dataset.store.manifest_parsing import parse_manifest, whole
+from physx_core.dataset.store.manifest_parsing import parse_manifest
+from physx_core.dataset.store.validation import whole
 from physx_core.errors import ConfigError, DatasetError
 
 FILE = "dataset.json"

@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
+from physx_core.dataset.store.validation import (
+    SESSION,
+    checked,
+    parse_field,
+    parse_name,
+    whole,
+)
 from physx_core.fields import Field
 from physx_core.statistics import RunningStatistics
-
-SESSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}")
-"""What file names can begin with; no path can be built from it."""
-
-_MOST = 2**62
-_WIDEST_ROW = 2**40
-_MOST_AXES = 32
-_LONGEST_NAME = 200
-
-T = TypeVar("T")
 
 
 def parse_manifest(plain: Mapping[str, Any]) -> Manifest:
     """Return the manifest that plain data of format version 1 describe."""
     modes = {
-        _name(name, "a mode"): _mode(name, mode)
+        parse_name(name, "a mode"): _mode(name, mode)
         for name, mode in checked(dict, plain["modes"], "'modes'").items()
     }
     versions = checked(dict, plain["versions"], "'versions'")
@@ -36,24 +31,10 @@ def parse_manifest(plain: Mapping[str, Any]) -> Manifest:
     return Manifest(modes, checked(dict, plain["info"], "'info'"), versions)
 
 
-def checked(kind: type[T], value: Any, what: str) -> T:
-    """Return a value that is of exactly one type."""
-    if type(value) is not kind:
-        raise ValueError(f"{what} cannot be {value!r:.60}")
-    return value
-
-
-def whole(value: Any, what: str, most: int = _MOST) -> int:
-    """Return an integer between 0 and `most`."""
-    if not 0 <= checked(int, value, what) <= most:
-        raise ValueError(f"{what} cannot be {value!r:.60}")
-    return int(value)
-
-
 def _mode(mode_name: str, plain: Any) -> Mode:
     fields: dict[str, Field] = {}
     for entry in plain["fields"]:
-        field = _field(entry)
+        field = parse_field(entry)
         if field.name in fields:
             raise ValueError(f"the field {field.name!r} is listed twice")
         fields[field.name] = field
@@ -70,21 +51,6 @@ def _mode(mode_name: str, plain: Any) -> Mode:
     whole(mode.rows, "the number of rows")
     _add_statistics(mode, checked(dict, plain["normalization"], "'normalization'"))
     return mode
-
-
-def _field(plain: Any) -> Field:
-    name, shape, role = _name(plain["name"], "a field"), plain.get("shape"), plain["role"]
-    if shape is not None:
-        if len(checked(list, shape, f"the shape of {name!r}")) > _MOST_AXES:
-            raise ValueError(f"the shape of {name!r} cannot be {shape!r:.60}")
-        shape = tuple(whole(count, f"the shape of {name!r}") for count in shape)
-    if role not in ("training", "additional"):
-        raise ValueError(f"the role of {name!r} cannot be {role!r:.60}")
-    unit = checked(str, plain.get("unit", ""), f"the unit of {name!r}")
-    field = Field(name, shape, checked(str, plain["dtype"], f"the type of {name!r}"), unit, role)
-    if math.prod(shape or ()) * np.dtype(field.dtype).itemsize > _WIDEST_ROW:
-        raise ValueError(f"the shape of {name!r} cannot be {shape!r:.60}")
-    return field
 
 
 def _partition(mode_name: str, plain: Any, fields: Mapping[str, Field]) -> Partition:
@@ -141,10 +107,3 @@ def _add_statistics(mode: Mode, plain: Mapping[str, Any]) -> None:
     have = (mode.statistics.get(name) for name in mode.counted_fields)
     if any((statistics.count if statistics else 0) != counted for statistics in have):
         mode.forget_statistics()
-
-
-def _name(value: Any, what: str) -> str:
-    name = checked(str, value, f"the name of {what}")
-    if not name.isidentifier() or len(name) > _LONGEST_NAME:
-        raise ValueError(f"the name of {what} cannot be {name!r:.60}")
-    return name

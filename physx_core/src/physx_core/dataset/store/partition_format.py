@@ -1,22 +1,24 @@
 """The partition file: an ordinary HDF5 file whose rows are written without HDF5.
 
-It holds three contiguous datasets: ``data`` (capacity, *field shape), the scalar ``rows``, the
+It holds contiguous datasets: ``data`` (capacity, *field shape), the scalar ``rows``, the
 number of committed rows, and ``commits``, the records that tell which rows have reached the disk.
-Its attributes say what it is part of. h5py makes the header once, in memory; from then on rows are
-written at known offsets of the file, so that HDF5 never runs while samples arrive, and h5py can
-open the file at any moment.
+Its attributes say what it is part of; ``header`` says it again, with a digest of everything that
+never changes. h5py makes all of it once, in memory; from then on rows are written at known offsets
+of the file, so that HDF5 never runs while samples arrive, and h5py can open the file at any moment.
 """
 
 from __future__ import annotations
 
 import errno
 import io
+import json
 import os
+import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from xxhash import xxh3_64_intdigest
 
 from physx_core import files
 from physx_core.dataset.store.commits import (
@@ -26,22 +28,30 @@ from physx_core.dataset.store.commits import (
     SECTOR,
     Commit,
     boot_id,
+    decode,
+    encode,
     find_intact,
 )
+from physx_core.dataset.store.validation import SESSION, checked, parse_field, parse_name, whole
 from physx_core.errors import DatasetError, PhysxError
 from physx_core.fields import Field
 
 FORMAT = "physx partition"
 VERSION = 2
-READABLE = (1, 2)
-"""Versions of the partition file that can be read; those of version 1 have no ``commits``."""
-UNREADABLE = (
-    OSError, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError,
-    MemoryError,
-)  # fmt: skip
-"""What h5py raises for damaged files."""
+READABLE = (2,)
+"""Versions of the partition file that can be read."""
+MAGIC = b"\x89physx\r\n"
+"""Beginning of the dataset ``header``, which tells physx what it needs without HDF5."""
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _PAGE = 4096
+_NUMBERS = struct.Struct("<5QI")  # digest and size of the header, offsets, capacity, length of text
+_COMMON_HEADER = 2**14
+_LARGEST_HEADER = 2**20
+_INVALID = (
+    OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError,
+    MemoryError, struct.error, PhysxError,
+)  # fmt: skip
+"""What reading and parsing raise for bytes that are not a header."""
 _END_OF_FILE = 40  # where the file's size stands in an HDF5 superblock of version 0
 
 
@@ -118,38 +128,13 @@ class Inspection:
     capacity: int
     rows: int
     data_offset: int
-    commits: tuple[Commit, ...] = ()
-    boot: str = ""
+    commits: tuple[Commit, ...]
+    boot: str
 
     @property
     def certain(self) -> bool:
         """Whether all rows that the file counts can be read: the machine has not been off since."""
-        if not self.commits:
-            return True
         return self.rows == self.commits[0].rows and self.boot == boot_id() != ""
-
-
-def count_intact(path: Path, found: Inspection) -> int:
-    """Return how many rows of an unsealed partition file really are what was written.
-
-    Args:
-        path: The file.
-        found: What it says of itself.
-    """
-    row_nbytes = found.identity.field.nbytes
-    if not found.commits:
-        return found.rows
-    with open_partition(path) as file:
-        try:
-            intact = find_intact(file.fileno(), found.data_offset, row_nbytes, found.commits)
-        except OSError as error:
-            raise cannot_read(path, error) from error
-    if intact is None or intact.rows > found.capacity:
-        raise DatasetError(
-            f"{path} was changed or is damaged: its rows have other checksums than its records. "
-            "Restore it from a copy, or set it aside with `physx verify --repair`."
-        )
-    return intact.rows
 
 
 def partition_file(session: str, mode: str, field: str, index: int) -> str:
@@ -178,24 +163,35 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
     with h5py.File(
         image, "w", libver=("earliest", "v110"), alignment_threshold=2048, alignment_interval=_PAGE
     ) as file:
-        for name, value in (identity.attributes | {"boot": boot_id()}).items():
+        for name, value in identity.attributes.items():
             file.attrs[name] = value
+        description = _describe(identity)
+        block = len(MAGIC) + _NUMBERS.size + len(description)
         scalar, table = h5s.create(h5s.SCALAR), h5s.create_simple((RECORDS, len(Commit._fields)))
         counter = h5d.create(file.id, b"rows", h5t.STD_U64LE, scalar, layout)
-        counter.write(h5s.ALL, h5s.ALL, np.array(rows, "<u8"))
         records = h5d.create(file.id, b"commits", h5t.STD_U64LE, table, layout)
-        records.write(h5s.ALL, h5s.ALL, np.array([Commit.unchecked(rows)] * RECORDS, "<u8"))
+        own = h5d.create(file.id, b"header", h5t.STD_U8LE, h5s.create_simple((block,)), layout)
         space = h5s.create_simple((capacity, *(field.shape or ())))
         data = h5d.create(file.id, b"data", kind, space, layout)
         rows_offset, data_offset = counter.get_offset(), data.get_offset() or 0
-        if (
-            records.get_offset() != rows_offset + COUNT.size
-            or rows_offset // SECTOR != (rows_offset + NBYTES - 1) // SECTOR
-        ):
-            raise RuntimeError("HDF5 has put the row count and the records into different sectors.")
-    content = image.getvalue()
+        own_offset, records_offset = own.get_offset(), records.get_offset()
+    if (
+        records_offset != rows_offset + COUNT.size
+        or rows_offset // SECTOR != (rows_offset + NBYTES - 1) // SECTOR
+    ):
+        raise RuntimeError("HDF5 has put the row count and the records into different sectors.")
+    content = bytearray(image.getvalue())
+    content[rows_offset : rows_offset + NBYTES] = encode(Commit.unchecked(rows))
+    nbytes, numbers = len(content), (rows_offset, data_offset, capacity, len(description))
+    for digest in (0, None):
+        if digest is None:
+            digest = _digest_header(
+                content, own_offset, rows_offset, data_offset, capacity * field.nbytes
+            )
+        filled = MAGIC + _NUMBERS.pack(digest, nbytes, *numbers) + description
+        content[own_offset : own_offset + block] = filled
     size = max(len(content), data_offset + capacity * field.nbytes)
-    return Header(content, rows_offset, data_offset, size)
+    return Header(bytes(content), rows_offset, data_offset, size)
 
 
 def inspect(path: Path, offset: int | None = None, row_nbytes: int = 0) -> Inspection:
@@ -208,6 +204,38 @@ def inspect(path: Path, offset: int | None = None, row_nbytes: int = 0) -> Inspe
     """
     with open_partition(path) as file:
         return inspect_open(file, path, offset, row_nbytes)
+
+
+def count_rows(
+    path: Path, offset: int | None, row_nbytes: int, *, thorough: bool
+) -> tuple[Inspection, int | None]:
+    """Read what an unsealed partition file says of itself, and count the rows that can be read.
+
+    The count is None if the file was changed: its rows have the digests of none of its records.
+
+    Args:
+        path: The file.
+        offset: Where its rows begin, if that is known; only for error messages.
+        row_nbytes: Bytes of one row, likewise.
+        thorough: Whether to compare the rows with the file's digests in any case; otherwise only if
+            the machine has been off since they were written.
+    """
+    with open_partition(path) as file:
+        before = None
+        while True:
+            found = inspect_open(file, path, offset, row_nbytes)
+            if found.certain and not thorough:
+                return found, found.rows
+            nbytes = found.identity.field.nbytes
+            try:
+                intact = find_intact(file.fileno(), found.data_offset, nbytes, found.commits)
+            except OSError as error:
+                raise cannot_read(path, error) from error
+            if intact is not None and intact.rows <= found.capacity:
+                return found, intact.rows
+            if found == before:
+                return found, None
+            before = found  # a writer may have updated rows meanwhile
 
 
 def open_partition(path: Path) -> io.FileIO:
@@ -234,15 +262,13 @@ def inspect_open(
     file: io.FileIO, path: Path, offset: int | None = None, row_nbytes: int = 0
 ) -> Inspection:
     """Return the header of an open partition file, as `inspect` does."""
-    import h5py
-
     _check_superblock(file, path, offset, row_nbytes)
     try:
-        with h5py.File(file, "r") as content:
-            found = _inspection(content)
-    except (*UNREADABLE, PhysxError) as error:
-        raise DatasetError(f"{path} is damaged or not a dataset's partition: {error}.") from error
-    size, field = os.fstat(file.fileno()).st_size, found.identity.field
+        found = _parse_header(_read_header(file.fileno()))
+    except _INVALID as error:
+        reason = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
+        raise DatasetError(f"{path} is damaged or not a dataset's partition: {reason}.") from error
+    size, field = files.size(file.fileno()), found.identity.field
     expected = found.data_offset + found.capacity * field.nbytes
     if size < expected:
         raise truncated(path, size, expected, found.data_offset, field.nbytes)
@@ -268,62 +294,84 @@ def _check_superblock(file: io.FileIO, path: Path, offset: int | None, row_nbyte
         raise truncated(path, actual, expected, _PAGE if offset is None else offset, row_nbytes)
 
 
-def _inspection(content: Any) -> Inspection:
-    attributes = content.attrs
-    if attributes["format"] != FORMAT:
-        raise ValueError(f"its format is {attributes['format']!r}, not {FORMAT!r}")
-    version = int(attributes["format_version"])
+def _describe(identity: Identity) -> bytes:
+    plain = {
+        "format": FORMAT,
+        "format_version": VERSION,
+        "session": identity.session,
+        "mode": identity.mode,
+        "field": identity.field.to_dict(),
+        "partition": identity.index,
+        "first_row": identity.first_row,
+        "boot": boot_id(),
+    }
+    return json.dumps(plain).encode()
+
+
+def _read_header(descriptor: int) -> bytes:
+    """Return the first bytes of a file, enough for its header."""
+    head = files.read_head(descriptor, _COMMON_HEADER)
+    start = head.find(MAGIC) + len(MAGIC)
+    if start < len(MAGIC) or start + _NUMBERS.size > len(head):
+        return head
+    nbytes = _NUMBERS.unpack_from(head, start)[1]
+    return (
+        head if nbytes <= len(head) else files.read_head(descriptor, min(nbytes, _LARGEST_HEADER))
+    )
+
+
+def _parse_header(head: bytes) -> Inspection:
+    """Return what the first bytes of a file say of it.
+
+    HDF5 itself never sees them: what a power cut leaves of a header may let it loop for ever.
+    """
+    start = head.find(MAGIC)
+    if start < 0:
+        raise ValueError("it has no header of physx")
+    numbers = _NUMBERS.unpack_from(head, start + len(MAGIC))
+    digest, nbytes, rows_offset, data_offset, capacity, length = numbers
+    for number in numbers[1:]:
+        whole(number, "a number of its header")
+    begin = start + len(MAGIC) + _NUMBERS.size
+    if nbytes > len(head) or begin + length > nbytes or rows_offset + NBYTES > nbytes:
+        raise ValueError("its header is not complete")
+    plain = json.loads(head[begin : begin + length])
+    version = whole(plain["format_version"], "the format's version")
     if version not in READABLE:
         raise ValueError(f"its format has version {version}; this physx reads {list(READABLE)}")
-    data, counter = _plain_dataset(content, "data"), _plain_dataset(content, "rows")
-    if counter.shape != () or counter.dtype != np.dtype("<u8") or not data.shape:
-        raise ValueError("its datasets do not have the shapes or types of a partition's")
-    field = Field(
-        str(attributes["field"]),
-        data.shape[1:],
-        data.dtype,
-        str(attributes["unit"]),
-        str(attributes["role"]),  # type: ignore[arg-type]
-    )
-    if np.dtype(field.dtype) != data.dtype or field.role not in ("training", "additional"):
-        raise ValueError(f"{data.dtype} and {field.role!r} are not the type and role of a field")
-    data_offset = data.id.get_offset()
-    if counter.id.get_offset() is None or (data_offset is None and data.size * field.nbytes):
-        raise ValueError("it has no space allocated for rows")
+    field = parse_field(plain["field"])
+    if field.shape is None:
+        raise ValueError("the shape of its field is missing")
+    whole(data_offset + capacity * field.nbytes, "the end of its rows")
+    if _digest_header(head[:nbytes], start, rows_offset, data_offset, capacity * field.nbytes) != (
+        digest
+    ):
+        raise ValueError("its header does not have the checksum that it states")
+    session = checked(str, plain["session"], "a session")
+    if not SESSION.fullmatch(session):
+        raise ValueError(f"a session cannot be {session!r:.60}")
     identity = Identity(
-        str(attributes["session"]),
-        str(attributes["mode"]),
+        session,
+        parse_name(plain["mode"], "a mode"),
         field,
-        int(attributes["partition"]),
-        int(attributes["first_row"]),
+        whole(plain["partition"], "the number of a partition", 2**31),
+        whole(plain["first_row"], "a first row"),
     )
-    return Inspection(
-        identity,
-        capacity=data.shape[0],
-        rows=min(int(counter[()]), data.shape[0]),
-        data_offset=data_offset or 0,
-        commits=_commits(content) if version > 1 else (),
-        boot=str(attributes["boot"]) if version > 1 else "",
-    )
+    rows, commits = decode(head[rows_offset : rows_offset + NBYTES])
+    boot = checked(str, plain["boot"], "'boot'")
+    return Inspection(identity, capacity, min(rows, capacity), data_offset, commits, boot)
 
 
-def _commits(content: Any) -> tuple[Commit, ...]:
-    records = _plain_dataset(content, "commits")
-    if records.shape != (RECORDS, len(Commit._fields)) or records.dtype != np.dtype("<u8"):
-        raise ValueError("its records do not have the shape or type of a partition's")
-    return tuple(Commit(*record) for record in records[()].tolist())
-
-
-def _plain_dataset(content: Any, name: str) -> Any:
-    """Return a dataset whose bytes are contiguous in this very file."""
-    import h5py
-
-    if not isinstance(content.get(name, getlink=True), h5py.HardLink):
-        raise ValueError(f"{name!r} is a link")
-    dataset = content[name]
-    if not isinstance(dataset, h5py.Dataset):
-        raise ValueError(f"{name!r} is not an array")
-    layout = dataset.id.get_create_plist()
-    if layout.get_layout() != h5py.h5d.CONTIGUOUS or layout.get_external_count():
-        raise ValueError(f"{name!r} is not stored contiguously in this file")
-    return dataset
+def _digest_header(
+    content: bytes | bytearray, start: int, rows_offset: int, data_offset: int, data_nbytes: int
+) -> int:
+    """Return the digest of a header, without itself and what changes later: counts and rows."""
+    fixed = bytearray(content)
+    place = start + len(MAGIC)
+    for first, last in (
+        (place, place + 8),
+        (rows_offset, rows_offset + NBYTES),
+        (data_offset, data_offset + data_nbytes),
+    ):
+        fixed[first:last] = bytes(len(fixed[first:last]))
+    return int(xxh3_64_intdigest(fixed))

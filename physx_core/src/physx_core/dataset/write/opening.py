@@ -12,8 +12,8 @@ from physx_core import files
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.store import locks, manifest_file
 from physx_core.dataset.store.manifest import Manifest, to_plain_info
-from physx_core.dataset.store.manifest_parsing import SESSION
 from physx_core.dataset.store.manifest_store import ManifestStore
+from physx_core.dataset.store.validation import SESSION
 from physx_core.dataset.store.virtual_index import write_index
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import ConfigError, DatasetError

@@ -148,11 +148,11 @@ class Writer:
             count: How many rows there are.
         """
         done = 0
-        while done < count:
-            try:
-                self._check()
-                if self._sealing:
-                    self._collect(wait=False)
+        try:
+            self._check()
+            if self._sealing:
+                self._collect(wait=False)
+            while done < count:
                 partition = self._open.get(mode_name)
                 if partition is None or not partition.free:
                     if partition is not None:
@@ -161,11 +161,11 @@ class Writer:
                 part = min(partition.free, count - done)
                 partition.append(rows, done, part)
                 done += part
-            except OSError as error:
-                self._note(error)
-                what = f"{count - done} of {count} rows of mode {mode_name!r}"
-                safe = f"The {self.store.manifest.modes[mode_name].rows} samples before them"
-                raise files.storage_error(what, error, safe) from error
+        except OSError as error:
+            self._note(error)
+            what = f"{count - done} of {count} rows of mode {mode_name!r}"
+            safe = f"The {self.store.manifest.modes[mode_name].rows} samples before them"
+            raise files.storage_error(what, error, safe) from error
 
     def update(self, mode_name: str, index: Index, rows: Batch) -> None:
         """Overwrite rows in place.

@@ -1,0 +1,59 @@
+"""Validates values of untrusted files: types, limits, names that no path can be built from."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any, TypeVar
+
+import numpy as np
+
+from physx_core.fields import Field
+
+SESSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}")
+"""What file names can begin with; no path can be built from it."""
+
+_MOST = 2**62
+_WIDEST_ROW = 2**40
+_MOST_AXES = 32
+_LONGEST_NAME = 200
+
+T = TypeVar("T")
+
+
+def checked(kind: type[T], value: Any, what: str) -> T:
+    """Return a value that is of exactly one type."""
+    if type(value) is not kind:
+        raise ValueError(f"{what} cannot be {value!r:.60}")
+    return value
+
+
+def whole(value: Any, what: str, most: int = _MOST) -> int:
+    """Return an integer between 0 and `most`."""
+    if not 0 <= checked(int, value, what) <= most:
+        raise ValueError(f"{what} cannot be {value!r:.60}")
+    return int(value)
+
+
+def parse_field(plain: Any) -> Field:
+    """Return the field that plain data describe."""
+    name, shape, role = parse_name(plain["name"], "a field"), plain.get("shape"), plain["role"]
+    if shape is not None:
+        if len(checked(list, shape, f"the shape of {name!r}")) > _MOST_AXES:
+            raise ValueError(f"the shape of {name!r} cannot be {shape!r:.60}")
+        shape = tuple(whole(count, f"the shape of {name!r}") for count in shape)
+    if role not in ("training", "additional"):
+        raise ValueError(f"the role of {name!r} cannot be {role!r:.60}")
+    unit = checked(str, plain.get("unit", ""), f"the unit of {name!r}")
+    field = Field(name, shape, checked(str, plain["dtype"], f"the type of {name!r}"), unit, role)
+    if math.prod(shape or ()) * np.dtype(field.dtype).itemsize > _WIDEST_ROW:
+        raise ValueError(f"the shape of {name!r} cannot be {shape!r:.60}")
+    return field
+
+
+def parse_name(value: Any, what: str) -> str:
+    """Return the name of a mode or a field."""
+    name = checked(str, value, f"the name of {what}")
+    if not name.isidentifier() or len(name) > _LONGEST_NAME:
+        raise ValueError(f"the name of {what} cannot be {name!r:.60}")
+    return name
