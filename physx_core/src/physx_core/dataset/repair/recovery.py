@@ -12,6 +12,7 @@ from pathlib import Path
 from physx_core import files
 from physx_core.dataset.repair.aside import FOLDER, keep, set_aside
 from physx_core.dataset.store import manifest_file
+from physx_core.dataset.store.commits import SECTOR
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition_format import (
@@ -339,4 +340,6 @@ def _is_foreign(path: Path) -> bool:
             head = file.read(2**14) or b""
     except DatasetError:
         return False
-    return head.startswith(SIGNATURE) and not (MAGIC in head or FORMAT.encode() in head)
+    if not head.startswith(SIGNATURE) or not any(head[SECTOR:]):
+        return False
+    return MAGIC not in head and FORMAT.encode() not in head
