@@ -311,3 +311,47 @@ def test_a_disk_that_is_full_at_some_moment(small_disk):
 def test_a_disk_that_is_full_at_any_moment(small_disk):
     for free in range(0, 1_200_000, 4096 * 9):
         fill_up(small_disk / "data", free)
+
+
+# Few descriptors, and folders that go away ------------------------------------------------------
+
+MANY_FILES = """
+import resource, sys
+import numpy as np
+from physx_core import Dataset
+
+resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
+with Dataset.create(sys.argv[1], max_file_size=2.4e-5, durable=sys.argv[2] == "durable") as dataset:
+    for first in range(0, 2000, 100):
+        values = np.sin(np.arange(first, first + 100)[:, None] * np.arange(1, 10))
+        dataset.append("training", {f"x{number}": values + number for number in range(8)})
+"""
+
+
+@pytest.mark.parametrize("durability", ["fast", "durable"])
+def test_many_partitions_need_few_descriptors(tmp_path, durability):
+    command = [sys.executable, "-c", MANY_FILES, str(tmp_path / "data"), durability]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    with Dataset.open(tmp_path / "data") as dataset:
+        assert dataset.num_samples("training") == 2000
+        values = np.sin(np.arange(2000)[:, None] * np.arange(1, 10))
+        assert_array_equal(dataset["training"]["x3"][:], values + 3)
+        assert 8 * dataset.describe()[0]["partitions"] > 2 * 64
+
+
+@pytest.mark.parametrize("durable", [False, True])
+def test_a_folder_that_is_removed_is_noticed(tmp_path, durable):
+    folder = tmp_path / "session" / "dataset"
+    dataset = Dataset.create(folder, durable=durable)
+    dataset.append("training", expected(10))
+    shutil.rmtree(tmp_path / "session")
+    begin = time.monotonic()
+    with pytest.raises(DatasetError, match="removed"):
+        while time.monotonic() < begin + 20:  # two passes of the syncer take about two seconds
+            dataset.append("training", expected(10))
+            time.sleep(0.01)
+    with pytest.raises(DatasetError):
+        dataset.append("training", expected(10))
+    with pytest.raises(DatasetError):
+        dataset.close()

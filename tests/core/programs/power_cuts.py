@@ -330,24 +330,16 @@ def check_curated(folder, durable, promised, told):
 
 
 def check_saved(folder, durable, promised, told):
-    numbers, best = range((promised + 1) // 2), promised // 2 - 1
-    for number in numbers:
+    best = promised // 2 - 1
+    for which in [*range((promised + 1) // 2), *(["best"] if best >= 0 else ())]:
         try:
-            path = checkpoint.find(folder, "network", number)
-            epoch = checkpoint.read(path).progress.epoch
+            found = checkpoint.find(folder, "network", which)
         except CheckpointError as error:
             raise Lost(str(error)) from error
-        content = (path / "parameters.safetensors").read_bytes()
-        demand(epoch == number and content == parameters(number), Wrong, f"checkpoint {number}")
-    if best >= 0:
-        try:
-            path = checkpoint.find(folder, "network", "best")
-            epoch = checkpoint.read(path).progress.epoch
-        except CheckpointError as error:
-            raise Lost(str(error)) from error
-        demand(epoch in (best, best + 1), Lost, f"the best is {epoch}, not {best}")
-        content = (path / "parameters.safetensors").read_bytes()
-        demand(content == parameters(epoch), Wrong, "the best checkpoint")
+        epoch, content = found.progress.epoch, (found.path / "parameters.safetensors").read_bytes()
+        right = epoch in (best, best + 1) if which == "best" else epoch == which
+        demand(right, Lost, f"checkpoint {which} is of epoch {epoch}")
+        demand(content == parameters(epoch), Wrong, f"parameters of checkpoint {which}")
 
 
 WORKS = {
