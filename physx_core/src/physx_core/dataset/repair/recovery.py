@@ -75,9 +75,8 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
             count_rows(directory, manifest)
         if _state(directory) == before:  # otherwise a writer has replaced it meanwhile
             break
-    for partition in chain.from_iterable(mode.partitions for mode in manifest.modes.values()):
-        if partition.problem:
-            warnings.warn(f"{directory}: {_label(partition)}: {partition.problem}", stacklevel=3)
+    for text in _lost_rows(directory, manifest):
+        warnings.warn(text, stacklevel=3)
     return manifest
 
 
@@ -105,7 +104,11 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
     Returns:
         What was sealed, completed or removed from the manifest, as texts.
     """
+    told = _lost_rows(directory, manifest)
     count_rows(directory, manifest, thorough=True)
+    for text in _lost_rows(directory, manifest):
+        if text not in told:
+            warnings.warn(text, stacklevel=4)
     if manifest.problems:
         raise next(iter(manifest.problems.values()))
     done = []
@@ -121,6 +124,12 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
         _clear_dropped(directory, manifest)
         done = done or ["The remains of removed partitions have been deleted."]
     return done + _clear_unlisted(directory, manifest)
+
+
+def _lost_rows(directory: Path, manifest: Manifest) -> list[str]:
+    """Return which rows of open partitions cannot be used, as texts."""
+    partitions = chain.from_iterable(mode.partitions for mode in manifest.modes.values())
+    return [f"{directory}: {_label(p)}: {p.problem}" for p in partitions if p.problem]
 
 
 def _label(partition: Partition) -> str:
