@@ -101,7 +101,8 @@ def repaired(folder):
 def damages(content, step, guarded):
     """Yield possible damages of a file: each length, and then other bytes.
 
-    What was never sealed has no checksum: other bytes in the place of its rows are not tried.
+    Plain reading does not check the rows of a partition that is open: other bytes in their place
+    are for `verify` and the next writer, see below.
     """
     for length in range(0, len(content), step):
         yield content[:length]

@@ -162,7 +162,7 @@ class PartitionFile:
 
     def sync(self) -> None:
         """Wait until everything written is on the disk."""
-        files.sync(self.descriptor)
+        sync_named(self.descriptor, self.path)
 
     def close(self) -> None:
         """Close the file; calling it again does nothing."""
@@ -206,6 +206,13 @@ def copy(
         files.remove(draft)
         raise
     return header.data_offset, crc
+
+
+def sync_named(descriptor: int, path: Path) -> None:
+    """Wait until an open file is on the disk, and check that it still has a name there."""
+    files.sync(descriptor)
+    if files.is_removed(descriptor):
+        raise files.RemovedError(errno.ENOENT, "it was removed", str(path))
 
 
 def _write_header(path: Path, header: Header) -> int:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import threading
 from pathlib import Path
 
 from physx_core import files
-from physx_core.dataset.store.partition_file import PartitionFile
+from physx_core.dataset.store.partition_file import PartitionFile, sync_named
 
 PERIOD = 1.0
 """Seconds between two syncs of the same file."""
@@ -97,8 +96,6 @@ def _sync_marked(file: PartitionFile) -> None:
     if descriptor < 0:
         return
     try:
-        files.sync(descriptor)
-        if files.is_removed(descriptor):
-            raise files.RemovedError(errno.ENOENT, "it was removed", str(file.path))
+        sync_named(descriptor, file.path)
     finally:
         files.close(descriptor)
