@@ -113,6 +113,27 @@ def test_a_reader_sees_updates_when_it_refreshes(folder, thousand):
         assert next(reader.batches("training", N))["n"][0] == 5
 
 
+@pytest.mark.parametrize("closed", [False, True])
+def test_an_update_is_no_damage_to_a_reader_that_does_not_refresh(folder, thousand, closed):
+    thousand.write(folder)
+    with Dataset.open(folder) as reader, Dataset.open(folder, writable=True) as dataset:
+        dataset.update("training", slice(5, 400), {"n": np.arange(5, 400) + N})
+        if closed:
+            dataset.close()
+        expected = thousand.rows["n"].copy()
+        expected[5:400] += N
+        assert_array_equal(reader["training"]["n"][:], expected)
+        assert_array_equal(next(reader.batches("training", N))["n"], expected)
+        assert reader.verify() == []
+        path = folder / "run_training_x_2.h5"
+        content = bytearray(path.read_bytes())
+        content[-9] ^= 1
+        path.write_bytes(content)
+        assert "run_training_x_2.h5 was changed" in "".join(reader.verify())
+        with pytest.raises(DatasetError, match="was changed or is damaged"):
+            reader["training"]["x"][:]
+
+
 # Merging ----------------------------------------------------------------------------------------
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
+from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.manifest import Manifest, Mode
 from physx_core.dataset.store.segment import BLOCK, Segment, rows_per_block
 from physx_core.errors import DatasetError, listed, nearest
@@ -120,7 +121,8 @@ class Reader:
             file, offset = segment.open()
             with file:
                 segment.read(file, offset + (first - segment.start) * size, part)
-            _compare(segment, first, count, part, {} if sums is None else sums)
+            if _differs(segment, first, count, part, {} if sums is None else sums):
+                self._report(mode, segment)
 
     def blocks(
         self, mode: str, name: str, start: int = 0, stop: int | None = None
@@ -142,19 +144,28 @@ class Reader:
             self.read_into(block, mode, name, first, sums)
             yield block
 
-
-def _compare(
-    segment: Segment, first: int, count: int, part: memoryview, sums: dict[int, int]
-) -> None:
-    """Add rows to the checksum of their segment, and compare it after the last ones."""
-    if segment.checksum is None or (first > segment.start and segment.start not in sums):
-        return
-    crc = crc32(part, sums.pop(segment.start, 0))
-    if first + count < segment.start + segment.rows:
-        sums[segment.start] = crc
-    elif crc != segment.checksum:
+    def _report(self, mode: str, segment: Segment) -> None:
+        """Raise the error for a wrong checksum, unless another process has updated the rows."""
+        name = segment.field.name
+        for partition in self.mode(mode).partitions:
+            mine = partition.path(self.directory, name) == segment.path
+            if mine and not manifest_file.lists(self.directory, partition, name):
+                return
         raise DatasetError(
-            f"{segment.path} was changed or is damaged: its rows have checksum {crc:08x}, not "
+            f"{segment.path} was changed or is damaged: its rows do not have the checksum "
             f"{segment.checksum:08x}. Restore it from a copy, or set it aside with "
             "`physx verify --repair`."
         )
+
+
+def _differs(
+    segment: Segment, first: int, count: int, part: memoryview, sums: dict[int, int]
+) -> bool:
+    """Add rows to the checksum of their segment; return whether it is wrong after the last ones."""
+    if segment.checksum is None or (first > segment.start and segment.start not in sums):
+        return False
+    crc = crc32(part, sums.pop(segment.start, 0))
+    if first + count == segment.start + segment.rows:
+        return crc != segment.checksum
+    sums[segment.start] = crc
+    return False

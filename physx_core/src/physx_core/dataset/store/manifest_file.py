@@ -15,7 +15,7 @@ from typing import Any
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
-from physx_core.dataset.store.manifest import Manifest
+from physx_core.dataset.store.manifest import Manifest, Partition
 from physx_core.dataset.store.manifest_parsing import parse_manifest
 from physx_core.dataset.store.validation import whole
 from physx_core.errors import ConfigError, DatasetError
@@ -87,6 +87,21 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
             "`physx verify --repair` or Dataset.repair(directory) repairs it, from the partition "
             "files if need be; no row is lost."
         ) from error
+
+
+def lists(directory: Path, partition: Partition, name: str) -> bool:
+    """Return whether the manifest on the disk still has the checksum of a field in a partition.
+
+    If not, the writer has updated rows or removed the partition since: nothing is damaged.
+    """
+    try:
+        mode = load(directory).modes[partition.mode]
+        now = mode.partitions[mode.place(partition)]
+    except (DatasetError, FileNotFoundError):
+        return True  # nothing is known
+    except (KeyError, ValueError):
+        return False
+    return now.checksums.get(name) == partition.checksums.get(name)
 
 
 def _format(value: Any, indent: str = "\n") -> str:
