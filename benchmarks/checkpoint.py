@@ -24,8 +24,8 @@ from measure import finish, rates, report
 from physx_core import Field, NetworkConfig, checkpoint
 from physx_core.pipelines import Learner
 
-ROUNDS = 15
-SAVES = 5
+ROUNDS = 30
+SAVES = 2
 TARGET = 1.5
 KINDS = {
     "a numbered checkpoint": (False, [256, 700, 700, 256]),
@@ -89,15 +89,16 @@ def plain_writes(
 
 def saves(root: Path, learner: Learner, *, best: bool) -> Callable[[], Iterator[int]]:
     """Return work that saves checkpoints, numbered ones or the best one again and again."""
-    folder = root / ("best" if best else "numbered")
+    folder = root / "network"
 
     def run() -> Iterator[int]:
         yield 0
-        for _ in range(SAVES):
-            learner.save(folder, PROGRESS, best=best)
+        paths = [learner.save(folder, PROGRESS, best=best) for _ in range(SAVES)]
         yield SAVES
         if not best:
-            shutil.rmtree(folder)
+            number = int(paths[0].name.rpartition("_")[2])
+            for earlier in range(number - 1, number + SAVES - 1):  # the last one stays
+                shutil.rmtree(folder / f"network_{earlier}")
 
     return run
 
