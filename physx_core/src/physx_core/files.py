@@ -48,7 +48,7 @@ def storage_error(
         kind: Class of the returned error.
         advice: What to do after having freed some space, if the disk is full.
     """
-    if isinstance(error, SyncError):
+    if isinstance(error, SyncError) and kind is DatasetError:
         return DatasetError(
             f"{what} cannot be stored: the disk has failed ({error.strerror}), and rows of the "
             "last seconds may be lost. Close the dataset and open it again: it then has all rows "
@@ -61,6 +61,8 @@ def storage_error(
         )
     full = error.errno in FULL
     reason = "the disk is full" if full else (error.strerror or str(error))
+    if isinstance(error, SyncError):
+        reason = f"the disk has failed ({reason})"
     then = f" Free some space and {advice}." if full else ""
     return kind(f"{what} cannot be stored: {reason}. {safe} are intact.{then}")
 
