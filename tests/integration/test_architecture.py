@@ -1,4 +1,4 @@
-"""docs/architecture.md names files and rooms that exist."""
+"""docs/architecture.md names files and rooms that exist, docs/durability.md tests."""
 
 import re
 
@@ -22,6 +22,13 @@ def test_the_tree_shows_every_room(root):
         drawn = set(re.findall(r"(\w+)/", part))
         for folder in folders:
             assert folder.name in drawn, folder
+
+
+def test_every_promise_names_a_test(root):
+    text = (root / "docs/durability.md").read_text()
+    named = set(re.findall(r"`(test_\w+)`", text))
+    assert len(named) > 5
+    assert named <= {path.stem for path in (root / "tests").rglob("test_*.py")}
 
 
 def source(root, package):

@@ -101,3 +101,14 @@ def test_info_is_kept(folder):
             "kwargs": {"a": [1, 2.5], "b": [0, 1], "p": "x"},
         }
         assert set(dataset.versions) == {"python", "physx-core", "numpy", "h5py"}
+
+
+@pytest.mark.parametrize("durable", [False, True])
+def test_an_exception_costs_neither_rows_nor_pending_samples(folder, durable):
+    with pytest.raises(KeyboardInterrupt), Dataset.create(folder, durable=durable) as dataset:
+        dataset.append("training", ROWS)
+        dataset.append_sample("training", {"x": np.zeros(3), "n": 3})
+        raise KeyboardInterrupt
+    with Dataset.open(folder) as dataset:
+        assert_array_equal(dataset["training"]["n"][:], [1, 2, 3])
+        assert dataset.verify() == []
