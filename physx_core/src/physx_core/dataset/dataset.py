@@ -456,6 +456,7 @@ class Dataset(Closeable):
             raise DatasetError(f"{source} cannot be merged into itself.")
         appender.flush()
         given = recovery.load(source)
+        recovery.count_rows(source, given, thorough=True)
         if given.problems:
             raise next(iter(given.problems.values()))
         with files.storing(f"The rows of {source}"):

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.manifest import Manifest, Mode
-from physx_core.dataset.store.segment import BLOCK, Segment, rows_per_block
+from physx_core.dataset.store.partition_format import inspect
+from physx_core.dataset.store.segment import BLOCK, RowsCheck, Segment, rows_per_block
 from physx_core.errors import DatasetError, listed, nearest
 from physx_core.fields import Field
 from physx_core.typing import Array
@@ -95,7 +95,7 @@ class Reader:
         mode: str,
         name: str,
         start: int,
-        sums: dict[int, int] | None = None,
+        checks: dict[int, RowsCheck] | None = None,
     ) -> None:
         """Fill a contiguous array of the field's type with the rows from `start` on.
 
@@ -106,7 +106,7 @@ class Reader:
             mode: Name of the mode.
             name: Name of the field.
             start: First row.
-            sums: Checksums of partitions that are read in several calls, kept from one to the next.
+            checks: Of partitions that are read in several calls, kept from one to the next.
         """
         size, stop = self.field(mode, name).nbytes, start + len(out)
         if not size:
@@ -121,7 +121,7 @@ class Reader:
             file, offset = segment.open()
             with file:
                 segment.read(file, offset + (first - segment.start) * size, part)
-            if _differs(segment, first, count, part, {} if sums is None else sums):
+            if _differs(segment, first, count, part, {} if checks is None else checks):
                 self._report(mode, segment)
 
     def blocks(
@@ -138,34 +138,37 @@ class Reader:
         field, end = self.field(mode, name), self.rows(mode) if stop is None else stop
         count = rows_per_block(field.nbytes)
         buffer = np.empty((min(count, max(0, end - start)), *(field.shape or ())), field.dtype)
-        sums: dict[int, int] = {}
+        checks: dict[int, RowsCheck] = {}
         for first in range(start, end, count):
             block = buffer[: end - first]
-            self.read_into(block, mode, name, first, sums)
+            self.read_into(block, mode, name, first, checks)
             yield block
 
     def _report(self, mode: str, segment: Segment) -> None:
         """Raise the error for a wrong checksum, unless another process has updated the rows."""
-        name = segment.field.name
+        name, commit = segment.field.name, segment.commit
+        if commit is not None and inspect(segment.path).commits[0].base > commit.base:
+            return
         for partition in self.mode(mode).partitions:
             mine = partition.path(self.directory, name) == segment.path
             if mine and not manifest_file.lists(self.directory, partition, name):
                 return
         raise DatasetError(
-            f"{segment.path} was changed or is damaged: its rows do not have the checksum "
-            f"{segment.checksum:08x}. Restore it from a copy, or set it aside with "
-            "`physx verify --repair`."
+            f"{segment.path} was changed or is damaged: its rows do not have the checksum that is "
+            "stored for them. Restore it from a copy, or set it aside with `physx verify --repair`."
         )
 
 
 def _differs(
-    segment: Segment, first: int, count: int, part: memoryview, sums: dict[int, int]
+    segment: Segment, first: int, count: int, part: memoryview, checks: dict[int, RowsCheck]
 ) -> bool:
-    """Add rows to the checksum of their segment; return whether it is wrong after the last ones."""
-    if segment.checksum is None or (first > segment.start and segment.start not in sums):
+    """Add rows to the check of their segment; return whether they fail it after the last ones."""
+    known = segment.checksum is not None or segment.commit is not None
+    if not known or (first > segment.start and segment.start not in checks):
         return False
-    crc = crc32(part, sums.pop(segment.start, 0))
+    check = checks.pop(segment.start, None) or RowsCheck(segment)
+    check.add(part)
     if first + count == segment.start + segment.rows:
-        return crc != segment.checksum
-    sums[segment.start] = crc
+        return not check.passed
+    checks[segment.start] = check
     return False

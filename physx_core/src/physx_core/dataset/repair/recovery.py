@@ -218,20 +218,21 @@ def _count_open(directory: Path, mode: Mode, partition: Partition, thorough: boo
     for name, field in mode.fields.items():
         path = partition.path(directory, name)
         try:
-            found, count = partition.count(directory, field, thorough=thorough)
+            found, commit = partition.find_rows(directory, field, thorough=thorough)
         except DatasetError as error:
             unreadable = error
             continue
         have = found.identity.field
         if have != field and field.shape is not None:
             raise DatasetError(f"{path} holds {have}, but the dataset says {field}.")
-        if count is None:
+        if commit is None:
             raise DatasetError(
                 f"{path} was changed or is damaged: its rows do not have the checksums of its "
                 "records. Restore it from a copy, or set it aside with `physx verify --repair`."
             )
         counted.append(found.rows)
-        rows.append(count)
+        rows.append(commit.rows)
+        partition.commits[name] = commit
     if unreadable is not None and any(counted):
         raise unreadable
     partition.rows = 0 if unreadable is not None else min(rows)

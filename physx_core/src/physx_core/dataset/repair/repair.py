@@ -135,6 +135,7 @@ def _repair_partition(folder: Path, mode: Mode, partition: Partition) -> list[st
         path, identity = partition.path(folder, name), partition.identity(field)
         offset, rows = partition.offsets[name], partition.rows
         partition.offsets[name], _ = copy(path, offset, path, identity, rows)
+        files.sync_folder(folder)
         done.append(f"{problem} Its rows are sound and have a new header.")
     return done
 

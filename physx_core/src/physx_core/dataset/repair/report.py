@@ -55,11 +55,11 @@ def find_problem(
     try:
         problem = _difference(partition.inspect(directory, field), partition, field)
         if problem is None and content and not partition.sealed:
-            found, rows = partition.count(directory, field, thorough=True)
-            if rows is None:
+            found, commit = partition.find_rows(directory, field, thorough=True)
+            if commit is None:
                 problem = "was changed: its rows do not have the checksums of its records."
-            elif rows < found.rows:
-                problem = f"counts {found.rows - rows} rows that did not reach the disk."
+            elif commit.rows < found.rows:
+                problem = f"counts {found.rows - commit.rows} rows that did not reach the disk."
         wanted = partition.checksums.get(field.name)
         if problem is None and content and wanted is not None:
             crc = partition.segment(directory, field).compute_checksum()

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from physx_core.dataset.store.commits import Commit
 from physx_core.dataset.store.partition_format import (
     Identity,
     Inspection,
-    count_rows,
+    find_rows,
     inspect,
     partition_file,
 )
@@ -46,6 +47,8 @@ class Partition:
         writing: Whether this process writes it, so that `offsets` are right though not sealed.
         follows: While it is not sealed, number of the partition that its writer filled before it,
             and how many rows that one got: without all of these, its own rows do not count.
+        commits: While it is not sealed, the records of its rows as its files state them, by field;
+            not stored.
         problem: Why rows of it cannot be read though its files count them; not stored.
         running: Statistics of its first rows while it is not counted, by field; not stored.
     """
@@ -61,6 +64,7 @@ class Partition:
     counted: bool = False
     writing: bool = False
     follows: tuple[int, int] | None = None
+    commits: dict[str, Commit] = field(default_factory=dict, compare=False)
     problem: str = field(default="", compare=False)
     running: dict[str, RunningStatistics] = field(default_factory=dict, compare=False)
 
@@ -85,10 +89,12 @@ class Partition:
         """Return what a field's file says of itself."""
         return inspect(self.path(directory, of.name), self.offsets.get(of.name), of.nbytes)
 
-    def count(self, directory: Path, of: Field, *, thorough: bool) -> tuple[Inspection, int | None]:
-        """Return what a field's file says of itself, and how many of its rows can be read."""
+    def find_rows(
+        self, directory: Path, of: Field, *, thorough: bool
+    ) -> tuple[Inspection, Commit | None]:
+        """Return what a field's file says of itself, and the record of the rows that it has."""
         path, offset = self.path(directory, of.name), self.offsets.get(of.name)
-        return count_rows(path, offset, of.nbytes, thorough=thorough)
+        return find_rows(path, offset, of.nbytes, thorough=thorough)
 
     def segment(self, directory: Path, of: Field, start: int = 0) -> Segment:
         """Return the rows of a field, of which the first is row `start` of the mode."""
@@ -100,7 +106,12 @@ class Partition:
             self.offsets.get(of.name, 0),
             self.sealed or self.writing,
             self.checksums.get(of.name),
+            self._commit_of(of),
         )
+
+    def _commit_of(self, of: Field) -> Commit | None:
+        commit = self.commits.get(of.name)
+        return commit if commit is not None and commit.rows == self.rows else None
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON; the row count of an open partition is only in its files."""

@@ -45,6 +45,7 @@ MAGIC = b"\x89physx\r\n"
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _PAGE = 4096
 _NUMBERS = struct.Struct("<5QI")  # digest and size of the header, offsets, capacity, length of text
+_ALIGNMENT = 16  # no number of the rows lies in two sectors
 _COMMON_HEADER = 2**14
 _LARGEST_HEADER = 2**20
 _INVALID = (
@@ -161,7 +162,11 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
     kind = h5t.py_create(np.dtype(field.dtype), logical=True)
     image = io.BytesIO()
     with h5py.File(
-        image, "w", libver=("earliest", "v110"), alignment_threshold=2048, alignment_interval=_PAGE
+        image,
+        "w",
+        libver=("earliest", "v110"),
+        alignment_threshold=2048,
+        alignment_interval=_PAGE,
     ) as file:
         for name, value in identity.attributes.items():
             file.attrs[name] = value
@@ -172,7 +177,12 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
         records = h5d.create(file.id, b"commits", h5t.STD_U64LE, table, layout)
         own = h5d.create(file.id, b"header", h5t.STD_U8LE, h5s.create_simple((block,)), layout)
         space = h5s.create_simple((capacity, *(field.shape or ())))
+        layout.set_alloc_time(h5d.ALLOC_TIME_LATE)  # behind everything that HDF5 needs
         data = h5d.create(file.id, b"data", kind, space, layout)
+        if capacity * field.nbytes:
+            origin, one = (0,) * len(data.shape), (1,) * len(data.shape)
+            space.select_hyperslab(origin, one)
+            data.write(h5s.create_simple(one), space, np.zeros(one, field.dtype))
         rows_offset, data_offset = counter.get_offset(), data.get_offset() or 0
         own_offset, records_offset = own.get_offset(), records.get_offset()
     if (
@@ -206,12 +216,12 @@ def inspect(path: Path, offset: int | None = None, row_nbytes: int = 0) -> Inspe
         return inspect_open(file, path, offset, row_nbytes)
 
 
-def count_rows(
+def find_rows(
     path: Path, offset: int | None, row_nbytes: int, *, thorough: bool
-) -> tuple[Inspection, int | None]:
-    """Read what an unsealed partition file says of itself, and count the rows that can be read.
+) -> tuple[Inspection, Commit | None]:
+    """Read what an unsealed partition file says of itself, and find the rows that can be read.
 
-    The count is None if the file was changed: its rows have the digests of none of its records.
+    The record is None if the file was changed: its rows have the digests of none of its records.
 
     Args:
         path: The file.
@@ -225,14 +235,14 @@ def count_rows(
         while True:
             found = inspect_open(file, path, offset, row_nbytes)
             if found.certain and not thorough:
-                return found, found.rows
+                return found, found.commits[0]
             nbytes = found.identity.field.nbytes
             try:
                 intact = find_intact(file.fileno(), found.data_offset, nbytes, found.commits)
             except OSError as error:
                 raise cannot_read(path, error) from error
             if intact is not None and intact.rows <= found.capacity:
-                return found, intact.rows
+                return found, intact
             if found == before:
                 return found, None
             before = found  # a writer may have updated rows meanwhile
@@ -305,19 +315,18 @@ def _describe(identity: Identity) -> bytes:
         "first_row": identity.first_row,
         "boot": boot_id(),
     }
-    return json.dumps(plain).encode()
+    text = json.dumps(plain).encode()
+    return text + b" " * (-(len(MAGIC) + _NUMBERS.size + len(text)) % _ALIGNMENT)
 
 
 def _read_header(descriptor: int) -> bytes:
     """Return the first bytes of a file, enough for its header."""
     head = files.read_head(descriptor, _COMMON_HEADER)
     start = head.find(MAGIC) + len(MAGIC)
-    if start < len(MAGIC) or start + _NUMBERS.size > len(head):
+    found = start >= len(MAGIC) and start + _NUMBERS.size <= len(head)
+    if found and _NUMBERS.unpack_from(head, start)[1] <= len(head):
         return head
-    nbytes = _NUMBERS.unpack_from(head, start)[1]
-    return (
-        head if nbytes <= len(head) else files.read_head(descriptor, min(nbytes, _LARGEST_HEADER))
-    )
+    return files.read_head(descriptor, _LARGEST_HEADER)
 
 
 def _parse_header(head: bytes) -> Inspection:

@@ -9,9 +9,11 @@ from io import FileIO
 from pathlib import Path
 
 import numpy as np
+from xxhash import xxh3_64
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
+from physx_core.dataset.store.commits import Commit
 from physx_core.dataset.store.partition_format import (
     SIGNATURE,
     cannot_read,
@@ -40,6 +42,7 @@ class Segment:
         certain: Whether `offset` can be relied on; otherwise it is read from the file, because
             another process may replace the file by its final form at any moment.
         checksum: CRC-32 of all its rows; None if it is not known.
+        commit: Record of all its rows, if the partition is open and was left by its writer.
     """
 
     path: Path
@@ -49,6 +52,7 @@ class Segment:
     offset: int
     certain: bool
     checksum: int | None = None
+    commit: Commit | None = None
 
     def open(self) -> tuple[FileIO, int]:
         """Open the file; return it with the offset of the first row."""
@@ -98,6 +102,31 @@ class Segment:
         for block in self.blocks():
             crc = crc32(files.as_bytes(block), crc)
         return crc
+
+
+class RowsCheck:
+    """Compares all rows of a segment, given in their order, with what is known of them."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+        self._crc, self._digest = 0, xxh3_64()
+        self._unchecked = segment.commit.base * segment.field.nbytes if segment.commit else 0
+
+    def add(self, part: memoryview) -> None:
+        """Take the next rows."""
+        if self._segment.checksum is not None:
+            self._crc = crc32(part, self._crc)
+        elif self._segment.commit is not None:
+            self._digest.update(part[self._unchecked :])
+            self._unchecked = max(0, self._unchecked - len(part))
+
+    @property
+    def passed(self) -> bool:
+        """Whether the rows that were taken are those of the segment."""
+        wanted, commit = self._segment.checksum, self._segment.commit
+        if wanted is not None:
+            return self._crc == wanted
+        return commit is None or self._digest.intdigest() == commit.digest
 
 
 def rows_per_block(row_nbytes: int, nbytes: int = BLOCK) -> int:

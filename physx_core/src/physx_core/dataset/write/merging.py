@@ -10,6 +10,7 @@ import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 
+from physx_core import files
 from physx_core.dataset.read.mode_statistics import merge_statistics
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition_file import copy
@@ -35,6 +36,7 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
         for name, partitions in pairs.items():
             for old, new in partitions:
                 _copy_files(writer.store.directory, source, given.modes[name].fields, old, new)
+        files.sync_folder(writer.store.directory)
         with writer.store.change() as manifest:
             for name, partitions in pairs.items():
                 _accept(manifest.modes[name], given.modes[name], partitions)

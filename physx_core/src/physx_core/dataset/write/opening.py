@@ -59,6 +59,7 @@ def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> Wri
                         "Dataset.open(directory, writable=True), or choose another folder."
                     )
                 manifest_file.save(folder, manifest)
+                files.sync_folder(folder.parent)  # the caller may just have made the folder
                 if options.shared:
                     locks.share(folder, lock)
             except BaseException:
