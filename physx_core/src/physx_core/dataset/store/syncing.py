@@ -63,6 +63,8 @@ class Syncer:
             for path in paths:
                 with contextlib.suppress(FileNotFoundError):  # its partition has been removed
                     files.sync_file(path)
+            for folder in {path.parent for path in paths}:  # a sealed copy may have its name now
+                files.sync_folder(folder)
         except OSError as error:
             self._error = self._error or error
 
