@@ -1106,12 +1106,12 @@ class SharedMachine(RuleBasedStateMachine):
 # Each history has its own seed: from one seed, Hypothesis would make variations of few histories.
 
 
-@pytest.mark.parametrize("number", range(18))
+@pytest.mark.parametrize("number", range(13))
 def test_a_dataset_is_what_lists_are(number):
     run_state_machine_as_test(seed(number)(Machine), settings=QUICK)
 
 
-@pytest.mark.parametrize("number", range(6))
+@pytest.mark.parametrize("number", range(4))
 def test_a_dataset_of_several_writers_is_what_lists_are(number):
     few = settings(QUICK, stateful_step_count=15)
     run_state_machine_as_test(seed(number)(SharedMachine), settings=few)
