@@ -134,6 +134,20 @@ def test_an_update_is_no_damage_to_a_reader_that_does_not_refresh(folder, thousa
             reader["training"]["x"][:]
 
 
+def test_rows_of_a_later_partition_are_not_taken_for_an_update(folder, thousand):
+    thousand.write(folder)
+    with Dataset.open(folder, writable=True, session="b") as dataset:
+        dataset.append("training", thousand.part(0, 400))
+    with Dataset.open(folder) as reader:
+        with Dataset.open(
+            folder, writable=True, session="run", max_file_size=thousand.size
+        ) as dataset:
+            dataset.remove_partition("training", 2, "run")
+            dataset.append("training", thousand.part(0, 320))  # in files of the same names
+        with pytest.raises(DatasetError, match="was changed or is damaged"):
+            reader["training"]["n"][:]
+
+
 # Merging ----------------------------------------------------------------------------------------
 
 

@@ -151,7 +151,7 @@ class Reader:
             return
         for partition in self.mode(mode).partitions:
             mine = partition.path(self.directory, name) == segment.path
-            if mine and not manifest_file.lists(self.directory, partition, name):
+            if mine and manifest_file.was_updated(self.directory, partition, name):
                 return
         raise DatasetError(
             f"{segment.path} was changed or is damaged: its rows do not have the checksum that is "

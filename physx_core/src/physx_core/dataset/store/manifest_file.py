@@ -89,19 +89,18 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
         ) from error
 
 
-def lists(directory: Path, partition: Partition, name: str) -> bool:
-    """Return whether the manifest on the disk still has the checksum of a field in a partition.
+def was_updated(directory: Path, partition: Partition, name: str) -> bool:
+    """Return whether the manifest on the disk has another checksum for a field of a partition.
 
-    If not, the writer has updated rows or removed the partition since: nothing is damaged.
+    If so, the writer has updated rows, and those that do not fit the old checksum are not damaged.
     """
     try:
         mode = load(directory).modes[partition.mode]
         now = mode.partitions[mode.place(partition)]
-    except (DatasetError, FileNotFoundError):
-        return True  # nothing is known
-    except (KeyError, ValueError):
+    except (DatasetError, FileNotFoundError, KeyError, ValueError):
         return False
-    return now.checksums.get(name) == partition.checksums.get(name)
+    same = now.first_row == partition.first_row  # not a later one of the same name
+    return same and now.checksums.get(name) != partition.checksums.get(name)
 
 
 def _format(value: Any, indent: str = "\n") -> str:
