@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from physx_core import Field
 from physx_core.errors import (
@@ -87,3 +89,39 @@ def test_a_buffer_holds_one_mebibyte_at_most():
 def test_open_shapes_are_taken_from_the_first_sample():
     fields = infer_shapes([Field("x"), Field("y", (1,))], {"x": [[1, 2]], "y": 0})
     assert [field.shape for field in fields] == [(1, 2), (1,)]
+
+
+@given(
+    st.integers(1, 6),
+    st.booleans(),
+    st.lists(st.sampled_from(["put", "checked", "wrong", "nan", "take", "clear"]), max_size=40),
+)
+def test_a_buffer_is_what_a_list_is(capacity, numbered, calls):
+    buffer, rows = RowBuffer(FIELDS, capacity, numbered=numbered), []
+    for number, call in enumerate(calls):
+        assert buffer.count == len(rows) and buffer.full == (len(rows) == capacity)
+        sample, place = {"x": [number, 0.5], "n": number}, (1 + number % 3, number // 5, number)
+        if call == "clear":
+            buffer.clear()
+            rows = []
+        elif call == "take":
+            bad = next((k for k, row in enumerate(rows) if np.isnan(row[0][1])), None)
+            if bad is not None:
+                with pytest.raises(NotFiniteError) as caught:
+                    buffer.take()
+                assert caught.value.step == (rows[bad][4] if numbered else -1)
+                rows = rows[:bad]
+            names = ["x", "n", "env_id", "episode", "step"][: 5 if numbered else 2]
+            found = {name: block.tolist() for name, block in buffer.take().items()}
+            assert found == {name: [row[k] for row in rows] for k, name in enumerate(names)}
+            rows = []
+        elif call == "wrong" and not buffer.full:
+            with pytest.raises(SampleError):
+                buffer.put({**sample, "n": 0.5}, *place)
+            with pytest.raises(SampleError):
+                buffer.put({**sample, "x": [number, np.inf]}, *place, finite=True)
+        elif not buffer.full:
+            if call == "nan":
+                sample["x"][1] = np.nan
+            buffer.put(sample, *place, finite=call == "checked")
+            rows.append((sample["x"], number, *place))

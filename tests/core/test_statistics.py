@@ -74,6 +74,36 @@ def test_merged_is_the_same_as_given_together(first, second):
         assert_allclose(merged.std, together.std(), rtol=1e-6, atol=1e-6)
 
 
+@given(
+    st.sampled_from([(), (3,), (0, 2), (600,)]),
+    st.lists(st.tuples(st.sampled_from(["update", "merge", "plain"]), st.integers(0, 9))),
+    st.sampled_from([0.0, 1e6]),
+)
+def test_any_history_gives_what_all_rows_give(shape, history, offset):
+    random, statistics, blocks = np.random.default_rng(0), RunningStatistics(), []
+    for call, count in history:
+        block = random.integers(-99, 99, (count, *shape)) + offset
+        if call == "plain":
+            if shape != (0, 2):  # JSON loses the shape of empty arrays
+                statistics = RunningStatistics.from_dict(statistics.to_dict())
+            continue
+        blocks.append(block)
+        if call == "update":
+            statistics.update(block)
+        else:
+            other = statistics_of(block[: count // 2], block[count // 2 :])
+            statistics.merge(other)
+            assert other.count == count
+    rows = np.concatenate([np.zeros((0, *shape)), *blocks])
+    assert statistics.count == len(rows)
+    if len(rows):
+        assert_allclose(statistics.mean, rows.mean(axis=0), rtol=1e-12, atol=1e-9)
+        assert_allclose(statistics.std, rows.std(axis=0), rtol=1e-9, atol=1e-9)
+        assert (statistics.minimum == rows.min(axis=0)).all()
+        assert (statistics.maximum == rows.max(axis=0)).all()
+        assert statistics.mean.shape == shape
+
+
 def test_plain_data_bring_it_back_and_it_goes_on():
     rows = np.random.default_rng(0).normal(1e5, 1.0, size=(300, 2))
     rows[:, 1] = 7.0
