@@ -321,3 +321,32 @@ def test_numbers_are_on_one_line_of_the_manifest(tmp_path):
     make(tmp_path / "data")
     text = (tmp_path / "data/dataset.json").read_text()
     assert '"shape": [3]' in text
+
+
+def test_repairing_keeps_the_rows_before_those_that_did_not_reach_the_disk(tmp_path):
+    writer = Dataset.create(tmp_path / "data", durable=True)
+    for rows in (4, 3):
+        writer.append("training", {"x": np.arange(1.0, rows + 1)})
+    shutil.copytree(tmp_path / "data", tmp_path / "cut")
+    writer.close()
+    path = tmp_path / "cut" / "run_training_x_0.h5"
+    content = path.read_bytes()
+    lost = content.rfind(np.arange(1.0, 4).tobytes())
+    path.write_bytes(content[:lost] + bytes(24) + content[lost + 24 :])
+    Dataset.repair(tmp_path / "cut")
+    with Dataset.open(tmp_path / "cut") as dataset:
+        assert_array_equal(dataset["training"]["x"][:], [1, 2, 3, 4])
+        assert dataset.verify() == []
+
+
+def test_rebuilding_keeps_updated_rows_of_full_partitions(tmp_path):
+    folder = tmp_path / "data"
+    with Dataset.create(folder, max_file_size=1.7e-5) as dataset:
+        dataset.append("training", {"x": np.arange(1000.0)})
+        dataset.update("training", 3, {"x": -1.0})
+    Dataset.rebuild(folder)
+    wanted = np.arange(1000.0)
+    wanted[3] = -1
+    with Dataset.open(folder) as dataset:
+        assert_array_equal(dataset["training"]["x"][:], wanted)
+        assert dataset.verify() == []

@@ -124,7 +124,7 @@ def _repair_partition(folder: Path, mode: Mode, partition: Partition) -> list[st
     """Give damaged files of a partition a new header, or else set all its files aside."""
     done = []
     for name, field in mode.fields.items():
-        problem = find_problem(folder, partition, field)
+        problem = _find_damage(folder, partition, field)
         if problem is None:
             continue
         if not _has_sound_rows(folder, partition, field):
@@ -138,6 +138,19 @@ def _repair_partition(folder: Path, mode: Mode, partition: Partition) -> list[st
         files.sync_folder(folder)
         done.append(f"{problem} Its rows are sound and have a new header.")
     return done
+
+
+def _find_damage(folder: Path, partition: Partition, field: Field) -> str | None:
+    """Return what is wrong with one file of a partition, or None.
+
+    Rows of an open partition that did not reach the disk are no damage: the others are sealed.
+    """
+    problem = find_problem(folder, partition, field, content=partition.sealed)
+    if problem is None and not partition.sealed:
+        _, commit = partition.find_rows(folder, field, thorough=True)
+        if commit is None:
+            problem = find_problem(folder, partition, field)
+    return problem
 
 
 def _has_sound_rows(folder: Path, partition: Partition, field: Field) -> bool:

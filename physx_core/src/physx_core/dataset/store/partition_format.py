@@ -120,6 +120,7 @@ class Inspection:
         identity: What it is part of.
         capacity: How many rows fit in.
         rows: How many rows are committed.
+        rows_offset: Offset of the committed row count.
         data_offset: Offset of the first row.
         commits: The records of committed rows, the newest first.
         boot: What `boot_id` returned when the file was made.
@@ -128,6 +129,7 @@ class Inspection:
     identity: Identity
     capacity: int
     rows: int
+    rows_offset: int
     data_offset: int
     commits: tuple[Commit, ...]
     boot: str
@@ -368,7 +370,8 @@ def _parse_header(head: bytes) -> Inspection:
     )
     rows, commits = decode(head[rows_offset : rows_offset + NBYTES])
     boot = checked(str, plain["boot"], "'boot'")
-    return Inspection(identity, capacity, min(rows, capacity), data_offset, commits, boot)
+    rows = min(rows, capacity)
+    return Inspection(identity, capacity, rows, rows_offset, data_offset, commits, boot)
 
 
 def _digest_header(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
+from physx_core.dataset.store.commits import Commit, encode
 from physx_core.dataset.store.manifest import Partition, has_statistics
 from physx_core.dataset.store.partition_file import copy
 from physx_core.fields import Field
@@ -57,6 +59,27 @@ def scan(directory: Path, fields: Mapping[str, Field], partition: Partition) -> 
             if has_statistics(field):
                 statistics.update(block)
     return replace(partition, checksums=crc, running=running, counted=False)
+
+
+def unseal(directory: Path, fields: Mapping[str, Field], partition: Partition) -> Partition:
+    """Take checksums and digests of a sealed partition's rows away, so that they may be updated.
+
+    Files that were full when they were sealed still have the digests of their rows.
+
+    Returns:
+        The partition, for the manifest; the files are on the disk.
+    """
+    settled = Commit.unchecked(partition.rows)
+    for name, field in fields.items():
+        found = partition.inspect(directory, field)
+        if set(found.commits) != {settled}:
+            descriptor = files.open_regular(partition.path(directory, name), os.O_WRONLY)
+            try:
+                files.write_at(descriptor, encode(settled), found.rows_offset)
+                files.sync(descriptor)
+            finally:
+                files.close(descriptor)
+    return replace(partition, checksums={}, counted=False)
 
 
 def sync_files(directory: Path, fields: Mapping[str, Field], partition: Partition) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,6 +13,7 @@ import numpy as np
 from physx_core import files
 from physx_core.dataset.store.manifest import Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
+from physx_core.dataset.store.sealing import unseal
 from physx_core.dataset.write.row_validation import check_rows
 from physx_core.errors import DatasetError, FieldShapeError, MissingFieldError
 from physx_core.fields import Field
@@ -105,7 +105,7 @@ def _invalidate(store: ManifestStore, mode_name: str, touched: list[Partition]) 
             if any(partition.counted for partition in sealed):
                 mode.forget_statistics()
             for partition in sealed:
-                mode.swap(replace(partition, checksums={}, counted=False))
+                mode.swap(unseal(store.directory, mode.fields, partition))
     store.manifest.generation += 1
 
 
