@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import zlib
 from pathlib import Path
 
 import h5py
@@ -11,6 +12,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from physx_core import Dataset, Field, files
+from physx_core.dataset.store.commits import Commit
 from physx_core.errors import (
     DatasetError,
     DatasetLockedError,
@@ -350,3 +352,32 @@ def test_rebuilding_keeps_updated_rows_of_full_partitions(tmp_path):
     with Dataset.open(folder) as dataset:
         assert_array_equal(dataset["training"]["x"][:], wanted)
         assert dataset.verify() == []
+
+
+def test_rebuilding_forgets_what_was_being_removed_and_what_was_never_committed(tmp_path):
+    folder = tmp_path / "data"
+    writer = Dataset.create(folder, max_file_size=1.7e-5)
+    writer.append("training", {"x": np.arange(200.0), "y": np.arange(200.0)})
+    writer.append("test", {"x": np.arange(2.0), "y": np.arange(2.0)})
+    shutil.copytree(folder, tmp_path / "before")
+    writer.remove_partition("training", 1)
+    writer.close()
+    folder = tmp_path / "before"  # the writer was killed while it removed the partition
+    plain = json.loads((folder / "dataset.json").read_text())
+    plain["modes"]["training"]["dropped"] = [plain["modes"]["training"]["partitions"].pop(1)]
+    del plain["crc32"]
+    body = json.dumps(plain, indent=1).encode()[:-2]
+    end = f',\n "crc32": "{zlib.crc32(body):08x}"\n}}'
+    (folder / "dataset.json").write_bytes(body + end.encode())
+    (folder / "run_training_y_1.h5").unlink()
+    with h5py.File(folder / "run_test_y_0.h5", "r+") as file:  # ... or before its second field
+        file["rows"][()] = 0
+        file["commits"][...] = np.array([Commit.unchecked(0)] * 3, "u8")
+    Dataset.rebuild(folder)
+    with Dataset.open(folder) as dataset:
+        assert dataset.modes == ["training"]
+        expected = [*range(77), *range(154, 200)]
+        assert_array_equal(dataset["training"]["x"][:], expected)
+        assert_array_equal(dataset["training"]["y"][:], expected)
+        assert dataset.verify() == []
+    assert not list(folder.glob("*_test_*"))

@@ -121,7 +121,7 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
         done.append("Rows were being updated in place: their checksums have been recomputed.")
     if any(mode.dropped for mode in manifest.modes.values()):
         manifest_file.save(directory, manifest)  # from now on nothing refers to the files
-        _clear_dropped(directory, manifest)
+        clear_dropped(directory, manifest)
         done = done or ["The remains of removed partitions have been deleted."]
     return done + _clear_unlisted(directory, manifest)
 
@@ -155,7 +155,8 @@ def _close(directory: Path, mode: Mode, partition: Partition) -> str:
     return what
 
 
-def _clear_dropped(directory: Path, manifest: Manifest) -> None:
+def clear_dropped(directory: Path, manifest: Manifest) -> None:
+    """Remove what is left of the files of removed partitions."""
     for mode in manifest.modes.values():
         for partition in mode.dropped:
             remove_files(directory, mode.fields, partition)
@@ -163,16 +164,39 @@ def _clear_dropped(directory: Path, manifest: Manifest) -> None:
 
 
 def _clear_unlisted(directory: Path, manifest: Manifest) -> list[str]:
-    """Remove partition files without rows that the manifest does not list; set torn ones aside."""
+    """Remove partitions without rows that the manifest does not list; set torn files aside."""
     done = []
+    counts: dict[tuple[str, str, int], dict[Path, int]] = {}
     for path in _unlisted(directory, manifest):
         try:
-            if not inspect(path).rows:
-                files.remove(path)
+            found = inspect(path)
         except DatasetError as error:
             if _is_torn(path):
                 done.append(f"{error} It was moved to {set_aside(directory, [path])}.")
+        else:
+            identity = found.identity
+            key = identity.mode, identity.session, identity.index
+            counts.setdefault(key, {})[path] = found.rows
+    unfinished = [group for group in counts.values() if not all(group.values())]
+    if unfinished:
+        manifest_file.save(directory, manifest)  # the one on the disk may refer to the files
+    for group in unfinished:
+        _remove_unfinished(directory, group)
     return done
+
+
+def _remove_unfinished(directory: Path, counts: Mapping[Path, int]) -> None:
+    """Remove the files of a partition of which some have no row.
+
+    Those that have some go first: alone, they would look like a whole partition of fewer fields.
+    """
+    for path in counts:
+        if counts[path]:
+            files.remove(path)
+    if any(counts.values()):
+        files.sync_folder(directory)
+    for path in counts:
+        files.remove(path)
 
 
 def complete_checksums(directory: Path, manifest: Manifest) -> bool:

@@ -38,6 +38,8 @@ def repair(folder: Path) -> list[str]:
 def rebuild(folder: Path) -> None:
     """Rebuild the manifest from the partition files alone: see `Dataset.rebuild`."""
     with _lock(folder):
+        with contextlib.suppress(DatasetError, FileNotFoundError):
+            recovery.clear_dropped(folder, manifest_file.load(folder))
         if torn := list(_unlisted_damaged_files(folder)):
             set_aside(folder, torn)
         manifest = recovery.load_from_files(folder)
