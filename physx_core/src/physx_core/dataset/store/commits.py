@@ -53,9 +53,9 @@ class Commit(NamedTuple):
         return cls(rows, rows, _NO_DIGEST)
 
 
-def encode(commit: Commit) -> bytes:
+def encode(commit: tuple[int, int, int]) -> bytes:
     """Return the row count and the records when all records are the same."""
-    return COUNT.pack(commit.rows) + RECORD.pack(*commit) * RECORDS
+    return COUNT.pack(commit[0]) + RECORD.pack(*commit) * RECORDS
 
 
 def decode(content: bytes) -> tuple[int, tuple[Commit, ...]]:
@@ -77,12 +77,13 @@ def find_intact(
     """
     for commit in sorted(set(commits), reverse=True):
         start, stop = (data_offset + row * row_nbytes for row in (commit.base, commit.rows))
-        if _digest(descriptor, start, stop) == commit.digest:
+        digest = digest_of(descriptor, start, stop)
+        if digest is not None and digest.intdigest() == commit.digest:
             return commit
     return None
 
 
-def _digest(descriptor: int, start: int, stop: int) -> int | None:
+def digest_of(descriptor: int, start: int, stop: int) -> xxh3_64 | None:
     """Return the digest of some bytes of a file; None if it does not have them."""
     if start > stop or stop > files.size(descriptor):
         return None
@@ -92,7 +93,7 @@ def _digest(descriptor: int, start: int, stop: int) -> int | None:
         if not files.read_at(descriptor, part, place):
             return None
         digest.update(part)
-    return digest.intdigest()
+    return digest
 
 
 @functools.cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import struct
 import threading
 from pathlib import Path
 
@@ -10,13 +11,15 @@ from xxhash import xxh3_64
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
-from physx_core.dataset.store.commits import COUNT, RECORD, Commit, encode
+from physx_core.dataset.store.commits import COUNT, RECORD, Commit, digest_of, encode
+from physx_core.dataset.store.digesting import LARGE, Digester
 from physx_core.dataset.store.partition_format import Header, Identity, make_header
 from physx_core.typing import Array
 
 _SMALLEST_STEP = 2**20
 _LARGEST_STEP = 2**26
 _COPY = 2**23
+_NEWEST = struct.Struct("<4Q")  # the row count and the newest record
 
 
 class PartitionFile:
@@ -29,36 +32,48 @@ class PartitionFile:
         data_offset: Offset of the first row.
         descriptor: The open file; -1 if it is closed.
         path: Its path, once it is published.
-        committed: The newest commit.
+        room: How many rows have their disk space already.
+        committed: The newest commit: rows, base and digest, as in `Commit`.
     """
 
-    def __init__(self, path: Path, identity: Identity, header: Header, descriptor: int) -> None:
+    def __init__(
+        self,
+        path: Path,
+        identity: Identity,
+        header: Header,
+        descriptor: int,
+        digester: Digester,
+    ) -> None:
         self.identity = identity
         self.data_offset = header.data_offset
         self.path = path
-        self.committed = Commit.unchecked(0)
-        self._pending = self.committed
-        self._digest = self._written = xxh3_64()
-        self._next_mark = self._pending_mark = 0
+        self.committed: tuple[int, int, int] = Commit.unchecked(0)
+        self._digest, self._digester = xxh3_64(), digester
+        self._next_mark = 0
         self._lock = threading.Lock()
         self._row_nbytes = identity.field.nbytes
         self._rows_offset = header.rows_offset
         self._size = header.size
         self._reserved = len(header.content)
+        self.room = 0
         self.descriptor = descriptor
 
     @classmethod
-    def create(cls, directory: Path, identity: Identity, capacity: int) -> PartitionFile:
+    def create(
+        cls, directory: Path, identity: Identity, capacity: int, digester: Digester
+    ) -> PartitionFile:
         """Write an empty partition file under a temporary name and wait until it is on the disk.
 
         Args:
             directory: The dataset's folder.
             identity: What the file is part of.
             capacity: How many rows fit in.
+            digester: Computes the digests.
         """
         header = make_header(identity, capacity)
         path = directory / identity.file_name
-        file = cls(path, identity, header, _write_header(files.temporary_path(path), header))
+        descriptor = _write_header(files.temporary_path(path), header)
+        file = cls(path, identity, header, descriptor, digester)
         try:
             file.sync()
         except OSError:
@@ -79,8 +94,6 @@ class PartitionFile:
     def reserve(self, rows: int) -> None:
         """Allocate disk space for the first `rows` rows, and for some more."""
         needed = self.data_offset + rows * self._row_nbytes
-        if needed <= self._reserved:
-            return
         step = min(max(self._reserved, _SMALLEST_STEP), _LARGEST_STEP)
         ample = min(max(needed, self._reserved + step), self._size)
         try:
@@ -88,6 +101,7 @@ class PartitionFile:
         except OSError as error:
             if error.errno in (errno.EOPNOTSUPP, errno.EINVAL):  # not supported here
                 self._reserved = self._size
+                self._allocate(self._size)
             elif error.errno in files.FULL:
                 self._allocate(needed)
             else:
@@ -100,41 +114,53 @@ class PartitionFile:
             row: Number of the first one in the file.
             block: Contiguous rows of the field's own type, shape (count, *field shape).
         """
-        self._written = self._digest.copy()
-        if self._row_nbytes:
-            content = files.as_bytes(block)
-            offset = self.data_offset + row * self._row_nbytes
-            files.write_at(self.descriptor, content, offset)
-            self._written.update(content)
+        if not self._row_nbytes:
+            return
+        content = files.as_bytes(block)
+        if len(content) < LARGE and not self._digester.pending:
+            self._digest.update(content)
+        else:
+            self._digester.update(self._digest, content)
+        files.write_at(self.descriptor, content, self.data_offset + row * self._row_nbytes)
 
     def commit(self, rows: int, *, durable: bool) -> None:
         """Make the first `rows` rows part of the dataset, the last of which were just written.
 
-        The commit stands once it is accepted; until then it can be withdrawn.
-
         Args:
             rows: How many rows.
-            durable: Whether the caller syncs the file before accepting the commit.
+            durable: Whether the caller syncs the file before it goes on.
         """
-        pending = Commit(rows, self.committed.base, self._written.intdigest())
-        content = COUNT.pack(rows) + RECORD.pack(*pending)
+        if self._digester.pending:
+            self._digester.wait()
+        before = self.committed
+        commit = rows, before[1], self._digest.intdigest()
+        content = _NEWEST.pack(rows, *commit)
         if durable:
-            marks = [pending, self.committed]
-            content += b"".join(RECORD.pack(*mark) for mark in marks[:: 1 - 2 * self._next_mark])
+            first, second = (before, commit) if self._next_mark else (commit, before)
+            content += RECORD.pack(*first) + RECORD.pack(*second)
+            self._next_mark = 1 - self._next_mark
         files.write_at(self.descriptor, content, self._rows_offset)
-        self._pending, self._pending_mark = pending, self._next_mark ^ durable
+        self.committed = commit
 
-    def accept(self, *, durable: bool) -> None:
-        """Let the last commit stand; calling it again does nothing."""
-        self.committed, self._digest = self._pending, self._written
-        if durable:
-            self._next_mark = self._pending_mark
+    def withdraw(self, commit: tuple[int, int, int]) -> None:
+        """Return to an earlier commit, whatever has been written since.
 
-    def withdraw(self, *, durable: bool) -> None:
-        """Return to the commit that was accepted last."""
-        records = 1 + 2 * durable
-        content = COUNT.pack(self.committed.rows) + RECORD.pack(*self.committed) * records
-        files.write_at(self.descriptor, content, self._rows_offset)
+        Args:
+            commit: The commit, of the same base.
+        """
+        self._digester.wait()
+        rows, base, _ = commit
+        with self._lock:
+            self.committed = commit
+            start, stop = (self.data_offset + row * self._row_nbytes for row in (base, rows))
+            self._digest = digest_of(self.descriptor, start, stop) or xxh3_64()
+            files.sync(self.descriptor)
+            files.write_at(self.descriptor, encode(commit), self._rows_offset)
+            files.sync(self.descriptor)
+
+    def is_checked(self, row: int) -> bool:
+        """Return whether the digest covers a row, so that `settle` has to precede its update."""
+        return row >= self.committed[1]
 
     def mark(self) -> int:
         """Make the newest commit a mark, which the next sync is to bring to the disk.
@@ -148,14 +174,14 @@ class PartitionFile:
             place = COUNT.size + RECORD.size * (1 + self._next_mark)
             content = RECORD.pack(*self.committed)
             files.write_at(self.descriptor, content, self._rows_offset + place)
-            self._next_mark ^= 1
+            self._next_mark = 1 - self._next_mark
             return files.duplicate(self.descriptor)
 
     def settle(self) -> None:
         """Bring all rows to the disk and take their digest away, so that they may be updated."""
         with self._lock:
             files.sync(self.descriptor)
-            settled = Commit.unchecked(self.committed.rows)
+            settled = Commit.unchecked(self.committed[0])
             files.write_at(self.descriptor, encode(settled), self._rows_offset)
             files.sync(self.descriptor)
             self.committed, self._digest = settled, xxh3_64()
@@ -172,8 +198,10 @@ class PartitionFile:
             files.close(descriptor)
 
     def _allocate(self, end: int) -> None:
-        files.reserve(self.descriptor, self._reserved, end)
-        self._reserved = end
+        if end > self._reserved:
+            files.reserve(self.descriptor, self._reserved, end)
+            self._reserved = end
+        self.room = (self._reserved - self.data_offset) // max(1, self._row_nbytes)
 
 
 def copy(

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from itertools import chain
 from pathlib import Path
+from typing import Protocol
 
 from physx_core import files
 from physx_core.dataset.store.partition_file import PartitionFile, sync_named
 
 PERIOD = 1.0
 """Seconds between two syncs of the same file."""
+
+
+class Written(Protocol):
+    """A partition that is being written."""
+
+    files: dict[str, PartitionFile]
 
 
 class Syncer:
@@ -22,18 +30,18 @@ class Syncer:
 
     def __init__(self, period: float = PERIOD) -> None:
         self._period = period
-        self._files: dict[PartitionFile, None] = {}
+        self._partitions: dict[Written, None] = {}
         self._paths: dict[Path, None] = {}
         self._lock = threading.Lock()
         self._wake, self._end = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
         self._error: OSError | None = None
 
-    def note(self, file: PartitionFile) -> None:
-        """Schedule an open partition file, whose rows are synced and marked."""
-        if file not in self._files:
+    def note(self, partition: Written) -> None:
+        """Schedule an open partition, whose rows are synced and marked."""
+        if partition not in self._partitions:
             with self._lock:
-                self._files[file] = None
+                self._partitions[partition] = None
             self._start()
 
     def note_path(self, path: Path) -> None:
@@ -54,11 +62,11 @@ class Syncer:
     def sync(self) -> None:
         """Sync everything that is scheduled now; a failure is reported by `check`."""
         with self._lock:
-            opened, paths = list(self._files), list(self._paths)
-            self._files.clear()
+            opened, paths = list(self._partitions), list(self._paths)
+            self._partitions.clear()
             self._paths.clear()
         try:
-            for file in opened:
+            for file in chain.from_iterable(partition.files.values() for partition in opened):
                 _sync_marked(file)
             for path in paths:
                 with contextlib.suppress(FileNotFoundError):  # its partition has been removed

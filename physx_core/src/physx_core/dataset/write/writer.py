@@ -14,6 +14,7 @@ from physx_core.dataset.read.mode_statistics import compute_statistics, count_se
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.store import locks, manifest_file
+from physx_core.dataset.store.digesting import Digester
 from physx_core.dataset.store.manifest import Mode, Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.partition_file import PartitionFile
@@ -34,6 +35,7 @@ class OpenPartition:
     Attributes:
         partition: Its entry in the manifest.
         capacity: How many rows fit in.
+        files: The files by field.
     """
 
     def __init__(
@@ -45,7 +47,7 @@ class OpenPartition:
     ) -> None:
         self.partition = partition
         self.capacity = capacity
-        self._files = parts
+        self.files = parts
         self._syncer = syncer
 
     @property
@@ -55,52 +57,42 @@ class OpenPartition:
 
     def append(self, rows: Batch, start: int, count: int) -> None:
         """Write and commit rows `start` to `start + count` of a block; all of them, or none."""
-        parts, durable = self._files.values(), self._syncer is None
+        parts, durable = self.files.values(), self._syncer is None
         first = self.partition.rows
         last = first + count
         for file in parts:
-            file.reserve(last)
-        for name, file in self._files.items():
-            file.write(first, rows[name][start : start + count])
+            if file.room < last:
+                file.reserve(last)
+        before = [file.committed for file in parts]
         try:
+            for name, file in self.files.items():
+                file.write(first, rows[name][start : start + count])
             for file in parts:
                 file.commit(last, durable=durable)
             if durable:
-                self._sync()
+                for file in parts:
+                    file.sync()
+            self.partition.rows = last
         except BaseException:  # an interrupt, too: the next rows go to the same offsets
-            for file in parts:
-                file.withdraw(durable=durable)
+            self.partition.rows = first
+            for file, commit in zip(parts, before, strict=True):
+                file.withdraw(commit)
             raise
-        try:
-            self._accept(last)
-        except BaseException:
-            self._accept(last)
-            raise
+        if self._syncer is not None:
+            self._syncer.note(self)
 
     def settle(self, names: Iterable[str], last: int) -> None:
         """Prepare some fields for an update of rows up to `last`."""
         for name in names:
-            if last >= self._files[name].committed.base:
-                self._files[name].settle()
+            if self.files[name].is_checked(last):
+                self.files[name].settle()
 
     def close(self) -> None:
         """Close the files; the syncer syncs them once more."""
-        for file in self._files.values():
+        for file in self.files.values():
             file.close()
             if self._syncer is not None:
                 self._syncer.note_path(file.path)
-
-    def _accept(self, rows: int) -> None:
-        for file in self._files.values():
-            file.accept(durable=self._syncer is None)
-        self.partition.rows = rows
-        if self._syncer is not None:
-            for file in self._files.values():
-                self._syncer.note(file)
-
-    def _sync(self) -> None:
-        for file in self._files.values():
-            file.sync()
 
 
 class Writer:
@@ -132,6 +124,7 @@ class Writer:
         self._directory = store.directory
         self._max_nbytes = int(max_file_size * 1e9) - _HEADER
         self._syncer = None if durable else Syncer()
+        self._digester = Digester()
         self._reader = Reader(store.directory, store.manifest)
         self._open: dict[str, OpenPartition] = {}
         self._filled: dict[str, Partition] = {}
@@ -221,6 +214,7 @@ class Writer:
                 raise
         finally:
             self._sealer.shutdown()
+            self._digester.close()
             for opened in self._open.values():
                 opened.close()
             self._open.clear()
@@ -292,7 +286,9 @@ class Writer:
                 entry.follows = self._find_unsealed_before(mode_name, mode)
                 for name, field in mode.fields.items():
                     identity = entry.identity(field)
-                    parts[name] = PartitionFile.create(self._directory, identity, capacity)
+                    parts[name] = PartitionFile.create(
+                        self._directory, identity, capacity, self._digester
+                    )
                     entry.offsets[name] = parts[name].data_offset
                 for part in parts.values():
                     part.publish()
