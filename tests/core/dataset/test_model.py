@@ -114,6 +114,7 @@ class Mode:
     parts: list = field(default_factory=list)
     open: bool = False  # whether the last partition takes more rows
     pending: list = field(default_factory=list)
+    removed: dict = field(default_factory=dict)  # largest number of a removed partition
 
     def __post_init__(self):
         self.numbers = {name: np.zeros(0, np.int64) for name in self.fields}
@@ -138,7 +139,8 @@ class Mode:
             left -= count
 
     def next_index(self, session):
-        return 1 + max((part.index for part in self.parts if part.session == session), default=-1)
+        used = [part.index for part in self.parts if part.session == session]
+        return 1 + max([*used, self.removed.get(session, -1)])
 
     def snapshot(self):
         return {name: numbers.copy() for name, numbers in self.numbers.items()}
@@ -473,6 +475,7 @@ class Machine(RuleBasedStateMachine):
         assert self.dataset.remove_partition(mode, part.index, part.session) == part.rows
         first = sum(each.rows for each in model.parts[:which])
         del model.parts[which]
+        model.removed[part.session] = max(part.index, model.removed.get(part.session, -1))
         for name, numbers in model.numbers.items():
             model.numbers[name] = np.delete(numbers, slice(first, first + part.rows))
         self.iterations = [each for each in self.iterations if each.mode != mode]

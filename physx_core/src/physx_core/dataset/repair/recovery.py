@@ -284,7 +284,8 @@ def _is_partition(path: Path) -> bool:
     """Return whether a file claims to be a partition, judging by its first bytes."""
     try:
         with open_partition(path) as file:
-            return MAGIC in (file.read(2**14) or b"")
+            head = file.read(2**14) or b""
+            return MAGIC in head or FORMAT.encode() in head
     except DatasetError:  # a link, a pipe, or no permission to read it
         return False
 

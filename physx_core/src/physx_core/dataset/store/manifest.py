@@ -104,7 +104,7 @@ class Partition:
             start,
             self.rows,
             self.offsets.get(of.name, 0),
-            self.sealed or self.writing,
+            self.sealed,
             self.checksums.get(of.name),
             self._commit_of(of),
         )
@@ -140,12 +140,15 @@ class Mode:
         statistics: Statistics of floating fields, over the rows of all counted partitions.
         dropped: Partitions that do not belong to the mode though their files may exist: they are
             being removed, or copied from another dataset.
+        removed: Largest number of a removed partition, by session: no other gets it again, so that
+            a reader that still knows the removed one cannot take the other's rows for its rows.
     """
 
     fields: dict[str, Field]
     partitions: list[Partition] = field(default_factory=list)
     statistics: dict[str, RunningStatistics] = field(default_factory=dict)
     dropped: list[Partition] = field(default_factory=list)
+    removed: dict[str, int] = field(default_factory=dict)
 
     @property
     def rows(self) -> int:
@@ -198,7 +201,11 @@ class Mode:
     def copy(self) -> Mode:
         """Return a copy to change while this one stays; the partitions are shared."""
         return Mode(
-            dict(self.fields), list(self.partitions), dict(self.statistics), list(self.dropped)
+            dict(self.fields),
+            list(self.partitions),
+            dict(self.statistics),
+            list(self.dropped),
+            dict(self.removed),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -208,6 +215,8 @@ class Mode:
             "partitions": [partition.to_dict() for partition in self.partitions],
             "normalization": {name: s.to_dict() for name, s in self.statistics.items() if s.count},
         }
+        if self.removed:
+            plain["removed"] = self.removed
         if self.dropped:
             plain["dropped"] = [partition.to_dict() for partition in self.dropped]
         return plain

@@ -45,6 +45,8 @@ def _mode(mode_name: str, plain: Any) -> Mode:
         [_partition(mode_name, entry, fields) for entry in plain["partitions"]],
         dropped=[_partition(mode_name, entry, fields) for entry in plain.get("dropped", ())],
     )
+    for session, index in checked(dict, plain.get("removed", {}), "'removed'").items():
+        mode.removed[session] = whole(index, "the number of a partition", 2**31)
     keys = [partition.key for partition in (*mode.partitions, *mode.dropped)]
     if len(set(keys)) != len(keys):
         raise ValueError("a partition is listed twice")

@@ -39,7 +39,7 @@ from physx_core.fields import Field
 FORMAT = "physx partition"
 VERSION = 2
 READABLE = (2,)
-"""Versions of the partition file that can be read."""
+"""Versions of the header; `partition_v1` reads the files of version 1, which have none."""
 MAGIC = b"\x89physx\r\n"
 """Beginning of the dataset ``header``, which tells physx what it needs without HDF5."""
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -137,6 +137,8 @@ class Inspection:
     @property
     def certain(self) -> bool:
         """Whether all rows that the file counts can be read: the machine has not been off since."""
+        if not self.commits:
+            return True
         return self.rows == self.commits[0].rows and self.boot == boot_id() != ""
 
 
@@ -236,6 +238,8 @@ def find_rows(
         before = None
         while True:
             found = inspect_open(file, path, offset, row_nbytes)
+            if not found.commits:
+                return found, Commit.unchecked(found.rows)
             if found.certain and not thorough:
                 return found, found.commits[0]
             nbytes = found.identity.field.nbytes
@@ -274,9 +278,12 @@ def inspect_open(
     file: io.FileIO, path: Path, offset: int | None = None, row_nbytes: int = 0
 ) -> Inspection:
     """Return the header of an open partition file, as `inspect` does."""
+    from physx_core.dataset.store.partition_v1 import read_header  # imports this module
+
     _check_superblock(file, path, offset, row_nbytes)
     try:
-        found = _parse_header(_read_header(file.fileno()))
+        head = _read_header(file.fileno())
+        found = _parse_header(head) if MAGIC in head else read_header(file)
     except _INVALID as error:
         reason = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
         raise DatasetError(f"{path} is damaged or not a dataset's partition: {reason}.") from error

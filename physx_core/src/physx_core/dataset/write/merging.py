@@ -55,6 +55,7 @@ def drop_partition(writer: Writer, mode_name: str, session: str | None, index: i
         mode = manifest.modes[mode_name]
         del mode.partitions[mode.place(found)]
         mode.dropped.append(found)
+        mode.removed[found.session] = max(found.index, mode.removed.get(found.session, -1))
         if found.counted:
             mode.forget_statistics()
     writer.store.manifest.generation += 1

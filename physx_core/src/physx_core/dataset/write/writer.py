@@ -304,7 +304,8 @@ class Writer:
         """Return a partition with the first number whose files do not exist yet."""
         listed = (*mode.partitions, *mode.dropped)
         used = [partition.index for partition in listed if partition.session == self.session]
-        entry = Partition(mode_name, self.session, max(used, default=-1) + 1, mode.next_row)
+        last = max(mode.removed.get(self.session, -1), *used, -1)
+        entry = Partition(mode_name, self.session, last + 1, mode.next_row)
         while any(entry.path(self._directory, name).exists() for name in mode.fields):
             entry = replace(entry, index=entry.index + 1)
         return entry

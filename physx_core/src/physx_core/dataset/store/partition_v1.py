@@ -1,0 +1,80 @@
+"""Reads the headers of partition files of version 1, which only HDF5 describes.
+
+They have no records: their row count is all that is known of an open one.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+
+from physx_core.dataset.store.partition_format import FORMAT, Identity, Inspection
+from physx_core.fields import Field
+
+UNREADABLE = (
+    OSError, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError,
+    MemoryError,
+)  # fmt: skip
+"""What h5py raises for damaged files."""
+
+
+def read_header(file: io.FileIO) -> Inspection:
+    """Return what a partition file of version 1 says of itself.
+
+    Raises:
+        ValueError: If it is none, or damaged.
+    """
+    import h5py
+
+    try:
+        with h5py.File(file, "r") as content:
+            return _inspect(content)
+    except UNREADABLE as error:
+        raise ValueError(str(error)) from error
+
+
+def _inspect(content: Any) -> Inspection:
+    attributes = content.attrs
+    if attributes["format"] != FORMAT or int(attributes["format_version"]) != 1:
+        raise ValueError("it has no header of physx")
+    data, counter = _plain_dataset(content, "data"), _plain_dataset(content, "rows")
+    if counter.shape != () or counter.dtype != np.dtype("<u8") or not data.shape:
+        raise ValueError("its datasets do not have the shapes or types of a partition's")
+    field = Field(
+        str(attributes["field"]),
+        data.shape[1:],
+        data.dtype,
+        str(attributes["unit"]),
+        str(attributes["role"]),  # type: ignore[arg-type]
+    )
+    if np.dtype(field.dtype) != data.dtype or field.role not in ("training", "additional"):
+        raise ValueError(f"{data.dtype} and {field.role!r} are not the type and role of a field")
+    counter_offset, data_offset = counter.id.get_offset(), data.id.get_offset()
+    if counter_offset is None or (data_offset is None and data.size * field.nbytes):
+        raise ValueError("it has no space allocated for rows")
+    identity = Identity(
+        str(attributes["session"]),
+        str(attributes["mode"]),
+        field,
+        int(attributes["partition"]),
+        int(attributes["first_row"]),
+    )
+    rows = min(int(counter[()]), data.shape[0])
+    return Inspection(identity, data.shape[0], rows, counter_offset, data_offset or 0, (), "")
+
+
+def _plain_dataset(content: Any, name: str) -> Any:
+    """Return a dataset whose bytes are contiguous in this very file."""
+    import h5py
+
+    if not isinstance(content.get(name, getlink=True), h5py.HardLink):
+        raise ValueError(f"{name!r} is a link")
+    dataset = content[name]
+    if not isinstance(dataset, h5py.Dataset):
+        raise ValueError(f"{name!r} is not an array")
+    layout = dataset.id.get_create_plist()
+    if layout.get_layout() != h5py.h5d.CONTIGUOUS or layout.get_external_count():
+        raise ValueError(f"{name!r} is not stored contiguously in this file")
+    return dataset
