@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 
@@ -381,3 +383,15 @@ def test_rebuilding_forgets_what_was_being_removed_and_what_was_never_committed(
         assert_array_equal(dataset["training"]["y"][:], expected)
         assert dataset.verify() == []
     assert not list(folder.glob("*_test_*"))
+
+
+def test_a_header_of_version_1_whose_heap_is_torn_is_an_error_and_not_read_for_ever(folder):
+    shutil.copytree(OLD, folder)
+    path = folder / "first_training_x_0.h5"
+    content = path.read_bytes()
+    objects = content.index(b"GCOL") + 16
+    path.write_bytes(content[:objects] + bytes(512) + content[objects + 512 :])
+    code = "import sys; from physx_core import Dataset; print(Dataset.open(sys.argv[1]).verify())"
+    command = [sys.executable, "-c", code, str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert path.name in done.stdout

@@ -90,7 +90,7 @@ def load_from_files(directory: Path) -> Manifest:
 
 def damaged_files(directory: Path) -> Iterator[tuple[Path, DatasetError]]:
     """Yield the partition files that cannot be opened, and why."""
-    for path in sorted(directory.glob("*.h5")):
+    for path in (p for p in sorted(directory.glob("*.h5")) if _NAME.fullmatch(p.name)):
         try:
             inspect(path)
         except DatasetError as error:

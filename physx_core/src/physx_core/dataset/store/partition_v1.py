@@ -6,10 +6,12 @@ They have no records: their row count is all that is known of an open one.
 from __future__ import annotations
 
 import io
+import struct
 from typing import Any
 
 import numpy as np
 
+from physx_core import files
 from physx_core.dataset.store.partition_format import FORMAT, Identity, Inspection
 from physx_core.fields import Field
 
@@ -20,6 +22,11 @@ UNREADABLE = (
 """What h5py raises for damaged files."""
 
 
+_HEAP = b"GCOL\1\0\0\0"
+_OBJECT = struct.Struct("<HHIQ")  # number, references, reserved, size
+_LONGEST = 2**16
+
+
 def read_header(file: io.FileIO) -> Inspection:
     """Return what a partition file of version 1 says of itself.
 
@@ -28,11 +35,29 @@ def read_header(file: io.FileIO) -> Inspection:
     """
     import h5py
 
+    _check_heaps(files.read_head(file.fileno(), _LONGEST))
     try:
         with h5py.File(file, "r") as content:
             return _inspect(content)
     except UNREADABLE as error:
         raise ValueError(str(error)) from error
+
+
+def _check_heaps(head: bytes) -> None:
+    """Check that HDF5 gets to the end of the heaps that hold the texts of attributes.
+
+    It would read an empty object, as lost sectors leave it, for ever.
+    """
+    start = head.find(_HEAP)
+    while start >= 0:
+        place = start + _OBJECT.size
+        end = min(start + int.from_bytes(head[start + 8 : place], "little"), len(head))
+        while place + _OBJECT.size <= end:
+            number, _, _, size = _OBJECT.unpack_from(head, place)
+            if number == 0 and size == 0:
+                raise ValueError("its header is damaged")
+            place += size if number == 0 else _OBJECT.size + size + -size % 8
+        start = head.find(_HEAP, start + 1)
 
 
 def _inspect(content: Any) -> Inspection:
