@@ -104,6 +104,23 @@ def test_an_interrupted_update_is_completed(folder, tmp_path, thousand):
     thousand.check(tmp_path / "killed", rows)
 
 
+def test_statistics_do_not_tell_of_updates_that_the_disk_does_not_have(folder, tmp_path):
+    dataset = Dataset.create(folder, max_file_size=1.7e-5)
+    dataset.append("training", {"x": np.arange(100.0)})  # 77 of them are sealed
+    dataset.recompute_normalization()
+    path = folder / "run_training_x_0.h5"
+    before = path.read_bytes()
+    dataset.update("training", slice(0, 10), {"x": np.full(10, -1e6)})
+    assert dataset.recompute_normalization()["x"].mean < -1e3
+    shutil.copytree(folder, tmp_path / "cut")
+    dataset.close()
+    (tmp_path / "cut" / path.name).write_bytes(before)
+    for writable in (False, True, False):
+        with Dataset.open(tmp_path / "cut", writable=writable) as dataset:
+            mean = dataset["training"]["x"][:].mean()
+            assert dataset.normalization["x"].mean == pytest.approx(mean)
+
+
 def test_a_reader_sees_updates_when_it_refreshes(folder, thousand):
     thousand.write(folder)
     with Dataset.open(folder) as reader, Dataset.open(folder, writable=True) as dataset:

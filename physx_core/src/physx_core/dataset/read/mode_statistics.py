@@ -27,11 +27,15 @@ def compute_statistics(reader: Reader, mode_name: str) -> Statistics:
 
 
 def count_sealed(mode: Mode) -> None:
-    """Merge into the mode's statistics those of sealed partitions that cover all their rows."""
+    """Merge into the mode's statistics those of sealed partitions that cover all their rows.
+
+    Rows that were updated in place are left out until they have checksums again: the disk may not
+    have them yet.
+    """
     for place, partition in enumerate(mode.partitions):
         have = (partition.running.get(name) for name in mode.counted_fields)
         complete = all(s is not None and s.count == partition.rows for s in have)
-        if partition.sealed and not partition.counted and complete:
+        if partition.checksums and not partition.counted and complete:
             mode.statistics = merge_statistics(mode.statistics, partition.running)
             mode.partitions[place] = replace(partition, counted=True, running={})
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -206,10 +205,7 @@ def complete_checksums(directory: Path, manifest: Manifest) -> bool:
         for partition in [p for p in mode.partitions if p.sealed and not p.checksums]:
             changed = True
             sync_files(directory, mode.fields, partition)
-            found = scan(directory, mode.fields, partition)
-            if partition.counted:
-                found = replace(found, counted=True, running={})
-            mode.swap(found)
+            mode.swap(scan(directory, mode.fields, partition))
     return changed
 
 

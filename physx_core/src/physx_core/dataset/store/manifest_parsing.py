@@ -85,7 +85,7 @@ def _partition(mode_name: str, plain: Any, fields: Mapping[str, Field]) -> Parti
         sealed=sealed,
         offsets=offsets,
         checksums={n: int(checked(str, crc, "a checksum"), 16) for n, crc in crc32.items()},
-        counted=sealed and plain.get("counted") is True,
+        counted=sealed and bool(crc32) and plain.get("counted") is True,
         follows=follows,
     )
 
