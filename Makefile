@@ -32,6 +32,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/transport.py
 	$(BIN)/python benchmarks/faults.py
 	$(BIN)/python benchmarks/dataset.py
+	$(BIN)/python benchmarks/crash.py
 	$(BIN)/python benchmarks/checkpoint.py
 	$(BIN)/python benchmarks/backends.py
 	$(BIN)/python benchmarks/differentiable.py

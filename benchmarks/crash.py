@@ -1,0 +1,110 @@
+"""Power cuts: every legal state of the disk is opened, and nothing wrong is ever read back.
+
+Histories of calls are drawn by chance, and everything that they do to the disk is recorded. The
+states that a cut may leave at each moment are built in memory (`tests/core/crash/powercut/disk.py`
+says which they are), opened as after the next start of the machine, and compared with what had been
+promised at that moment. Some are also verified, opened for writing, repaired and rebuilt.
+
+    python benchmarks/crash.py                # one minute
+    python benchmarks/crash.py --check        # 15 minutes; ends with status 1 if a target is missed
+    python benchmarks/crash.py --check --small
+    python benchmarks/crash.py --seconds 100 --first 5000
+    python benchmarks/crash.py --replay 36/0/110/5    # what a problem says: one state, or one seed
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import multiprocessing
+import os
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "core" / "crash"))
+
+from measure import claim
+from powercut.checker import Problem, Result, campaign, replay
+
+PROCESSES = 2
+SHOWN = 20
+FULL = {"seconds": 900.0, "states": 500_000}
+SMALL = {"seconds": 55.0, "states": 20_000}
+
+
+def folder() -> Path:
+    """Return a new folder, in memory if possible."""
+    memory = Path("/dev/shm")
+    return Path(tempfile.mkdtemp(dir=memory if memory.is_dir() else None))
+
+
+def work(first: int, seconds: float) -> Result:
+    """Examine every `PROCESSES`-th history from one on."""
+    root = folder()
+    try:
+        return campaign(itertools.count(first, PROCESSES), root, seconds)
+    finally:
+        shutil.rmtree(root)
+
+
+def examine(first: int, seconds: float) -> Result:
+    """Examine histories in several processes."""
+    total = Result()
+    with multiprocessing.get_context("spawn").Pool(PROCESSES) as pool:
+        jobs = [(first + number, seconds) for number in range(PROCESSES)]
+        for result in pool.starmap(work, jobs, chunksize=1):
+            total.add(result)
+    return total
+
+
+def show(problems: list[Problem]) -> None:
+    """Print problems, and how to replay them."""
+    for problem in problems[:SHOWN]:
+        print(f"{problem}\n    replay: python benchmarks/crash.py --replay {problem.place}")
+    if len(problems) > SHOWN:
+        print(f"... and {len(problems) - SHOWN} more")
+
+
+def run_replay(place: str) -> None:
+    """Examine one history again, and tell everything about one of its states."""
+    root = folder()
+    try:
+        problems = replay(place, root)
+    finally:
+        shutil.rmtree(root)
+    show(problems)
+    sys.exit(1 if problems else 0)
+
+
+def main() -> None:
+    """Examine states and print what was found."""
+    parser = argparse.ArgumentParser(description="Examine what power cuts may leave.")
+    parser.add_argument("--check", action="store_true", help="end with status 1 on a miss")
+    parser.add_argument("--small", action="store_true", help="a minute instead of 15")
+    parser.add_argument("--seconds", type=float, help="how long")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--replay", metavar="PLACE", help="seed, or place of a problem")
+    given = parser.parse_args()
+    if given.replay:
+        run_replay(given.replay)
+    size = FULL if given.check and not given.small else SMALL
+    began = time.monotonic()
+    found = examine(given.first, given.seconds or size["seconds"])
+    seconds = time.monotonic() - began
+    rate = found.distinct / seconds
+    print(f"{found.histories} histories in {seconds:.0f} s on {os.cpu_count()} cores")
+    print(
+        f"{found.distinct} different states, {rate:.0f} each second, {found.examined} comparisons"
+    )
+    print(f"done with some of them: {dict(found.deep)}")
+    show(found.problems)
+    met = claim("violations", len(found.problems), at_most=0)
+    met &= claim("different states", found.distinct, at_least=size["states"])
+    sys.exit(1 if given.check and not met else 0)
+
+
+if __name__ == "__main__":
+    main()

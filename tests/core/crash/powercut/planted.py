@@ -1,0 +1,207 @@
+"""Bugs that a checker of power cuts must find: each is planted in the product for a while."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from physx_core import checkpoint, files
+from physx_core.dataset.repair import recovery
+from physx_core.dataset.store import partition_format, syncing
+from physx_core.dataset.store.partition_file import PartitionFile
+from physx_core.dataset.write import updating
+from physx_core.dataset.write.writer import OpenPartition
+
+
+@dataclass(frozen=True)
+class Bug:
+    """A bug.
+
+    Attributes:
+        what: What is wrong.
+        planted: Returns a context in which it is there.
+        checkpoints: Whether it is one of checkpoints.
+        first: Seed of the first history to look at.
+    """
+
+    what: str
+    planted: Callable[[], AbstractContextManager[Any]]
+    checkpoints: bool = False
+    first: int = 0
+
+
+@contextlib.contextmanager
+def _skipped(name: str, caller: str) -> Iterator[None]:
+    """Leave out what one function does with `physx_core.files`."""
+    do = getattr(files, name)
+
+    def maybe(*given: Any) -> Any:
+        return None if sys._getframe(1).f_code.co_name == caller else do(*given)
+
+    with mock.patch.object(files, name, maybe):
+        yield
+
+
+def _skip(name: str, caller: str) -> Callable[[], AbstractContextManager[Any]]:
+    return lambda: _skipped(name, caller)
+
+
+def _instead(owner: Any, name: str, new: Any) -> Callable[[], AbstractContextManager[Any]]:
+    return lambda: mock.patch.object(owner, name, new)
+
+
+def _unsynced(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function during which partition files are not synced."""
+
+    def without(*given: Any) -> Any:
+        with mock.patch.object(PartitionFile, "sync", lambda self: None):
+            return function(*given)
+
+    return without
+
+
+def _append_committing_late(self: Any, rows: Any, start: int, count: int) -> None:
+    first, last, durable = self.partition.rows, self.partition.rows + count, self._syncer is None
+    for name, file in self.files.items():
+        if file.room < last:
+            file.reserve(last)
+        file.write(first, rows[name][start : start + count])
+        if durable:
+            file.sync()
+    for file in self.files.values():
+        file.commit(last, durable=durable)
+    self.partition.rows = last
+    if self._syncer is not None:
+        self._syncer.note(self)
+
+
+def _append_committing_early(self: Any, rows: Any, start: int, count: int) -> None:
+    first, last, durable = self.partition.rows, self.partition.rows + count, self._syncer is None
+    for name, file in self.files.items():
+        part = rows[name][start : start + count]
+        with mock.patch.object(files, "write_at", lambda *_: None):
+            file.write(first, part)
+        file.commit(last, durable=durable)
+        if durable:
+            file.sync()
+        place = file.data_offset + first * file.identity.field.nbytes
+        files.write_at(file.descriptor, files.as_bytes(part), place)
+    self.partition.rows = last
+    if self._syncer is not None:
+        self._syncer.note(self)
+
+
+def _no_mark(self: Any) -> int:
+    return files.duplicate(self.descriptor) if self.descriptor >= 0 else -1
+
+
+def _mark_one_place(self: Any) -> int:
+    self._next_mark = 0
+    return int(_mark(self))
+
+
+def _settle_unsynced(self: Any) -> None:
+    with _skipped("sync", "settle"):
+        _settle(self)
+
+
+_mark, _settle = PartitionFile.mark, PartitionFile.settle
+
+
+def _newest_record(_: int, __: int, ___: int, commits: Any) -> Any:
+    return max(commits)
+
+
+def _publish_removing_first(partial: Path, path: Path) -> None:
+    files.sync_folder(partial)
+    if path.is_dir():
+        files.remove_folder(path)
+    files.rename(partial, path)
+    files.sync_folder(path.parent)
+
+
+def _publish_forgetting_early(partial: Path, path: Path) -> None:
+    files.sync_folder(partial)
+    former = path.with_name(f".{path.name}.former")
+    if path.is_dir():
+        files.rename(path, former)
+    files.rename(partial, path)
+    files.remove_folder(former)
+    files.sync_folder(path.parent)
+
+
+BUGS = (
+    Bug(
+        "a new file's header is not synced",
+        _instead(PartitionFile, "create", _unsynced(PartitionFile.create)),
+    ),
+    Bug("the manifest is renamed before it is synced", _skip("sync", "replace")),
+    Bug("the manifest's new name is not synced", _skip("sync_folder", "replace")),
+    Bug(
+        "a durable append does not sync",
+        _instead(OpenPartition, "append", _unsynced(OpenPartition.append)),
+    ),
+    Bug(
+        "a durable append commits after its sync",
+        _instead(OpenPartition, "append", _append_committing_late),
+    ),
+    Bug("rows are committed first", _instead(OpenPartition, "append", _append_committing_early)),
+    Bug("digests are not compared", _instead(partition_format, "find_intact", _newest_record)),
+    Bug(
+        "a power cut is not noticed",
+        _instead(partition_format.Inspection, "certain", property(lambda self: True)),
+    ),
+    Bug("no marks are made", _instead(PartitionFile, "mark", _no_mark)),
+    Bug("there is only one mark", _instead(PartitionFile, "mark", _mark_one_place), first=36),
+    Bug(
+        "rows that follow lost ones are given out",
+        _instead(recovery, "_discard_behind_lost_rows", lambda mode: None),
+    ),
+    Bug("a sealed copy replaces its original unsynced", _skip("sync", "copy")),
+    Bug("a full partition is sealed unsynced", _skip("sync_file", "seal")),
+    Bug("the names of sealed copies are not synced", _skip("sync_folder", "seal")),
+    Bug(
+        "an update is not synced",
+        _instead(syncing.Syncer, "note_path", lambda self, path: None),
+    ),
+    Bug("a durable update does not sync", _skip("sync_file", "update")),
+    Bug(
+        "rows with a digest are updated",
+        _instead(OpenPartition, "settle", lambda self, names, last: None),
+    ),
+    Bug(
+        "rows that are not on the disk lose their digest",
+        _instead(PartitionFile, "settle", _settle_unsynced),
+    ),
+    Bug(
+        "updated rows of full partitions keep their digest",
+        _instead(
+            updating, "unseal", lambda _, __, part: replace(part, checksums={}, counted=False)
+        ),
+        first=17,
+    ),
+    Bug(
+        "merged files are listed before their names are synced",
+        _skip("sync_folder", "add_partitions"),
+    ),
+    Bug("removed files may come back", _skip("sync_folder", "remove_files")),
+    Bug("a checkpoint's files are not synced", _skip("sync_file", "save"), checkpoints=True),
+    Bug("a checkpoint's name is not synced", _skip("sync_folder", "_publish"), checkpoints=True),
+    Bug(
+        "the former best checkpoint is removed first",
+        _instead(checkpoint, "_publish", _publish_removing_first),
+        checkpoints=True,
+    ),
+    Bug(
+        "the former best checkpoint is removed before the new one is on the disk",
+        _instead(checkpoint, "_publish", _publish_forgetting_early),
+        checkpoints=True,
+    ),
+)
+"""Bugs, each in one place."""
