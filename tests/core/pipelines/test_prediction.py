@@ -72,7 +72,8 @@ def take(mode="prediction", session="training"):
     with Dataset.open(f"sessions/{session}", writable=True) as dataset:
         assert dataset.verify() == []
         rows = {name: view[:] for name, view in dataset[mode].items()}
-        dataset.remove_partition(mode, 0)
+        (path,) = dataset.directory.glob(f"*_{mode}_{next(iter(rows))}_*.h5")
+        dataset.remove_partition(mode, int(path.stem.rpartition("_")[2]))
     return rows
 
 

@@ -153,7 +153,7 @@ MERGED = range(10**6, 10**6 + 200)
 
 def curation(steps):
     """Partitions after so many steps of `curated`, and the next step: number to rows' numbers."""
-    parts, step = {}, None
+    parts, step, used = {}, None, 0
     for number in range(steps + 1):
         if number:
             kind, what = step
@@ -161,7 +161,8 @@ def curation(steps):
                 del parts[what]
             else:
                 for rows in what:
-                    parts[max(parts, default=-1) + 1] = rows
+                    parts[used] = rows
+                    used += 1
         chance = random.Random(number)
         kind = chance.choice(("append", "append", "merge", "remove"))
         if len(parts) > 12 or (kind == "remove" and parts):

@@ -32,6 +32,7 @@ from physx_core.dataset.store.commits import (
     encode,
     find_intact,
 )
+from physx_core.dataset.store.partition_v1 import HeaderV1, read_header
 from physx_core.dataset.store.validation import SESSION, checked, parse_field, parse_name, whole
 from physx_core.errors import DatasetError, PhysxError
 from physx_core.fields import Field
@@ -278,12 +279,10 @@ def inspect_open(
     file: io.FileIO, path: Path, offset: int | None = None, row_nbytes: int = 0
 ) -> Inspection:
     """Return the header of an open partition file, as `inspect` does."""
-    from physx_core.dataset.store.partition_v1 import read_header  # imports this module
-
     _check_superblock(file, path, offset, row_nbytes)
     try:
         head = _read_header(file.fileno())
-        found = _parse_header(head) if MAGIC in head else read_header(file)
+        found = _parse_header(head) if MAGIC in head else _from_version_1(read_header(file))
     except _INVALID as error:
         reason = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
         raise DatasetError(f"{path} is damaged or not a dataset's partition: {reason}.") from error
@@ -292,6 +291,13 @@ def inspect_open(
     if size < expected:
         raise truncated(path, size, expected, found.data_offset, field.nbytes)
     return found
+
+
+def _from_version_1(header: HeaderV1) -> Inspection:
+    identity = Identity(header.session, header.mode, header.field, header.index, header.first_row)
+    return Inspection(
+        identity, header.capacity, header.rows, header.rows_offset, header.data_offset, (), ""
+    )
 
 
 def truncated(path: Path, actual: int, expected: int, offset: int, row_nbytes: int) -> DatasetError:

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import io
 import struct
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from physx_core import files
-from physx_core.dataset.store.partition_format import FORMAT, Identity, Inspection
 from physx_core.fields import Field
 
 UNREADABLE = (
@@ -27,7 +27,22 @@ _OBJECT = struct.Struct("<HHIQ")  # number, references, reserved, size
 _LONGEST = 2**16
 
 
-def read_header(file: io.FileIO) -> Inspection:
+@dataclass(frozen=True)
+class HeaderV1:
+    """What a partition file of version 1 says of itself: see `Identity` and `Inspection`."""
+
+    session: str
+    mode: str
+    field: Field
+    index: int
+    first_row: int
+    capacity: int
+    rows: int
+    rows_offset: int
+    data_offset: int
+
+
+def read_header(file: io.FileIO) -> HeaderV1:
     """Return what a partition file of version 1 says of itself.
 
     Raises:
@@ -60,9 +75,9 @@ def _check_heaps(head: bytes) -> None:
         start = head.find(_HEAP, start + 1)
 
 
-def _inspect(content: Any) -> Inspection:
+def _inspect(content: Any) -> HeaderV1:
     attributes = content.attrs
-    if attributes["format"] != FORMAT or int(attributes["format_version"]) != 1:
+    if attributes["format"] != "physx partition" or int(attributes["format_version"]) != 1:
         raise ValueError("it has no header of physx")
     data, counter = _plain_dataset(content, "data"), _plain_dataset(content, "rows")
     if counter.shape != () or counter.dtype != np.dtype("<u8") or not data.shape:
@@ -79,15 +94,17 @@ def _inspect(content: Any) -> Inspection:
     counter_offset, data_offset = counter.id.get_offset(), data.id.get_offset()
     if counter_offset is None or (data_offset is None and data.size * field.nbytes):
         raise ValueError("it has no space allocated for rows")
-    identity = Identity(
-        str(attributes["session"]),
-        str(attributes["mode"]),
-        field,
-        int(attributes["partition"]),
-        int(attributes["first_row"]),
+    return HeaderV1(
+        session=str(attributes["session"]),
+        mode=str(attributes["mode"]),
+        field=field,
+        index=int(attributes["partition"]),
+        first_row=int(attributes["first_row"]),
+        capacity=data.shape[0],
+        rows=min(int(counter[()]), data.shape[0]),
+        rows_offset=counter_offset,
+        data_offset=data_offset or 0,
     )
-    rows = min(int(counter[()]), data.shape[0])
-    return Inspection(identity, data.shape[0], rows, counter_offset, data_offset or 0, (), "")
 
 
 def _plain_dataset(content: Any, name: str) -> Any:
