@@ -72,8 +72,9 @@ def take(mode="prediction", session="training"):
     with Dataset.open(f"sessions/{session}", writable=True) as dataset:
         assert dataset.verify() == []
         rows = {name: view[:] for name, view in dataset[mode].items()}
-        (path,) = dataset.directory.glob(f"*_{mode}_{next(iter(rows))}_*.h5")
-        dataset.remove_partition(mode, int(path.stem.rpartition("_")[2]))
+        names = [path.stem for path in dataset.directory.glob(f"*_{mode}_*.h5")]
+        (number,) = {int(name.rpartition("_")[2]) for name in names}
+        dataset.remove_partition(mode, number)
     return rows
 
 
