@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import faulthandler
+import gc
 import itertools
 import random
 import shutil
@@ -23,8 +24,10 @@ LONGEST = 60.0
 """Seconds after which looking at a hundred states counts as endless."""
 CHECKPOINTS = 0.1
 """Share of the histories that save checkpoints."""
-DEEP = 8
+DEEP = 16
 """Of so many different states, one is also verified, written to, repaired or rebuilt."""
+KILLS = 3
+"""Of so many moments, one is also that of a kill of the process, after which nothing is lost."""
 STATES = 600
 """About how many states of one history are built."""
 UNREAD = ("dataset.lock", "dataset.json.lock")
@@ -110,6 +113,8 @@ class Checker:
     def check(self, seed: int) -> Result:
         """Examine the history that a seed stands for; return what was found in it."""
         result = Result(histories=1)
+        gc.collect()
+        gc.freeze()
         for folder in (self._work, self._aside):
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
@@ -187,7 +192,7 @@ class _Part:
             disk.advance(moment)
             same = 0
             for number, choice in enumerate(disk.choices(self._chance(moment))):
-                if number >= self._each + 5 or same > 6:
+                if number >= self._each + 5 or same > 4:
                     break
                 problem = self._examine(disk.build(choice), promise, moment, number)
                 same = 0 if problem is not None else same + 1
@@ -226,7 +231,7 @@ class _Part:
         print(f"cut: {choice.plan}; names that have changed: {choice.names}")
         for name, content in sorted(tree.items()):
             print(f"  {name}: {'folder' if content is None else f'{len(content)} bytes'}")
-        print(f"seen: {self._look(tree, _key(tree), power=number > 0)}")
+        print(f"seen: {self._look(tree, _key(tree), _is_cut(moment, number))}")
 
     def _moments(self) -> Iterator[tuple[int, Promise]]:
         """Yield each moment with what is promised then."""
@@ -242,7 +247,7 @@ class _Part:
 
     def _examine(self, tree: Tree, promise: Promise, moment: int, number: int) -> str | None:
         """Return what is wrong with a state, empty if nothing, None if it is known already."""
-        key, power = _key(tree), number > 0
+        key, power = _key(tree), _is_cut(moment, number)
         if (key, id(promise), power) in self._compared:
             return None
         self._compared.add((key, id(promise), power))
@@ -269,6 +274,11 @@ class _Part:
             Stage.now.boot = "another" if power else self._part.boot
             self._seen[key] = self._history.look(self._folder.path)
         return self._seen[key]
+
+
+def _is_cut(moment: int, number: int) -> bool:
+    """Return whether the power is cut; otherwise the process is killed and the disk is as it is."""
+    return number > 0 or moment % KILLS != 0
 
 
 def _key(tree: Tree) -> int:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import random
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 from physx_core import Field, NetworkConfig, PhysxError, checkpoint, files
-from physx_core.checkpoint import BEST, Progress
+from physx_core.checkpoint import BEST, Checkpoint, Progress
 from powercut.disk import Killed, Recorder
 from powercut.histories import Part
 from powercut.stage import Stage
@@ -21,6 +22,7 @@ FIELDS = {"x": Field("x", (2,)), "y": Field("y", ())}
 PARAMETERS, STATE = "parameters.bin", "optimization.bin"
 
 
+@functools.lru_cache(100)
 def content(number: int, nbytes: int) -> bytes:
     """Return bytes that no other checkpoint has."""
     return random.Random(number).randbytes(nbytes)
@@ -64,27 +66,29 @@ def look(folder: Path) -> Seen:
     """Read all checkpoints."""
     seen = Seen()
     for path in checkpoint.list_all(folder):
-        seen.found[path.name] = _read(folder, path.name.rpartition("_")[2])
+        best = path.name.endswith(BEST)
+        seen.found[path.name] = _read(path.name, lambda at=path: checkpoint.read(at), best=best)
     numbered = [name for name in seen.found if not name.endswith(BEST)]
-    seen.last = _read(folder, "-1") if numbered else None
+    if numbered:
+        seen.last = _read("the last", lambda: checkpoint.find(folder, NAME, -1))
     return seen
 
 
-def _read(folder: Path, which: str) -> int | str:
+def _read(what: str, find: Callable[[], Checkpoint], *, best: bool = False) -> int | str:
+    """Return the number of a checkpoint that is as it was saved; or else, what is wrong with it."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            found = checkpoint.find(folder, NAME, which if which == BEST else int(which))
+            found = find()
         number, nbytes = found.progress.epoch, found.progress.batches_read
         if (found.path / PARAMETERS).read_bytes() != content(number, nbytes):
-            return f"{which} has other parameters"
-        state = found.path / STATE
-        if which != BEST and state.read_bytes() != content(-number, nbytes // 2):
-            return f"{which} has another state"
+            return f"{what} has other parameters"
+        if not best and (found.path / STATE).read_bytes() != content(-number, nbytes // 2):
+            return f"{what} has another state"
     except (PhysxError, Warning) as error:
-        return f"{which}: {error}"
+        return f"{what}: {error}"
     except Exception as error:
-        return f"{which}: raw {type(error).__name__}: {error}"
+        return f"{what}: raw {type(error).__name__}: {error}"
     return number
 
 

@@ -556,6 +556,7 @@ class Disk:
         self._files: dict[Node, FileState] = {}
         self._folders: dict[Node, dict[str, Node]] = {}
         self._pending: list[tuple[int, Naming]] = []
+        self._full: dict[Node, tuple[Picks, int]] | None = None
         self._begin(top)
 
     def advance(self, moment: int) -> None:
@@ -572,7 +573,7 @@ class Disk:
                 self._files[operation.node].sync(operation.failed)
             elif not operation.failed:
                 self._sync_folder(operation.node)
-        self.moment = moment
+        self.moment, self._full = moment, None
 
     def build(self, choice: Choice) -> Tree:
         """Return what is on the disk after a choice."""
@@ -588,10 +589,6 @@ class Disk:
         self._fill(tree, "", self._top, folders, choice)
         return tree
 
-    def dirty(self) -> list[Node]:
-        """Return the files whose content is not certain, in the order of their first names."""
-        return [node for node, state in self._files.items() if not state.settled]
-
     # Choices --------------------------------------------------------------------------------
 
     def choices(self, chance: Callable[[int], random.Random]) -> Iterator[Choice]:
@@ -601,11 +598,12 @@ class Disk:
             chance: Returns the source of chance of one of the choices by its number.
         """
         names = tuple(number for number, _ in self._pending)
-        yield self._all("everything is on the disk", names)
+        full = self._everything()
+        yield Choice("everything is on the disk", names, full)
         yield Choice("nothing is on the disk", (), self._none())
         yield Choice("names without contents", names, self._none())
         yield Choice("names and sizes without contents", names, self._sizes_only())
-        yield self._all("contents without names", ())
+        yield Choice("contents without names", (), full)
         number = 5
         while True:
             yield self._chosen(chance(number), names)
@@ -613,7 +611,7 @@ class Disk:
 
     def _chosen(self, chance: random.Random, names: tuple[int, ...]) -> Choice:
         how, which = chance.choice(_NAME_PLANS), chance.choice(_FILE_PLANS)
-        dirty = self.dirty()
+        dirty = list(self._everything())
         if not names:
             how = "all"
         if not dirty:
@@ -629,20 +627,27 @@ class Disk:
         plan = f"names: {how}, contents: {which}"
         return Choice(plan, _some_names(chance, how, names), self._some(chance, which, dirty))
 
-    def _all(self, plan: str, names: tuple[int, ...]) -> Choice:
-        return Choice(plan, names, {n: self._files[n].until(self.moment) for n in self.dirty()})
+    def _everything(self) -> dict[Node, tuple[Picks, int]]:
+        """Choose what was written last of all files whose content is not certain."""
+        if self._full is None:
+            self._full = {
+                node: state.until(self.moment)
+                for node, state in self._files.items()
+                if not state.settled
+            }
+        return self._full
 
     def _none(self) -> dict[Node, tuple[Picks, int]]:
-        return {node: ({}, self._files[node].sizes[0][1]) for node in self.dirty()}
+        return {node: ({}, self._files[node].sizes[0][1]) for node in self._everything()}
 
     def _sizes_only(self) -> dict[Node, tuple[Picks, int]]:
-        return {node: ({}, self._files[node].sizes[-1][1]) for node in self.dirty()}
+        return {node: ({}, self._files[node].sizes[-1][1]) for node in self._everything()}
 
     def _some(
         self, chance: random.Random, which: str, dirty: list[Node]
     ) -> dict[Node, tuple[Picks, int]]:
         """Choose versions of all files."""
-        full = {node: self._files[node].until(self.moment) for node in dirty}
+        full = self._everything()
         if which == "all":
             return full
         if which in ("one lost", "one kept"):

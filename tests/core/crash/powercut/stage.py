@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -13,7 +14,7 @@ from unittest import mock
 import physx_core.checkpoint
 import physx_core.dataset.write.writer as writer_module
 from physx_core import files
-from physx_core.dataset.store import partition_format, syncing
+from physx_core.dataset.store import partition_file, partition_format, syncing
 from powercut.disk import Recorder
 
 
@@ -136,6 +137,7 @@ class Stage:
             stack.enter_context(patch(writer_module, "ThreadPoolExecutor", Executor))
             stack.enter_context(patch(writer_module, "Syncer", Syncer))
             stack.enter_context(patch(partition_format, "boot_id", lambda: Stage.now.boot))
+            stack.enter_context(patch(partition_file, "make_header", _make_header))
             stack.enter_context(warnings.catch_warnings())
             warnings.simplefilter("ignore")
             try:
@@ -154,6 +156,19 @@ class Stage:
         finally:
             for module, former in before:
                 module.os = former
+
+
+_make = partition_format.make_header
+
+
+def _make_header(*given: Any) -> Any:
+    """Return what HDF5 makes, which takes long, once for all files that are alike."""
+    return _made(Stage.now.boot, *given)
+
+
+@functools.lru_cache(500)
+def _made(_: str, *given: Any) -> Any:
+    return _make(*given)
 
 
 def _modules() -> list[Any]:
