@@ -73,8 +73,8 @@ def take(mode="prediction", session="training"):
         assert dataset.verify() == []
         rows = {name: view[:] for name, view in dataset[mode].items()}
         names = [path.stem for path in dataset.directory.glob(f"*_{mode}_*.h5")]
-        (number,) = {int(name.rpartition("_")[2]) for name in names}
-        dataset.remove_partition(mode, number)
+        for number in {int(name.rpartition("_")[2]) for name in names}:
+            dataset.remove_partition(mode, number)
     return rows
 
 
