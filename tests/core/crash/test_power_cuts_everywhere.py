@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from powercut.checker import Checker, Problem
+from powercut.checker import NEXT_BOOT, Checker, Problem
 from powercut.disk import Disk, Folder, Recorder
 from powercut.planted import BUGS
 from powercut.promises import encode, look
@@ -97,7 +97,7 @@ def test_a_failed_sync_is_an_error_and_never_retried_as_success(tmp_path, durabl
         assert errors >= 3  # it does not go on as if nothing had happened
         with pytest.raises(DatasetError, match="disk has failed"):
             dataset.close()
-        stage.boot = "another"
+        stage.boot = NEXT_BOOT
         disk = Disk(recorder.top, recorder.journal)
         disk.advance(len(recorder.journal))
         folder = Folder(tmp_path / "state")

@@ -20,6 +20,8 @@ from powercut.histories import History, Part
 from powercut.promises import Promise, Seen
 from powercut.stage import Stage
 
+NEXT_BOOT = "boot 9"
+"""What tells the machine's next run from others; as long as theirs, as in reality."""
 LONGEST = 60.0
 """Seconds after which looking at a hundred states counts as endless."""
 CHECKPOINTS = 0.1
@@ -271,7 +273,7 @@ class _Part:
         key = key if power else ~key
         if key not in self._seen:
             self._folder.become(tree)
-            Stage.now.boot = "another" if power else self._part.boot
+            Stage.now.boot = NEXT_BOOT if power else self._part.boot
             self._seen[key] = self._history.look(self._folder.path)
         return self._seen[key]
 

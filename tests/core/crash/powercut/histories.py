@@ -164,13 +164,23 @@ class Model:
             self.versions[mode, name] = Versions(limits.kept, limits.stored, newest)
         return self.updates
 
-    def end_update(self, mode: str, names: list[str]) -> None:
+    def end_update(self, mode: str, names: list[str], rows: list[int]) -> None:
         """The update has returned."""
         for key in ((mode, name) for name in names):
             limits = self.versions[key]
-            stored = limits.newest
-            kept = stored if self.durable else limits.kept
+            stored, kept = limits.stored.copy(), limits.kept.copy()
+            stored[rows] = limits.newest[rows]
+            if self.durable:
+                kept[rows] = stored[rows]
             self.versions[key] = Versions(kept, stored, limits.newest)
+
+    def pin(self, seen: Seen) -> None:
+        """All numbers stay as they are."""
+        self.versions = {
+            (mode, name): _exactly(found, self.last_row)
+            for mode, fields in seen.decoded.items()
+            for name, found in fields.items()
+        }
 
     def adopt(self, seen: Seen, promise: Promise, *, power: bool) -> None:
         """Go on from what is there after a cut or a kill."""
@@ -191,11 +201,7 @@ class Model:
         self.now, self.next = _World(modes, dict(seen.info)), None
         self.made = True
         if power:
-            self.versions = {
-                (mode, name): _exactly(found, self.last_row)
-                for mode, fields in seen.decoded.items()
-                for name, found in fields.items()
-            }
+            self.pin(seen)
 
     def _sized(self, key: tuple[str, str], width: int) -> Versions:
         limits = self.versions.get(key)
@@ -439,6 +445,7 @@ class History:
         problem = self._model.promise("").broken(seen, power=False)
         if problem:
             raise Broken(problem)
+        self._model.pin(seen)
         for name, mode in self._model.now.modes.items():
             mode.streams = {owner: _Stream(seen.rows(name).tolist(), sure=True)}
             mode.certain = True
@@ -529,7 +536,7 @@ class History:
         if how == "one":
             values = {field: array[0] for field, array in values.items()}
         dataset.update(name, index, values)
-        self._model.end_update(name, names)
+        self._model.end_update(name, names, touched)
 
     def _remove(self) -> None:
         _, dataset = self._any()

@@ -117,7 +117,7 @@ class Stage:
     now: Stage
 
     def __init__(self) -> None:
-        self.boot = "first"
+        self.boot = "boot 0"
         self.actor = 0
         self.executors: list[Executor] = []
         self.syncers: list[Syncer] = []
