@@ -150,6 +150,7 @@ BUGS = (
     Bug(
         "a durable append commits after its sync",
         _instead(OpenPartition, "append", _append_committing_late),
+        first=6,
     ),
     Bug("rows are committed first", _instead(OpenPartition, "append", _append_committing_early)),
     Bug("digests are not compared", _instead(partition_format, "find_intact", _newest_record)),
@@ -157,7 +158,7 @@ BUGS = (
         "a power cut is not noticed",
         _instead(partition_format.Inspection, "certain", property(lambda self: True)),
     ),
-    Bug("no marks are made", _instead(PartitionFile, "mark", _no_mark)),
+    Bug("no marks are made", _instead(PartitionFile, "mark", _no_mark), first=17),
     Bug("there is only one mark", _instead(PartitionFile, "mark", _mark_one_place), first=36),
     Bug(
         "rows that follow lost ones are given out",
@@ -184,7 +185,7 @@ BUGS = (
         _instead(
             updating, "unseal", lambda _, __, part: replace(part, checksums={}, counted=False)
         ),
-        first=17,
+        first=24,
     ),
     Bug(
         "merged files are listed before their names are synced",
