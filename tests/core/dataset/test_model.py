@@ -29,7 +29,7 @@ from physx_core import Dataset, Field
 from physx_core.dataset.read import reader as reading
 from physx_core.dataset.read import splits
 from physx_core.dataset.read.strategies import disk, memory, prefetch, windows
-from physx_core.dataset.store import segment
+from physx_core.dataset.store.partition import segment
 from physx_core.errors import (
     ConfigError,
     DatasetError,

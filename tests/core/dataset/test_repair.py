@@ -14,7 +14,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from physx_core import Dataset, Field, files
-from physx_core.dataset.store.commits import Commit
+from physx_core.dataset.store.partition.commits import Commit
 from physx_core.errors import (
     DatasetError,
     DatasetLockedError,

@@ -1,6 +1,6 @@
 """Datasets: samples in HDF5 partitions, written at the speed of the disk and safe at any moment.
 
-`physx_core.dataset.store` describes the format: `partition_format` and `manifest`.
+`physx_core.dataset.store` describes the format: `partition.format` and `manifest`.
 """
 
 from __future__ import annotations

@@ -13,8 +13,9 @@ from unittest import mock
 
 from physx_core import checkpoint, files
 from physx_core.dataset.repair import recovery
-from physx_core.dataset.store import partition_format, syncing
-from physx_core.dataset.store.partition_file import PartitionFile
+from physx_core.dataset.store import syncing
+from physx_core.dataset.store.partition import format as partition_format
+from physx_core.dataset.store.partition.file import PartitionFile
 from physx_core.dataset.write import updating
 from physx_core.dataset.write.writer import OpenPartition
 

@@ -14,7 +14,9 @@ from unittest import mock
 import physx_core.checkpoint
 import physx_core.dataset.write.writer as writer_module
 from physx_core import files
-from physx_core.dataset.store import partition_file, partition_format, syncing
+from physx_core.dataset.store import syncing
+from physx_core.dataset.store.partition import file as partition_file
+from physx_core.dataset.store.partition import format as partition_format
 from powercut.disk import Recorder
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from physx_core.dataset.exchange.table import Column, ExportOptions, Notes, Table, encode_notes
-from physx_core.dataset.store.segment import rows_per_block
+from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.errors import ExchangeError
 from physx_core.typing import Array
 

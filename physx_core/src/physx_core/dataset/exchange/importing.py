@@ -13,7 +13,7 @@ from physx_core.dataset.dataset import Dataset
 from physx_core.dataset.exchange import hdf5_format, npz_format
 from physx_core.dataset.exchange.table import BLOCK, Advance, Column, Notes
 from physx_core.dataset.repair.recovery import holds_dataset
-from physx_core.dataset.store.segment import rows_per_block
+from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.errors import ExchangeError, SampleError, listed
 from physx_core.fields import Field
 

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from physx_core.dataset.read.views import ModeView
-from physx_core.dataset.store.segment import rows_per_block
+from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.errors import ConfigError, MissingLibraryError
 from physx_core.fields import RESERVED, Field, Role
 from physx_core.typing import Array, Batch

@@ -16,7 +16,7 @@ from physx_core.dataset.exchange.table import (
     encode_notes,
     import_library,
 )
-from physx_core.dataset.store.segment import rows_per_block
+from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.errors import ExchangeError
 
 COMPRESSIONS = ("none", "zstd", "gzip", "blosc")

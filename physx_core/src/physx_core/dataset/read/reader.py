@@ -10,8 +10,8 @@ import numpy as np
 from physx_core import files
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.manifest import Manifest, Mode
-from physx_core.dataset.store.partition_format import inspect
-from physx_core.dataset.store.segment import BLOCK, RowsCheck, Segment, rows_per_block
+from physx_core.dataset.store.partition.format import inspect
+from physx_core.dataset.store.partition.segment import BLOCK, RowsCheck, Segment, rows_per_block
 from physx_core.errors import DatasetError, listed, nearest
 from physx_core.fields import Field
 from physx_core.typing import Array

@@ -11,7 +11,7 @@ from physx_core.dataset.read.episodes import find_episodes
 from physx_core.dataset.read.sampling import BatchOptions, BatchReader
 from physx_core.dataset.read.views import FieldView, ModeView
 from physx_core.dataset.store.manifest import has_statistics
-from physx_core.dataset.store.segment import rows_per_block
+from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.errors import ConfigError
 from physx_core.fields import Field
 from physx_core.statistics import Normalization, RunningStatistics

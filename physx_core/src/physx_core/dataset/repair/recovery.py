@@ -11,10 +11,10 @@ from pathlib import Path
 from physx_core import files
 from physx_core.dataset.repair.aside import FOLDER, keep, set_aside
 from physx_core.dataset.store import manifest_file
-from physx_core.dataset.store.commits import SECTOR
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
-from physx_core.dataset.store.partition_format import (
+from physx_core.dataset.store.partition.commits import SECTOR
+from physx_core.dataset.store.partition.format import (
     FORMAT,
     MAGIC,
     SIGNATURE,

@@ -14,7 +14,7 @@ from physx_core.dataset.repair.aside import set_aside, unused
 from physx_core.dataset.repair.report import find_problem, find_problems
 from physx_core.dataset.store import locks, manifest_file
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
-from physx_core.dataset.store.partition_file import copy
+from physx_core.dataset.store.partition.file import copy
 from physx_core.dataset.store.virtual_index import write_index
 from physx_core.errors import DatasetError
 from physx_core.fields import Field

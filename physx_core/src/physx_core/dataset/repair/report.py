@@ -9,7 +9,7 @@ import numpy as np
 
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.manifest import Manifest, Partition
-from physx_core.dataset.store.partition_format import Inspection
+from physx_core.dataset.store.partition.format import Inspection
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
 

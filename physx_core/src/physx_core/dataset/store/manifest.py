@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset.store.commits import Commit
-from physx_core.dataset.store.partition_format import (
+from physx_core.dataset.store.partition.commits import Commit
+from physx_core.dataset.store.partition.format import (
     Identity,
     Inspection,
     find_rows,
     inspect,
     partition_file,
 )
-from physx_core.dataset.store.segment import Segment
+from physx_core.dataset.store.partition.segment import Segment
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.fields import RESERVED, Field
 from physx_core.statistics import RunningStatistics

@@ -10,9 +10,9 @@ from pathlib import Path
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
-from physx_core.dataset.store.commits import Commit, encode
 from physx_core.dataset.store.manifest import Partition, has_statistics
-from physx_core.dataset.store.partition_file import copy
+from physx_core.dataset.store.partition.commits import Commit, encode
+from physx_core.dataset.store.partition.file import copy
 from physx_core.fields import Field
 from physx_core.statistics import RunningStatistics
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from physx_core import files
-from physx_core.dataset.store.partition_file import PartitionFile, sync_named
+from physx_core.dataset.store.partition.file import PartitionFile, sync_named
 
 PERIOD = 1.0
 """Seconds between two syncs of the same file."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from physx_core import files
 from physx_core.dataset.read.mode_statistics import merge_statistics
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
-from physx_core.dataset.store.partition_file import copy
+from physx_core.dataset.store.partition.file import copy
 from physx_core.dataset.store.sealing import remove_files
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError

@@ -14,10 +14,10 @@ from physx_core.dataset.read.mode_statistics import compute_statistics, count_se
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.store import locks, manifest_file
-from physx_core.dataset.store.digesting import Digester
 from physx_core.dataset.store.manifest import Mode, Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
-from physx_core.dataset.store.partition_file import PartitionFile
+from physx_core.dataset.store.partition.digesting import Digester
+from physx_core.dataset.store.partition.file import PartitionFile
 from physx_core.dataset.store.sealing import remove_files, seal
 from physx_core.dataset.store.syncing import Syncer
 from physx_core.dataset.store.virtual_index import write_index

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physx_core import files
-from physx_core.dataset.store.partition_format import cannot_read, truncated
-from physx_core.dataset.store.segment import Segment
+from physx_core.dataset.store.partition.format import cannot_read, truncated
+from physx_core.dataset.store.partition.segment import Segment
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
 from physx_core.typing import Array, Index

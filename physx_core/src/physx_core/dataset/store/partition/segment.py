@@ -13,8 +13,8 @@ from xxhash import xxh3_64
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
-from physx_core.dataset.store.commits import Commit
-from physx_core.dataset.store.partition_format import (
+from physx_core.dataset.store.partition.commits import Commit
+from physx_core.dataset.store.partition.format import (
     SIGNATURE,
     cannot_read,
     inspect_open,

@@ -11,9 +11,9 @@ from xxhash import xxh3_64
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
-from physx_core.dataset.store.commits import COUNT, RECORD, Commit, digest_of, encode
-from physx_core.dataset.store.digesting import LARGE, Digester
-from physx_core.dataset.store.partition_format import Header, Identity, make_header
+from physx_core.dataset.store.partition.commits import COUNT, RECORD, Commit, digest_of, encode
+from physx_core.dataset.store.partition.digesting import LARGE, Digester
+from physx_core.dataset.store.partition.format import Header, Identity, make_header
 from physx_core.typing import Array
 
 _SMALLEST_STEP = 2**20

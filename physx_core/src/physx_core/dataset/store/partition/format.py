@@ -21,7 +21,7 @@ import numpy as np
 from xxhash import xxh3_64_intdigest
 
 from physx_core import files
-from physx_core.dataset.store.commits import (
+from physx_core.dataset.store.partition.commits import (
     COUNT,
     NBYTES,
     RECORDS,
@@ -32,7 +32,7 @@ from physx_core.dataset.store.commits import (
     encode,
     find_intact,
 )
-from physx_core.dataset.store.partition_v1 import HeaderV1, read_header
+from physx_core.dataset.store.partition.version_1 import HeaderV1, read_header
 from physx_core.dataset.store.validation import SESSION, checked, parse_field, parse_name, whole
 from physx_core.errors import DatasetError, PhysxError
 from physx_core.fields import Field
@@ -40,7 +40,7 @@ from physx_core.fields import Field
 FORMAT = "physx partition"
 VERSION = 2
 READABLE = (2,)
-"""Versions of the header; `partition_v1` reads the files of version 1, which have none."""
+"""Versions of the header; `version_1` reads the files of version 1, which have none."""
 MAGIC = b"\x89physx\r\n"
 """Beginning of the dataset ``header``, which tells physx what it needs without HDF5."""
 SIGNATURE = b"\x89HDF\r\n\x1a\n"

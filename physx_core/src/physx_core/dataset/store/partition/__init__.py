@@ -1,0 +1,1 @@
+"""The files of a partition: their format, their writer, their reader, and what tells lost rows."""
