@@ -143,7 +143,8 @@ def _close(directory: Path, mode: Mode, partition: Partition) -> str:
     if lost:  # the files are kept as they are
         keep(directory, [partition.path(directory, name) for name in mode.fields])
     if partition.rows:
-        mode.swap(seal(directory, mode.fields, partition, rewrite=True))
+        listed = bool(partition.offsets)  # others may be sealed, as a manifest of before says
+        mode.swap(seal(directory, mode.fields, partition, rewrite=listed))
         what = f"of {partition.rows} rows was left open and has been sealed."
     else:
         mode.partitions.remove(partition)
