@@ -101,7 +101,6 @@ class Writer:
     Attributes:
         store: The manifest, kept up to date in memory and on the disk.
         session: Name of the session that writes.
-        durable: Whether a commit waits for the disk.
     """
 
     def __init__(
@@ -119,7 +118,6 @@ class Writer:
         """
         self.store = store
         self.session = session
-        self.durable = durable
         self._lock = lock
         self._directory = store.directory
         self._max_nbytes = int(max_file_size * 1e9) - _HEADER

@@ -198,13 +198,10 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
     content = bytearray(image.getvalue())
     content[rows_offset : rows_offset + NBYTES] = encode(Commit.unchecked(rows))
     nbytes, numbers = len(content), (rows_offset, data_offset, capacity, len(description))
-    for digest in (0, None):
-        if digest is None:
-            digest = _digest_header(
-                content, own_offset, rows_offset, data_offset, capacity * field.nbytes
-            )
-        filled = MAGIC + _NUMBERS.pack(digest, nbytes, *numbers) + description
-        content[own_offset : own_offset + block] = filled
+    filled = MAGIC + _NUMBERS.pack(0, nbytes, *numbers) + description
+    content[own_offset : own_offset + block] = filled
+    digest = _digest_header(content, own_offset, rows_offset, data_offset, capacity * field.nbytes)
+    _NUMBERS.pack_into(content, own_offset + len(MAGIC), digest, nbytes, *numbers)
     size = max(len(content), data_offset + capacity * field.nbytes)
     return Header(bytes(content), rows_offset, data_offset, size)
 
