@@ -114,6 +114,12 @@ class Checker:
 
     def check(self, seed: int) -> Result:
         """Examine the history that a seed stands for; return what was found in it."""
+        try:
+            return self._check(seed)
+        finally:
+            WATCH.end()
+
+    def _check(self, seed: int) -> Result:
         result = Result(histories=1)
         gc.collect()
         gc.freeze()
@@ -163,6 +169,11 @@ class Watch:
         if self._left < 0:
             self._left = 100
             faulthandler.dump_traceback_later(LONGEST, exit=True)
+
+    def end(self) -> None:
+        """Let the process live on: nothing is examined for now."""
+        self._left = 0
+        faulthandler.cancel_dump_traceback_later()
 
 
 WATCH = Watch()
@@ -307,7 +318,6 @@ def campaign(seeds: Iterator[int], root: Path, seconds: float) -> Result:
         checker.check(seed)
         if time.monotonic() > end:
             break
-    faulthandler.cancel_dump_traceback_later()
     return checker.result
 
 
@@ -324,5 +334,4 @@ def replay(place: str, root: Path) -> list[Problem]:
     seed, _, rest = place.partition("/")
     checker = Checker(root, told=place)
     found = checker.check(int(seed)).problems
-    faulthandler.cancel_dump_traceback_later()
     return [problem for problem in found if not rest or problem.place == place]
