@@ -689,7 +689,7 @@ class History:
     def _sync(self) -> None:
         """Let the syncers sync once: what was stored before is kept afterwards."""
         model = self._model
-        owners = {syncer.actor for syncer in self._stage.syncers}
+        owners = {syncer.actor for syncer in self._stage.syncers} & self._writers.keys()
         if not self._shared and owners:
             owners.add(0)
         before = [

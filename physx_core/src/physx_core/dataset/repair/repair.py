@@ -32,20 +32,34 @@ def repair(folder: Path) -> list[str]:
         done += recovery.recover(folder, manifest)
         if done:
             _store(folder, manifest)
+        else:
+            files.sync_folder(folder)  # the manifest may be one that a killed writer had just named
     return done
 
 
 def rebuild(folder: Path) -> None:
     """Rebuild the manifest from the partition files alone: see `Dataset.rebuild`."""
     with _lock(folder):
-        with contextlib.suppress(DatasetError, FileNotFoundError):
-            recovery.clear_dropped(folder, manifest_file.load(folder))
+        _finish(folder)
         if torn := list(_unlisted_damaged_files(folder)):
             set_aside(folder, torn)
         manifest = recovery.load_from_files(folder)
         _keep_old(folder)
         recovery.recover(folder, manifest)
         _store(folder, manifest)
+
+
+def _finish(folder: Path) -> None:
+    """Finish what a writer left open, if a manifest tells it; the files alone do not tell it all.
+
+    Only the manifest knows which partitions are being removed, and which come after rows that did
+    not reach the disk.
+    """
+    with contextlib.suppress(DatasetError):
+        manifest = recovery.load(folder)
+        recovery.clear_dropped(folder, manifest)
+        if recovery.recover(folder, manifest):
+            manifest_file.save(folder, manifest)
 
 
 def _unlisted_damaged_files(folder: Path) -> Iterator[Path]:
