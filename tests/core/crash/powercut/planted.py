@@ -186,7 +186,7 @@ BUGS = (
         _instead(
             updating, "unseal", lambda _, __, part: replace(part, checksums={}, counted=False)
         ),
-        first=24,
+        first=62,
     ),
     Bug(
         "merged files are listed before their names are synced",
