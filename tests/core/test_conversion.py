@@ -73,6 +73,8 @@ def expected(dtype, shape, value):
         return FieldShapeError
     if array.shape != shape:
         return FieldShapeError
+    if not array.size and isinstance(value, list):
+        return []
     kind, given_kind = np.dtype(dtype).kind, array.dtype.kind
     if given_kind not in ORDER or ORDER[given_kind] > ORDER[kind]:
         return FieldTypeError
@@ -276,3 +278,11 @@ def test_what_is_no_array_is_named():
 
     with pytest.raises(FieldTypeError, match='"x" is not convertible .* requires grad'):
         Field("x").convert(Stubborn())
+
+
+@pytest.mark.parametrize("dtype", ["?", "i4", "f8"])
+def test_an_empty_list_has_no_type_and_fits_all(tmp_path, dtype):
+    with Dataset.create(tmp_path / "data") as dataset:
+        dataset.define_fields("training", [Field("n", (), dtype)])
+        dataset.append("training", {"n": []})
+        assert dataset["training"]["n"][:].dtype == dtype

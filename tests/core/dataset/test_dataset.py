@@ -127,7 +127,7 @@ def test_views_are_indexed_like_arrays(dataset):
     field = dataset["training"]["x"]
     assert len(field) == 20 and field.shape == (20, 3) and field.dtype == np.float64
     for index in (
-        *(0, -1, np.int64(7)),
+        *(0, -1, np.int64(7), np.array(3), np.array(-2, "i1")),
         *(slice(3, 9), slice(None, None, -2), slice(15, 99), slice(5, 2)),
         *([1, 1, -1], np.array([0, 19]), values[:, 0] > 30),
     ):

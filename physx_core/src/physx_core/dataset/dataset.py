@@ -194,6 +194,9 @@ class Dataset(Closeable):
     def refresh(self) -> None:
         """See the rows that another process has committed since the dataset was opened.
 
+        Rows of an open partition that it has updated since `batches` read them into memory keep
+        their earlier values in later batches; open the dataset again to see the new ones.
+
         Raises:
             DatasetError: If the manifest is no longer valid.
         """

@@ -42,6 +42,8 @@ class FieldView:
         return self._reader.rows(self._mode)
 
     def __getitem__(self, rows: Any) -> Array:
+        if isinstance(rows, np.ndarray) and not rows.ndim:
+            rows = rows[()]
         if isinstance(rows, (int, np.integer)) and not isinstance(rows, bool):
             row = int(rows) + (len(self) if rows < 0 else 0)
             if not 0 <= row < len(self):
