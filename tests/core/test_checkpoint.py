@@ -464,20 +464,6 @@ def test_a_checkpoint_that_is_replaced_while_it_is_read_is_not_mixed(tmp_path):
 # Full disks and deleted folders -----------------------------------------------------------------
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """An 8 MB disk."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(place)], capture_output=True
-    )
-    if mounted.returncode:
-        pytest.skip("no right to mount a small disk here")
-    yield place
-    subprocess.run(["umount", str(place)], check=True)
-
-
 def check_full_disk(disk, made, load):
     """Save 1 MB each until the disk is full; return how many fitted."""
     (disk / "run").mkdir()

@@ -190,20 +190,6 @@ def check_rows(folder, total):
         assert dataset.verify() == []
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """An 8 MB disk."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(place)], capture_output=True
-    )
-    if mounted.returncode:
-        pytest.skip("no right to mount a small disk here")
-    yield place
-    subprocess.run(["umount", str(place)], check=True)
-
-
 @pytest.mark.parametrize("file_size", [0.25, 0.0005])
 def test_a_full_disk_loses_no_committed_row(tmp_path, small_disk, file_size):
     folder = small_disk / "data"
