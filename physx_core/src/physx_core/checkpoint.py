@@ -147,17 +147,7 @@ def save(
     numbers = list_numbers(network_dir, name)
     path = network_dir / f"{name}_{BEST if best else max(numbers, default=-1) + 1}"
     partial = network_dir / f".{path.name}.partial"
-    plain = to_plain(config)
-    used = [name for name in (*network.net_fields, *network.opt_fields) if name in fields]
-    description = {
-        "format_version": FORMAT_VERSION,
-        "progress": dataclasses.asdict(progress),
-        **{key: plain[key] for key in _KEPT if key in plain},
-        "fields": [fields[name].to_dict() for name in dict.fromkeys(used)],
-        "normalization": {
-            name: normalization[name].to_dict() for name in used if name in normalization
-        },
-    }
+    description = _describe(config, network, fields, normalization, progress)
     try:
         check_session(network_dir)
         if not network_dir.is_dir():
@@ -165,15 +155,7 @@ def save(
         elif not numbers and not path.is_dir():  # whoever made it may not have waited for the disk
             files.sync_folder(network_dir.parent)
         _clear(network_dir, name)
-        files.create_folder(partial, sync=False)
-        network.save_parameters(partial / network.parameters_file)
-        described = _describe_files(partial)
-        if optimization.state_file and not best:
-            optimization.save_state(partial / optimization.state_file)
-            described |= _describe_files(partial, described)
-        _write_description(partial / DESCRIPTION, {**description, "files": described})
-        for file in (*described, DESCRIPTION):
-            files.sync_file(partial / file)
+        _write(partial, description, network, None if best else optimization)
         _publish(partial, path)
     except BaseException as error:
         cause = error if isinstance(error, OSError) else error.__cause__
@@ -189,6 +171,44 @@ def save(
             raise files.storage_error(what, cause, safe, CheckpointError, advice) from error
         raise
     return path
+
+
+def _describe(
+    config: NetworkConfig,
+    network: Network,
+    fields: Mapping[str, Field],
+    normalization: Mapping[str, Normalization],
+    progress: Progress,
+) -> dict[str, Any]:
+    plain = to_plain(config)
+    used = [name for name in (*network.net_fields, *network.opt_fields) if name in fields]
+    return {
+        "format_version": FORMAT_VERSION,
+        "progress": dataclasses.asdict(progress),
+        **{key: plain[key] for key in _KEPT if key in plain},
+        "fields": [fields[name].to_dict() for name in dict.fromkeys(used)],
+        "normalization": {
+            name: normalization[name].to_dict() for name in used if name in normalization
+        },
+    }
+
+
+def _write(
+    partial: Path,
+    description: Mapping[str, Any],
+    network: Network,
+    optimization: Optimization | None,
+) -> None:
+    """Write the files of a checkpoint to a new folder, and wait until they are on the disk."""
+    files.create_folder(partial, sync=False)
+    network.save_parameters(partial / network.parameters_file)
+    described = _describe_files(partial)
+    if optimization is not None and optimization.state_file:
+        optimization.save_state(partial / optimization.state_file)
+        described |= _describe_files(partial, described)
+    _write_description(partial / DESCRIPTION, {**description, "files": described})
+    for file in (*described, DESCRIPTION):
+        files.sync_file(partial / file)
 
 
 def check_session(network_dir: Path) -> None:
