@@ -57,14 +57,14 @@ def test_the_core_alone_generates_and_trains_and_torch_adds_its_network(empty, r
     foreign = {"gymnasium", "torch", "dartpy", "pin", "rerun-sdk"}
     assert not foreign & {package["name"] for package in listed}
     generate = (*PHYSX, "generate", "toy/spring", "--batch-nb", 2, "--batch-size", 10)
-    assert "20 samples" in run(*generate, python=python).stdout
+    assert "20 samples" in run(*generate, python=python).stderr
 
     def train(network, *options, ok=True):
         words = (*PHYSX, "train", "sessions/data_generation", "--epoch-nb", 1, "--batch-size", 5)
         return run(*words, "--network.network", network, *options, python=python, ok=ok)
 
     arguments = ("--network.network-kwargs", "net_fields=['state','force']")
-    assert "training loss" in train("toy/linear", *arguments).stdout
+    assert "training loss" in train("toy/linear", *arguments).stderr
     fc = (
         "torch/fc", "--network.network-kwargs",
         "layers=[2,4,2]", "net_fields='state'", "opt_fields='next_state'",
@@ -77,7 +77,7 @@ def test_the_core_alone_generates_and_trains_and_torch_adds_its_network(empty, r
     missing = run(*PHYSX, "serve", python=python, ok=False)
     assert missing.returncode == 1 and "pip install physx-remote" in missing.stderr
     empty("physx_torch")
-    assert "training loss" in train(*fc).stdout
+    assert "training loss" in train(*fc).stderr
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_the_core_alone_generates_and_trains_and_torch_adds_its_network(empty, r
 )
 def test_each_plugin_works_with_the_core_alone(name, command, empty, run):
     python = empty("physx_core", name)
-    assert "20 samples" in run(*PHYSX, *command.split(), python=python).stdout
+    assert "20 samples" in run(*PHYSX, *command.split(), python=python).stderr
 
 
 def test_remote_works_with_the_core_alone(empty, run, tmp_path):

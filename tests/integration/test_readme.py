@@ -5,6 +5,8 @@ import shlex
 
 import pytest
 
+from physx_core import checkpoint
+
 pytest.importorskip("torch")
 
 
@@ -30,12 +32,41 @@ def test_the_pendulum_and_its_commands(block, run, tmp_path):
     assert (tmp_path / "pendulum.parquet").exists()
 
 
-def test_the_program_for_those_who_come_from_deepphysx(block, run, tmp_path):
-    (tmp_path / "main.py").write_text(
-        block("docs/migration.md", "import numpy as np\nfrom physx_core")
-    )
-    run("main.py")
-    assert (tmp_path / "sessions/training/network").is_dir()
+@pytest.mark.parametrize(
+    ("page", "field", "network"),
+    [("README.md", "state", "pendulum_network"), ("docs/migration.md", "input", "training")],
+)
+def test_a_new_user_starts_the_program_three_times(page, field, network, block, run, tmp_path):
+    """The first time with a mistake, the last time with another simulation."""
+    script, sessions = tmp_path / "pendulum.py", tmp_path / "sessions"
+    code = block(page, "import numpy as np\nfrom physx_core")
+    code = re.sub("batch_nb=[0-9]+, batch_size=[0-9]+", "batch_nb=4, batch_size=25", code)
+    code = re.sub("epoch_nb=[0-9]+", "epoch_nb=1", code)
+
+    def learned(run_name):
+        """Mean of what the network was trained on."""
+        found = checkpoint.find(sessions / run_name, None, -1)
+        return found.normalization[field].mean[0]
+
+    script.write_text(code.replace(f"{field}=before", f"{field}s=before"))
+    failed = run(script, ok=False).stderr
+    assert f'Did you mean "{field}"?' in failed
+    assert "session: sessions/pendulum is removed, as the run kept nothing in it" in failed
+    assert list(sessions.iterdir()) == []
+
+    script.write_text(code)
+    said = run(script).stderr
+    assert "session: sessions/pendulum\n" in said and f"session: sessions/{network}\n" in said
+    assert said.count("samples: 100 training in sessions/pendulum/dataset") == 2
+    assert f"checkpoint: sessions/{network}/network/network_0" in said
+    assert abs(learned(network)) < 10
+
+    script.write_text(code.replace("self.rng.uniform(", "100 + self.rng.uniform("))
+    said = run(script).stderr
+    assert 'session: sessions/pendulum_1 ("pendulum" exists)' in said
+    assert f'session: sessions/{network}_1 ("{network}" exists)' in said
+    assert said.count("samples: 100 training in sessions/pendulum_1/dataset") == 2
+    assert learned(f"{network}_1") > 50
 
 
 def test_environments_of_gymnasium(block, run, tmp_path):

@@ -24,10 +24,10 @@ def test_the_template_brings_an_environment_and_a_network(root, run, tmp_path):
     run(*physx, *generate, "--environment.num-clients", 2, **path)
     train = ("train", "sessions/data_generation", "--network.network", "template/mlp")
     fit = ("--network.loss", "MSELoss", "--network.optimizer", "Adam", "--network.lr", "0.01")
-    text = run(*physx, *train, *fit, "--epoch-nb", 2, "--batch-size", 20, **path).stdout
+    text = run(*physx, *train, *fit, "--epoch-nb", 2, "--batch-size", 20, **path).stderr
     assert "training loss" in text
     predict = ("predict", "sessions/training", "template/cloud", "--step-nb", 3)
-    assert "3 steps with template/mlp" in run(*physx, *predict, **path).stdout
+    assert "3 steps with template/mlp" in run(*physx, *predict, **path).stderr
 
 
 def test_the_template_imports_faces_only(root):

@@ -35,6 +35,8 @@ from physx_core.statistics import Normalization
 
 FORMAT_VERSION = 2
 """Version of the description; version 1 has no checksums."""
+NAME = "network"
+"""Name of the checkpoints unless another one is given."""
 BEST = "best"
 DESCRIPTION = "checkpoint.toml"
 _KEPT = (
@@ -143,7 +145,7 @@ def save(
         CheckpointError: If it cannot be stored; the others are intact.
         SessionError: If the session's folder was deleted.
     """
-    name = config.network_name
+    name = config.network_name or NAME
     numbers = list_numbers(network_dir, name)
     path = network_dir / f"{name}_{BEST if best else max(numbers, default=-1) + 1}"
     partial = network_dir / f".{path.name}.partial"
@@ -320,7 +322,7 @@ def list_all(network_dir: Path) -> list[Path]:
     return [path for *_, path in sorted(set(found))]
 
 
-def find(place: Path, name: str, which: int | str) -> Checkpoint:
+def find(place: Path, name: str | None, which: int | str) -> Checkpoint:
     """Return the description of a checkpoint, all of whose files are intact.
 
     If the last one is asked for and cannot be read, the last one that can be is returned, with a
@@ -328,7 +330,7 @@ def find(place: Path, name: str, which: int | str) -> Checkpoint:
 
     Args:
         place: A session's folder, its network folder, or a checkpoint's own folder.
-        name: Name of the network.
+        name: Name of the network; None: the only one there, or else ``"network"``.
         which: Number of the checkpoint; -1: the last; ``"best"``: the one with the smallest loss.
 
     Raises:
@@ -338,6 +340,9 @@ def find(place: Path, name: str, which: int | str) -> Checkpoint:
     if (place / DESCRIPTION).exists() or _former(place).is_dir():
         return read(place)
     folder = place / "network" if (place / "network").is_dir() else place
+    if name is None:
+        names = {path.name.rpartition("_")[0] for path in list_all(folder)}
+        name = names.pop() if len(names) == 1 else NAME
     numbers = list_numbers(folder, name)
     if which == -1 and numbers:
         return _find_last(folder, name, numbers)

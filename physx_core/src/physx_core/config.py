@@ -84,10 +84,20 @@ def _validate(instance: Any, cls: Any) -> None:
         try:
             typeguard.check_type(value, hints[option.name])
         except typeguard.TypeCheckError as error:
-            raise ConfigError(f"{where} is {value!r}, of the wrong type: {error}.") from None
+            raise ConfigError(f"{where} {_misfit(value, hints[option.name], error)}") from None
         if value is None:
             continue
         _check_range(where, value, option.metadata)
+
+
+def _misfit(value: Any, hint: Any, error: Exception) -> str:
+    """Return what is wrong with the type of an option's value."""
+    wanted, own = _configuration_in(hint), type(value).__name__
+    if wanted is not None:
+        return f"is of type {own} but must be a {wanted.__name__}."
+    if type[Any] in typing.get_args(hint) and type(value).__module__ != "builtins":
+        return f'is an object, but must be its class, {own}, or a reference such as "plugin/name".'
+    return f"is {value!r}, of the wrong type: {error}."
 
 
 def _check_range(where: str, value: Any, metadata: Mapping[Any, Any]) -> None:
@@ -172,7 +182,7 @@ class EnvironmentConfig:
 class DatasetConfig:
     """Where samples are stored and how they are read."""
 
-    existing_dir: str | None = None
+    existing_dir: str | Path | None = None
     """Folder of an existing session or dataset to read; it is never modified."""
     mode: str = field(default="training", metadata={"choices": (*MODES, WRONG)})
     """Mode to write or read: "training", "validation" or "prediction"; "wrong", with the samples
@@ -221,10 +231,11 @@ class NetworkConfig:
     the rate is constant."""
     scheduler_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the scheduler."""
-    network_dir: str | None = None
+    network_dir: str | Path | None = None
     """Session or network folder with the parameters that a training starts from."""
-    network_name: str = "network"
-    """Name of the checkpoints in the session."""
+    network_name: str | None = None
+    """Name of the checkpoints in the session; None: "network" for those that are written, and for
+    one that is read the only name there."""
     which_network: int | Literal["best"] = -1
     """Number of the checkpoint to load; -1: the last; "best": the one with the smallest loss."""
     save_each_epoch: bool = False
@@ -282,7 +293,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     """Return the content of a TOML file.
 
     Raises:
-        ConfigFileError: If the file is missing or is not TOML.
+        ConfigFileError: If the file is missing, cannot be read, or is not TOML.
     """
     import tomllib
 
@@ -292,6 +303,8 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         raise ConfigFileError(f"There is no configuration file {path}.") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigFileError(f"{path} is not valid TOML: {error}.") from None
+    except OSError as error:
+        raise ConfigFileError(f"{path} cannot be read: {error.strerror or error}.") from None
 
 
 def write_toml(path: str | Path, plain: Mapping[str, Any]) -> None:

@@ -9,16 +9,30 @@ from collections.abc import Iterable, Mapping, Sequence
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return `` Did you mean "x"?`` for the known name closest to `name`, or an empty string."""
+    """Return `` Did you mean "x"?`` for the known name closest to `name`, or an empty string.
+
+    Upper and lower case count as equal.
+    """
     import difflib
 
-    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f' Did you mean "{matches[0]}"?' if matches else ""
+    folded = {each.casefold(): each for each in known}
+    matches = difflib.get_close_matches(name.casefold(), folded, n=1, cutoff=0.5)
+    return f' Did you mean "{folded[matches[0]]}"?' if matches else ""
 
 
 def listed(names: Iterable[str]) -> str:
     """Return the names sorted and separated by commas, or ``none``."""
     return ", ".join(sorted(names)) or "none"
+
+
+def _listed_near(name: str, known: Sequence[str]) -> str:
+    """Return the known names, or if there are many, those closest to `name` and how many more."""
+    import difflib
+
+    if len(known) <= 20:
+        return listed(known)
+    near = difflib.get_close_matches(name, known, n=8, cutoff=0.0)
+    return f"{listed(near)} and {len(known) - len(near)} others (physx plugins)"
 
 
 class PhysxError(Exception):
@@ -102,7 +116,7 @@ class ComponentNotFoundError(PhysxError):
         self.kind, self.name, self.known = kind, name, sorted(known)
         super().__init__(
             f'{place} has no {kind} "{name}".{nearest(name, self.known)} '
-            f"It has: {listed(self.known)}."
+            f"It has: {_listed_near(name, self.known)}."
         )
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import datetime
 import platform
 import re
-import shutil
 import sys
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import distributions
@@ -62,7 +62,7 @@ class Session:
             session_dir: Folder of the sessions, relative to the working directory.
             session_name: Name of the session.
             new_session: Whether to number the new session if one of that name exists; otherwise the
-                existing one is used.
+                existing one is used, with a warning if there is a later one.
 
         Raises:
             SessionError: If the name is not a valid folder name, or the folder cannot be created.
@@ -74,19 +74,24 @@ class Session:
         try:
             files.make_folder(root)
             if not new_session and path.is_dir():
-                return cls(path)
+                return cls.existing(root, session_name)
+            if not new_session and _numbered(path):
+                others = listed(other.name for other in _numbered(path))
+                _warn(f'There is no session "{session_name}": a new one is used, not {others}.')
             while True:
                 try:
                     files.create_folder(path)
                     return cls(path, is_new=True)
                 except FileExistsError:
-                    path = root / f"{session_name}_{_last_number(root, session_name) + 1}"
+                    path = root / f"{session_name}_{_last_number(root / session_name) + 1}"
         except OSError as error:
             raise SessionError(f"Cannot create the session folder {path}: {error}.") from error
 
     @classmethod
     def existing(cls, session_dir: str | Path, session_name: str) -> Session:
-        """Return an existing session.
+        """Return an existing session, and warn if one that was numbered after it is newer.
+
+        A script whose first run made the session "run" writes to "run_1" when it is started again.
 
         Raises:
             SessionError: If there is no such session; the message lists the existing ones.
@@ -99,12 +104,11 @@ class Session:
                 f'There is no session "{session_name}" in {root}.'
                 f"{nearest(session_name, names)} There are: {listed(names)}."
             )
+        later = [other for other in _numbered(path) if _last_used(other) > _last_used(path)]
+        if later:
+            newest = max(later, key=_last_used)
+            _warn(f'The session "{session_name}" is used, but "{newest.name}" is newer.')
         return cls(path)
-
-    def discard(self) -> None:
-        """Remove the folder if it was created for the current run, which failed to start."""
-        if self.is_new:
-            shutil.rmtree(self.path, ignore_errors=True)
 
     def record(self, pipeline: str, plain: Mapping[str, Any], seed: int) -> None:
         """Write a run's configuration into ``config.toml`` and ``info.txt``.
@@ -142,10 +146,37 @@ class Session:
             stream.write(f"{text.rstrip()}\n\n")
 
 
-def _last_number(root: Path, name: str) -> int:
-    pattern = re.compile(re.escape(name) + r"_(\d+)")
-    found = (pattern.fullmatch(path.name) for path in root.iterdir())
-    return max((int(match[1]) for match in found if match), default=0)
+def _warn(text: str) -> None:
+    advice = (
+        "If another one is meant, name it; in a script, pass on what the run before has made: "
+        "DatasetConfig(existing_dir=generation.session.path), session_name=training.session.name."
+    )
+    warnings.warn(f"{text} {advice}", stacklevel=2)
+
+
+def related_sessions(path: Path) -> list[Path]:
+    """Return the folders beside a session that have its name but for the number, by number."""
+    name = re.sub(r"_\d+$", "", path.name)
+    base = path.with_name(name)
+    return [other for other in (base, *_numbered(base)) if other.is_dir() and other != path]
+
+
+def _numbered(path: Path) -> list[Path]:
+    """Return ``<path>_1``, ``<path>_2``, ... as far as there are such, by number."""
+    found = (re.fullmatch(re.escape(path.name) + r"_(\d+)", p.name) for p in path.parent.iterdir())
+    names = sorted((int(match[1]), match[0]) for match in found if match)
+    return [path.with_name(name) for _, name in names]
+
+
+def _last_used(path: Path) -> float:
+    """Return when a run last wrote its configuration into a session; 0 if none did."""
+    file = path / "config.toml"
+    return file.stat().st_mtime if file.is_file() else 0.0
+
+
+def _last_number(path: Path) -> int:
+    numbered = _numbered(path)
+    return int(numbered[-1].name.rpartition("_")[2]) if numbered else 0
 
 
 def installed_versions() -> dict[str, str]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -78,6 +79,7 @@ class RerunVisualizer(Visualizer):
         self._offscreen: OffscreenViewer | None = None
         self._step, self._pictures = 0, 0
         self.file: Path | None = None
+        self._outputs: list[str] = []
         self._run_name = "run"
         self._address: str | None = None
         self._recording: RecordingStreams | None = None
@@ -234,9 +236,17 @@ class RerunVisualizer(Visualizer):
         if self._recording is None:
             return
         self._recording = self._offscreen = None
-        if self.mode == "headless" and self.file is not None:
+        if self.file is None:
+            return
+        self._outputs.append(f"recording: {self.file}  (rerun {shlex.quote(str(self.file))})")
+        if self.mode == "headless":
             picture = Path(self.picture) if self.picture else self.file.with_suffix(".png")
             render_picture(self.file, picture, self.picture_size, timeline=self._layout.timeline)
+            self._outputs.append(f"picture: {picture}")
+
+    def outputs(self) -> Sequence[str]:
+        """Name the recording and the picture, if any: see `Observer.outputs`."""
+        return self._outputs
 
     # Flushing -------------------------------------------------------------------------------
 

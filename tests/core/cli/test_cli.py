@@ -16,13 +16,13 @@ def test_the_main_job_by_commands(capsys):
         main([*GENERATE, *LOCAL, "--environment.env-kwargs", "mass=2", "--environment.seed", "3"])
         == 0
     )
-    assert "20 samples" in capsys.readouterr().out
+    assert "20 samples" in capsys.readouterr().err
     train = ["train", "sessions/data_generation", "--network.network", "toy/linear"]
     assert main([*train, "--epoch-nb", "1", "--batch-size", "5"]) == 0
-    assert "training loss" in capsys.readouterr().out
+    assert "training loss" in capsys.readouterr().err
     predict = ["predict", "sessions/training", "toy/spring", "--step-nb", "3", "--record"]
     assert main(predict) == 0
-    assert "3 steps with toy/linear" in capsys.readouterr().out
+    assert "3 steps with toy/linear" in capsys.readouterr().err
     assert main(["info", "sessions/data_generation"]) == 0
     text = capsys.readouterr().out
     assert "toy/spring" in text and "m, m/s" in text and "{'mass': 2}" in text
@@ -36,10 +36,10 @@ def test_a_file_gives_options_and_words_replace_them(capsys, tmp_path):
         "[data_generation.environment]\nenvironment = 'toy/spring'\nas_tcp_ip_client = false\n"
     )
     assert main(["generate", "--config", "job.toml", "--batch-size", "5"]) == 0
-    text = capsys.readouterr().out
+    text = capsys.readouterr().err
     assert "15 samples" in text and "sessions/mine" in text
     assert main(["generate", "--config", "sessions/mine/config.toml"]) == 0
-    assert "sessions/mine_1" in capsys.readouterr().out
+    assert "sessions/mine_1" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

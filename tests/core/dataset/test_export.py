@@ -164,6 +164,8 @@ def test_zarr_holds_the_same(everything, tmp_path, compression):
         assert (found.dtype, found.shape) == (view.dtype, view.shape)
         assert found.attrs["unit"] == view.field.unit and found.attrs["role"] == view.field.role
         assert found[:].tobytes() == view[:].tobytes()
+        names = found.metadata.dimension_names  # without which xarray does not open it
+        assert names[0] == "sample" and len(set(names)) == len(names) == len(view.shape)
 
 
 REAL = [d for d in DTYPES if not d.startswith("c")]

@@ -201,7 +201,7 @@ def test_the_command_replays_too(capsys):
     words = ["predict", "sessions/training", f"{ENVS}:Doubling", "--environment.load-samples"]
     words += ["--dataset.existing-dir", "sessions/run", "--step-nb", "13", "--record"]
     assert main([*words, "--environment.env-kwargs", "factor=5.0"]) == 0
-    assert "13 steps" in capsys.readouterr().out
+    assert "13 steps" in capsys.readouterr().err
     assert take()["seen"][:, 2].tolist() == [*range(11), 0, 1]
 
 
@@ -317,7 +317,7 @@ def test_the_command_replays_the_rejected_samples(capsys):
     words = ["sessions/refused", "--environment.no-as-tcp-ip-client"]
     words += ["--environment.visualizer", f"{__file__}:Watch"]
     assert main(["replay", *words, "--mode", "wrong"]) == 0
-    assert "3 steps of" in capsys.readouterr().out
+    assert "3 steps of" in capsys.readouterr().err
     assert main(["replay", *words, "--mode", "validation"]) == 1
     assert 'no samples of mode "validation"' in capsys.readouterr().err
 

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from physx_core import plugins
 from physx_core.cli import main
 from physx_core.errors import ComponentNotFoundError, LogError
 from physx_core.simulation import (
@@ -140,6 +141,28 @@ def test_the_world_comes_back(tmp_path):
     Log({"world": field}, variables).write(tmp_path / "field.h5")
     found = read_log(tmp_path / "field.h5").world().ground
     np.testing.assert_array_equal(found.heights, field.ground.heights)
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_log_is_replayed_from_any_folder(moved, tmp_path, monkeypatch, capsys):
+    made, other = tmp_path / "made", tmp_path / "other"
+    made.mkdir()
+    monkeypatch.chdir(made)
+    robots = plugins.resolve("backend", "dart").robots()
+    model = next(robot.path for robot in robots if robot.name == "cartpole")
+    Path("own.urdf").write_bytes(Path(model).read_bytes())
+    env = RobotEnv("own.urdf", 0.02)
+    env.eval()
+    env.reset(seed=5, options={"log_path": "own.h5"})
+    env.step(env.action_space.sample())
+    env.close()
+    other.mkdir()
+    monkeypatch.chdir(other)
+    if moved:
+        made.rename(tmp_path / "moved")
+        made = tmp_path / "moved"
+    assert main(["log", str(made / "own.h5"), "--replay", "own.rrd"]) == 0
+    assert Path("own.rrd").read_bytes()[:3] == b"RRF"
 
 
 # Where logs lie -----------------------------------------------------------------------------

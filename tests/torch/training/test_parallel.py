@@ -159,6 +159,8 @@ def test_two_processes_train_as_one_with_the_doubled_batch():
     training(10, "sent_alone", 3, environment=script["halves"], resume=True).execute()
     status, text = ended(start("together()"))
     assert status != 0 and "exitcode  : 7" in text, text  # the process that died ended the other
+    assert text.count("session: sessions/free\n") == 1  # only the first process speaks
+    assert "batches of 10 samples, 5 in each of 2 processes" in text
     assert not list(Path("sessions/dies").glob("network/network_0"))
     names = ["cut", "dies", "free", "one", "sent", "sent_alone", "two"]
     assert sorted(path.name for path in Path("sessions").iterdir()) == names

@@ -9,6 +9,7 @@ import itertools
 import textwrap
 import typing
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -35,8 +36,8 @@ def pipeline_from(
         verb: The command, for messages.
         places: Options that take the first words without a dash, for example
             ``environment.environment``.
-        words: The words after the command. ``--config FILE`` names a TOML file whose table of the
-            pipeline's kind contains options; words after it override them.
+        words: The words after the command. ``--config FILE`` names a TOML file, or a session that
+            has one, whose table of the pipeline's kind contains options; words override them.
         given: Table of options that apply unless the file contains them.
     """
     table, rest = _take_file(make, list(words))
@@ -56,14 +57,30 @@ def pipeline_from(
     return make(**values)
 
 
+def take_session(words: Sequence[str]) -> tuple[Path | None, list[str]]:
+    """Return the session's folder that the first word names, if any, and the words with it named.
+
+    Args:
+        words: The words after the command.
+    """
+    if not words or words[0].startswith("-"):
+        return None, list(words)
+    folder = Path(words[0])
+    folder = folder if folder.name not in ("", "..") else folder.resolve()
+    named = ["--session-dir", str(folder.parent), "--session-name", folder.name]
+    return folder, [*words[1:], *named]
+
+
 def _take_file(make: type[Pipeline], words: list[str]) -> tuple[dict[str, Any], list[str]]:
     """Return the pipeline's table of the file after ``--config``, and the words without it."""
+    words = [part for w in words for part in (w.split("=", 1) if w[:9] == "--config=" else [w])]
     if "--config" not in words:
         return {}, words
     place = words.index("--config")
     if place + 1 == len(words):
-        raise UsageError("--config needs the path of a TOML file.")
-    path = words[place + 1]
+        raise UsageError("--config needs the path of a TOML file, or of a session.")
+    path = Path(words[place + 1])
+    path = path / "config.toml" if path.is_dir() else path
     tables = read_toml(path)
     if not isinstance(tables.get(make.kind), dict):
         names = [name for name, table in tables.items() if isinstance(table, dict)]
@@ -90,6 +107,11 @@ def _nested_defaults(
     for option in _dataclass_fields(make):
         name = _option_name(option.name)
         if name != option.name and name in table:
+            if not isinstance(table[name], Mapping):
+                raise ConfigFileError(
+                    f'The option "{name}" of the table [{make.kind}] is {table[name]!r} but must '
+                    f"be a table: [{make.kind}.{name}]."
+                )
             plain = dict(table[name])
             flag = f"--{name}.{name}"  # --environment.environment, --network.network
             if name not in plain and flag in words[:-1]:

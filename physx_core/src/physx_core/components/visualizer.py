@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -68,6 +68,13 @@ class Observer:
 
     def close(self) -> None:
         """Called at the end of the run, also after a failure."""
+
+    def outputs(self) -> Sequence[str]:
+        """Return a line for each file that it left in this run, for example ``recording: PATH``.
+
+        A command that shows the file follows the path in brackets. Called after `close`.
+        """
+        return ()
 
 
 class Visualizer(Observer):

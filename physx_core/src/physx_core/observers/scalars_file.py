@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ class ScalarsFile(Observer):
         self._stream: io.TextIOWrapper | None = None
         self._writer: Any = None
         self._flushed = 0.0
+        self._path, self._wrote = Path(), False
 
     def open(self, run_name: str, session_dir: Path, instance_nb: int) -> None:
         """Open the file, with a header if it is new."""
@@ -34,6 +35,7 @@ class ScalarsFile(Observer):
         folder.mkdir(exist_ok=True)
         path = folder / "scalars.csv"
         _cut_unfinished_line(path)
+        self._path, self._wrote = path, False
         self._stream = path.open("a", encoding="utf-8", newline="")
         self._writer = csv.writer(self._stream)
         if self._stream.tell() == 0:
@@ -43,6 +45,7 @@ class ScalarsFile(Observer):
         """Append the numbers."""
         if self._stream is None:
             return
+        self._wrote = True
         self._writer.writerows([(timeline, step, name, value) for name, value in values.items()])
         now = time.monotonic()
         if timeline != "batch" or now - self._flushed > FLUSH_SECONDS:
@@ -59,6 +62,10 @@ class ScalarsFile(Observer):
         if self._stream is not None:
             self._stream.close()
             self._stream = None
+
+    def outputs(self) -> Sequence[str]:
+        """Name the file, if a number was written."""
+        return [f"statistics: {self._path}"] if self._wrote else []
 
 
 def _cut_unfinished_line(path: Path) -> None:

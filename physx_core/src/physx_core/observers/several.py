@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ class Observers(Observer):
 
     def __init__(self, observers: Iterable[Observer]) -> None:
         self._observers = list(observers)
+        self._muted: list[Observer] = []
 
     def open(self, run_name: str, session_dir: Path, instance_nb: int) -> None:
         """Announce a run. Here the errors of observers are raised, as they are the user's.
@@ -66,15 +67,24 @@ class Observers(Observer):
         """Announce the end of the run."""
         self._call("close")
 
-    def _call(self, method: str, *arguments: Any) -> None:
+    def outputs(self) -> Sequence[str]:
+        """Return the lines of all observers, also of those that failed meanwhile."""
+        self._observers, self._muted = [*self._observers, *self._muted], []
+        return [line for lines in self._call("outputs") for line in lines]
+
+    def _call(self, method: str, *arguments: Any) -> list[Any]:
+        """Call a method of each observer and return what they return."""
+        returned = []
         for observer in self._observers:
             try:
-                getattr(observer, method)(*arguments)
+                returned.append(getattr(observer, method)(*arguments))
             except Exception as error:
                 # A new list: this loop continues with the old one.
                 self._observers = [other for other in self._observers if other is not observer]
+                self._muted.append(observer)
                 warnings.warn(
                     f"{type(observer).__name__} failed and is left out from here on: "
                     f"{type(error).__name__}: {error}",
                     stacklevel=3,
                 )
+        return returned

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+import shlex
+from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from typing import ClassVar
 
@@ -11,7 +12,11 @@ from physx_core.config import MODES, WRONG, DatasetConfig, EnvironmentConfig, at
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, listed
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
-from physx_core.pipelines.run_description import describe_dataset, describe_environment_config
+from physx_core.pipelines.run_description import (
+    describe_dataset,
+    describe_environment_config,
+    describe_samples,
+)
 from physx_core.pipelines.storage import describe_environment, open_own, record_rejected
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
@@ -133,6 +138,18 @@ class DataGeneration(NewSessionPipeline):
             derive_seed(seed, self._mode, offset),
             total=self.batch_nb * self.batch_size,
         )
+
+    def _results(self) -> Iterable[str]:
+        duration, made = self._duration, self.batch_id * self.batch_size
+        yield f"{made} samples in {duration:.2f} s, {made / duration:.0f} samples/s"
+        yield describe_samples(self.dataset)
+
+    def _next(self, error: BaseException | None) -> Iterable[str]:
+        path = shlex.quote(str(self.session.path))
+        yield f"physx info {path}"
+        if error is None and self._mode == "training":
+            options = "--network.network NETWORK --epoch-nb N --batch-size N"
+            yield f"physx train {path} {options}"
 
     def _components(self) -> Mapping[str, str]:
         return {

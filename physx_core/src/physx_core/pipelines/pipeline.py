@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,6 +20,7 @@ from physx_core.config import EnvironmentConfig, to_plain
 from physx_core.errors import UsageError
 from physx_core.observers import Observers, ProgressBar, ScalarsFile
 from physx_core.pipelines.services import Predict, RunServices
+from physx_core.pipelines.storage import remove_unused
 from physx_core.plugins import resolve
 from physx_core.session import Session
 from physx_core.sources.source import Source
@@ -32,7 +34,12 @@ class Pipeline(ABC):
 
     A pipeline is a context manager: entering it opens its session, dataset, environments and
     network, and leaving it closes them in any case. `execute` does both if the pipeline is not
-    open. Subclasses may override every event method.
+    open. Subclasses may override every event method; an override calls that of its base class,
+    which does the work that its docstring names.
+
+    At its beginning a run says on stderr where it writes, and at its end what it left there and the
+    next commands. A run that fails before it has kept anything removes the session that was created
+    for it.
 
     Attributes:
         session: The run's folder; known once the pipeline is open.
@@ -44,6 +51,8 @@ class Pipeline(ABC):
     """Folder of the sessions, relative to the working directory."""
     session_name: str = "training"
     """Name of the session's folder."""
+    quiet: bool = field(default=False, metadata={"recorded": False})
+    """Leave out the progress bar, and what the run says of its session; warnings remain."""
 
     kind: ClassVar[str]
     session: Session = field(init=False, repr=False)
@@ -60,14 +69,28 @@ class Pipeline(ABC):
     def _open(self, resources: contextlib.ExitStack) -> None:
         """Open everything, and push what must be closed onto the stack."""
 
+    def _plan(self) -> Iterable[str]:
+        """Return lines that say what the run is about to do, now that it is open."""
+        return ()
+
+    def _results(self) -> Iterable[str]:
+        """Return lines that say what the run did and left, also if it failed."""
+        return ()
+
+    def _next(self, error: BaseException | None) -> Iterable[str]:
+        """Return commands that continue from here.
+
+        Args:
+            error: What ended the run; None: nothing.
+        """
+        return ()
+
     def _components(self) -> Mapping[str, str]:
         """Return descriptions of the run's components by name, for ``info.txt``."""
         return {}
 
     def __enter__(self) -> Self:
         """Open the session and everything that the pipeline works with.
-
-        If that fails, a session that was created for it is removed.
 
         Raises:
             UsageError: If a client runs a script without ``if __name__ == "__main__":``.
@@ -87,8 +110,9 @@ class Pipeline(ABC):
                 self._resources = resources.pop_all()
         except BaseException:
             if self.session is not None:
-                self.session.discard()
+                remove_unused(self.session, opened=False)
             raise
+        self._say(*self._plan())
         return self
 
     def __exit__(
@@ -99,15 +123,42 @@ class Pipeline(ABC):
     ) -> None:
         """Close everything."""
         resources, self._resources = self._resources, None
-        if resources is not None:
-            self._note_end(error)
+        if resources is None:
+            return
+        self._note_end(error)
+        try:
             resources.__exit__(kind, error, trace)
+        except BaseException as closing:
+            error = closing
+            raise
+        finally:
+            self._end(error)
+
+    def _end(self, error: BaseException | None) -> None:
+        """Say what the run left, or remove its session if that is nothing."""
+        if error is not None and remove_unused(self.session, opened=True):
+            self._say(f"session: {self.session.path} is removed, as the run kept nothing in it")
+        else:
+            commands = (f"next: {command}" for command in self._next(error))
+            self._say(*self._results(), *self.observers.outputs(), *commands)
+
+    def _say(self, *lines: str) -> None:
+        """Print lines on stderr, in the process that writes the session."""
+        if self._leads and not self.quiet and sys.stderr is not None:
+            with contextlib.suppress(OSError, ValueError):  # a closed stderr ends no run
+                sys.stderr.write("".join(f"{line}\n" for line in lines))
+                sys.stderr.flush()
 
     def _describe_components(self) -> None:
         components = self._components()
         if self._leads and components:
             texts = (f"{name}: {text}" for name, text in components.items())
             self.session.note("\n".join(text.replace("\n", "\n  ") for text in texts))
+
+    @property
+    def _duration(self) -> float:
+        """Time in s since the pipeline began to open."""
+        return time.monotonic() - self._began
 
     def _note_end(self, error: BaseException | None) -> None:
         how = "finished"
@@ -117,7 +168,7 @@ class Pipeline(ABC):
             how = f"ended by {type(error).__name__}"
         if self._leads:
             with contextlib.suppress(OSError):  # the run's own error matters more
-                self.session.note(f"{how} after {time.monotonic() - self._began:.1f} s")
+                self.session.note(f"{how} after {self._duration:.1f} s")
 
     @contextlib.contextmanager
     def _running(self) -> Iterator[None]:
@@ -134,11 +185,16 @@ class Pipeline(ABC):
         environment: EnvironmentConfig | None,
         further: Iterable[Observer] = (),
     ) -> None:
-        """Open the run's observers; only the process that writes the session has any."""
+        """Say where the run writes, and open its observers.
+
+        Only the process that writes the session has any.
+        """
         if not self._leads:
             self.observers = Observers([])
             return
-        observers: list[Observer] = [ProgressBar(), ScalarsFile(), *further]
+        self._say(f"session: {self.session.path}{self._why_here()}")
+        bars = [] if self.quiet else [ProgressBar()]
+        observers: list[Observer] = [*bars, ScalarsFile(), *further]
         instance_nb = 0
         if environment is not None:
             instance_nb = environment.num_clients
@@ -148,6 +204,13 @@ class Pipeline(ABC):
         self.observers = Observers(observers)
         self.observers.open(self.session.name, self.session.path, instance_nb)
         resources.callback(self.observers.close)
+
+    def _why_here(self) -> str:
+        """Return why the run writes to this session, if that is not evident."""
+        if not self.session.is_new:
+            return " (continued)"
+        taken = self.session.name != self.session_name
+        return f' ("{self.session_name}" exists)' if taken else ""
 
     def _open_source(
         self,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+import shlex
+from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from typing import ClassVar
 
@@ -13,7 +14,11 @@ from physx_core.fields import Field
 from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.learning.learner import Learner, load_learner
 from physx_core.pipelines.pipeline import Pipeline, choose_seed, derive_seed
-from physx_core.pipelines.run_description import describe_environment_config, describe_learner
+from physx_core.pipelines.run_description import (
+    describe_environment_config,
+    describe_learner,
+    describe_samples,
+)
 from physx_core.pipelines.storage import (
     describe_environment,
     open_existing,
@@ -165,6 +170,15 @@ class Prediction(Pipeline):
             in_process=environment.num_clients == 1,
             replayed=replayed,
         )
+
+    def _results(self) -> Iterable[str]:
+        yield f"{self.step_id} steps with {self.learner.config.network}"
+        if self.dataset is not None:
+            yield describe_samples(self.dataset)
+
+    def _next(self, error: BaseException | None) -> Iterable[str]:
+        if self.dataset is not None:
+            yield f"physx info {shlex.quote(str(self.session.path))}"
 
     def _components(self) -> Mapping[str, str]:
         return {

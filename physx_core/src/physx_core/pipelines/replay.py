@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar
 
-from physx_core.config import DatasetConfig, EnvironmentConfig, at_least, from_plain, options
+from physx_core.config import (
+    DatasetConfig,
+    EnvironmentConfig,
+    at_least,
+    from_plain,
+    options,
+    to_plain,
+)
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError
 from physx_core.pipelines.interrupt import deferred_interrupt
@@ -119,6 +126,10 @@ class Replay(NewSessionPipeline):
             replayed=dataset.directory,
             accept_all=True,
         )
+
+    def _results(self) -> Iterable[str]:
+        environment = self.environment_config
+        yield f"{self.step_id} steps of {to_plain(environment)['environment']}"
 
 
 def recorded_environment(dataset: Dataset) -> dict[str, Any]:

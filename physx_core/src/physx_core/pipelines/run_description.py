@@ -50,6 +50,12 @@ def describe_environment_config(config: EnvironmentConfig | None) -> str:
     return f"{plain['environment']}{arguments}"
 
 
+def describe_samples(dataset: Dataset) -> str:
+    """Return a line with the number of samples of each mode of a dataset."""
+    counts = ", ".join(f"{dataset.num_samples(mode):,} {mode}" for mode in dataset.modes)
+    return f"samples: {counts or 'none'} in {dataset.directory}"
+
+
 def describe_dataset(dataset: Dataset) -> str:
     """Return a dataset's folder, and the samples and fields of its modes."""
     lines = [str(dataset.directory)]

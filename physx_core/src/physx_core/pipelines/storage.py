@@ -1,4 +1,4 @@
-"""Opens and checks the datasets that pipelines write to and read from."""
+"""Opens and checks the datasets that pipelines write to and read from, and removes unused ones."""
 
 from __future__ import annotations
 
@@ -8,11 +8,21 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from physx_core import files
 from physx_core.config import WRONG, DatasetConfig, EnvironmentConfig, to_plain
 from physx_core.dataset import Dataset
-from physx_core.errors import ConfigError, DatasetNotFoundError, UsageError, WrongSamplesError
+from physx_core.dataset.store.locks import LOCK
+from physx_core.dataset.store.manifest_file import FILE
+from physx_core.errors import (
+    ConfigError,
+    DatasetNotFoundError,
+    PhysxError,
+    UsageError,
+    WrongSamplesError,
+)
+from physx_core.observers import read_scalars
 from physx_core.plugins import reference_of
-from physx_core.session import Session, installed_versions
+from physx_core.session import NOTES, Session, installed_versions, related_sessions
 from physx_core.sources.source import Source
 
 PARAMETERS = "parameters_{}.bin"
@@ -41,9 +51,73 @@ def open_existing(session: Session, config: DatasetConfig) -> Dataset:
         if config.existing_dir is None:
             error.add_note(
                 "Name a session or dataset in DatasetConfig.existing_dir, or an environment that "
-                "generates the samples."
+                f"generates the samples.{other_samples(session.dataset_dir, config.mode)}"
             )
         raise
+
+
+def other_samples(directory: Path, mode: str) -> str:
+    """Return a sentence that names the sessions of another number that have samples of a mode.
+
+    Args:
+        directory: A session's dataset.
+        mode: The mode of which it has none.
+
+    Returns:
+        The sentence after a space; empty if there is no such session.
+    """
+    found = []
+    for other in related_sessions(directory.parent) if directory.name == "dataset" else ():
+        with contextlib.suppress(PhysxError, OSError), Dataset.open(other / "dataset") as dataset:
+            count = dataset.num_samples(mode) if mode in dataset.modes else 0
+            found += [f"{other} ({count:,})"] if count else []
+    return f" There are such samples in {', '.join(found)}." if found else ""
+
+
+def remove_unused(session: Session, *, opened: bool) -> bool:
+    """Remove a new session in which a run that failed has kept nothing; return whether it did.
+
+    It stays if it holds samples, parameters of an environment, a checkpoint, numbers, a recording,
+    notes, or any file that is not known here.
+
+    Args:
+        session: The run's session.
+        opened: Whether the pipeline was open. Otherwise what the dataset holds was copied into it.
+    """
+    if not session.is_new or not session.path.is_dir():
+        return False
+    try:
+        if not all(_is_unused(session, path, opened) for path in session.path.rglob("*")):
+            return False
+        files.remove_folder(session.path)
+    except (OSError, UnicodeDecodeError, PhysxError):  # whatever cannot be read stays
+        return False
+    return True
+
+
+def _is_unused(session: Session, path: Path, opened: bool) -> bool:
+    """Return whether a file or folder in a session was made by its opening and holds nothing."""
+    if path.is_dir() and not path.is_symlink():
+        return True
+    match path.relative_to(session.path).parts:
+        case ("config.toml",):
+            return True
+        case ("info.txt",):
+            return NOTES in path.read_text(encoding="utf-8")
+        case ("dataset", name):
+            is_data = name == FILE or path.suffix == ".h5"
+            return not opened or name == LOCK or (is_data and not _has_samples(path.parent))
+        case ("stats", *_):
+            numbers = session.stats_dir / "scalars.csv"
+            return not numbers.exists() or not read_scalars(session.path)
+        case ("network", name, *_):
+            return name.endswith(".partial")
+    return False
+
+
+def _has_samples(directory: Path) -> bool:
+    with Dataset.open(directory) as dataset:
+        return any(dataset.num_samples(mode) for mode in dataset.modes)
 
 
 def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) -> None:

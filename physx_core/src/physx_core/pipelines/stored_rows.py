@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from physx_core.dataset import Dataset
 from physx_core.errors import DatasetError, listed
+from physx_core.pipelines.storage import other_samples
 from physx_core.typing import Batch
 
 _AHEAD = 1 << 22
@@ -43,6 +44,7 @@ class StoredRows:
             raise DatasetError(
                 f'The dataset in {dataset.directory} has no samples of mode "{mode}" to send '
                 f"through an environment. It has: {listed(dataset.modes)}."
+                f"{other_samples(dataset.directory, mode)}"
             )
         self._view = dataset[mode]
         self._rows = np.arange(dataset.num_samples(mode)) if rows is None else rows

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import shlex
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,11 +20,15 @@ from physx_core.dataset import Dataset
 from physx_core.observers import statistics_observers
 from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.learning.learner import Learner
-from physx_core.pipelines.learning.resuming import read_last_checkpoint, without_copied_dataset
+from physx_core.pipelines.learning.resuming import (
+    can_resume,
+    read_last_checkpoint,
+    without_copied_dataset,
+)
 from physx_core.pipelines.learning.training_data import TrainingData
 from physx_core.pipelines.learning.training_record import BestEpoch, TrainingRecord
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
-from physx_core.pipelines.run_description import describe_training
+from physx_core.pipelines.run_description import describe_samples, describe_training
 from physx_core.pipelines.storage import (
     check_sources,
     copy_existing,
@@ -82,7 +88,7 @@ class Training(NewSessionPipeline):
     epoch_nb: int = at_least(1)
     """Number of epochs."""
     batch_size: int = at_least(1)
-    """Number of samples in a batch."""
+    """Number of samples in a batch; with several processes (torchrun), in each one's share."""
     batch_nb: int | None = at_least(1, None)
     """Batches in an epoch; None: as many as needed to use each stored sample once."""
     seed: int | None = at_least(0, None)
@@ -285,17 +291,18 @@ class Training(NewSessionPipeline):
         check_sources(config, environment)
         self._network_class: Any = Network
         self._prepare_network_class()
-        last = None
+        last = session = None
         if self.resume:
             session = Session.existing(self.session_dir, self.session_name)
-            last = read_last_checkpoint(session, self.network_config.network_name, environment)
+            name = self.network_config.network_name or checkpoint.NAME
+            last = read_last_checkpoint(session, name, environment)
             config, environment = without_copied_dataset(session, config), None
         self._start_from(last)
         self._network_class.set_seed(self._resumed.seed)
         self.learner = Learner(self.network_config, trains=True)
         if config.existing_dir is not None:  # a missing dataset leaves no session behind
             Dataset.open(config.existing_dir).close()
-        self.session = self._open_session()
+        self.session = session or self._open_session()
         make = open_existing if environment is None else open_own
         dataset = resources.enter_context(make(self.session, config))
         if environment is not None:
@@ -349,10 +356,39 @@ class Training(NewSessionPipeline):
     def _open_session(self) -> Session:
         made = None
         if self._leads:
-            new = self.new_session and not self.resume
-            made = Session.create(self.session_dir, self.session_name, new)
+            made = self._create_session()
         path = Path(self.group.tell(made and str(made.path)))
         return made or Session(path)
+
+    def _plan(self) -> Iterable[str]:
+        if self.data.dataset.modes:
+            yield describe_samples(self.data.dataset)
+        if self.group.size > 1:
+            total, each, count = self.batch_size * self.group.size, self.batch_size, self.group.size
+            yield f"batches of {total} samples, {each} in each of {count} processes"
+
+    def _results(self) -> Iterable[str]:
+        yield f"{self.epoch_id} of {self.epoch_nb} epochs in {self._duration:.2f} s"
+        if self.epoch_id:
+            yield f"training loss {self.training_loss:.6g}"
+        if not math.isnan(self.validation_loss):
+            yield f"validation loss {self.validation_loss:.6g}"
+        if not math.isinf(self.best.loss):
+            yield f"smallest loss {self.best.loss:.6g}, after epoch {self.best.epoch}"
+        if self.environment_config is not None:
+            yield describe_samples(self.data.dataset)
+        if self.checkpoint_path is not None:
+            yield f"checkpoint: {self.checkpoint_path}"
+
+    def _next(self, error: BaseException | None) -> Iterable[str]:
+        path = shlex.quote(str(self.session.path))
+        if self.checkpoint_path is None:
+            return
+        if error is None:
+            yield f"physx predict {path} ENVIRONMENT --step-nb N"
+            yield f"physx stats {path}"
+        elif can_resume(self.environment_config, self.epoch_id):
+            yield f"physx train {path} --resume"
 
     def _components(self) -> Mapping[str, str]:
         return describe_training(self.learner, self.environment_config, self.data.dataset)

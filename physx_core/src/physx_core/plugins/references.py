@@ -189,7 +189,23 @@ def _attribute(kind: str, module: ModuleType, name: str, place: str) -> Any:
     found: Any = module
     for part in name.split("."):
         if not hasattr(found, part):
-            classes = [n for n, value in vars(module).items() if isinstance(value, type)]
-            raise ComponentNotFoundError(kind, name, place, classes)
+            raise ComponentNotFoundError(kind, name, place, _classes(kind, module))
         found = getattr(found, part)
     return found
+
+
+def _classes(kind: str, module: ModuleType) -> list[str]:
+    """Return the names of the classes of a module that may be components of a kind."""
+    from physx_core import components
+
+    base = getattr(components, kind.capitalize(), None)
+    is_open = base is None or kind == "network"  # classes of a plugin's library are networks, too
+    return [
+        name
+        for name, found in vars(module).items()
+        if isinstance(found, type)
+        and (
+            (is_open and found.__module__ == module.__name__)
+            or (base is not None and issubclass(found, base) and found is not base)
+        )
+    ]

@@ -110,10 +110,13 @@ class Log:
     def world(self) -> World:
         """Return the simulated world, rebuilt from its description.
 
+        The files of robots and meshes are taken from where they were, or else from beside the log.
+
         Raises:
             LogError: If the log does not contain a valid world.
         """
-        return world_of(self.constants.get("world"), self._where)
+        folder = self.path.absolute().parent if self.path else None
+        return world_of(self.constants.get("world"), self._where, folder)
 
     @property
     def _where(self) -> str:

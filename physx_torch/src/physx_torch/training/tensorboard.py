@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ class TensorBoard(Visualizer):
             raise ConfigError("interval and drawing_interval must be at least 0 (s).")
         self._interval, self._drawing_interval = interval, drawing_interval
         self._writer: Any = None
+        self._session = Path()
         self._waiting: dict[str, tuple[float, int]] = {}
         self._written = float("-inf")
         self._objects: dict[str, dict[str, Any]] = {}
@@ -59,6 +61,7 @@ class TensorBoard(Visualizer):
             raise MissingLibraryError(
                 "Writing for TensorBoard", "tensorboard", "tensorboard", "physx-torch"
             ) from error
+        self._session = session_dir
         folder = session_dir / "stats" / "tensorboard"
         self._writer = SummaryWriter(str(folder), max_queue=1000, flush_secs=5)
 
@@ -143,6 +146,11 @@ class TensorBoard(Visualizer):
             self._write_waiting()
             self._writer.close()
             self._writer = None
+
+    def outputs(self) -> Sequence[str]:
+        """Name the folder of the files: see `Observer.outputs`."""
+        shown = f"physx stats {shlex.quote(str(self._session))} --tensorboard"
+        return [f"curves: {self._session / 'stats' / 'tensorboard'}  ({shown})"]
 
 
 def _colors(color: Any, number: int) -> Array | None:

@@ -27,8 +27,8 @@ class ExportNetwork:
     """Format of the file: "onnx", "torchscript" or "pt2" for PyTorch networks."""
     output: str | None = None
     """The file; by default in the session's folder, named like the checkpoint."""
-    network_name: str = "network"
-    """Name of the checkpoints in the session."""
+    network_name: str | None = None
+    """Name of the checkpoints in the session, if there are several names."""
     which_network: int = -1
     """Number of the checkpoint; -1: the last."""
 

@@ -35,9 +35,6 @@ def run(words: Sequence[str]) -> None:
             f"plugin. Installed: {listed(viewers)}. (None: draw nothing.)"
         )
     pipeline.execute()
-    config = pipeline.environment_config
-    print(f"{pipeline.step_id} steps of {config.environment if config else ''}")
-    print(f"session: {pipeline.session.path}")
 
 
 def _visualizer_plugins() -> list[str]:

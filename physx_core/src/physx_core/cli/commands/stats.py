@@ -42,6 +42,8 @@ def run(words: Sequence[str]) -> None:
         _start_tensorboard(Path(options.session), options.port)
         return
     numbers = read_scalars(Path(options.session))
+    if not numbers:
+        raise SessionError(f"{options.session} has no statistics: a training records them.")
     head = ("name", "per", "number", "last", "min", "max", "mean")
     lines = [head, *(_line(*key, list(steps.values())) for key, steps in numbers.items())]
     curves = ["", *(spark_line(list(steps.values()), options.width) for steps in numbers.values())]

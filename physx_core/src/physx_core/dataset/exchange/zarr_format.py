@@ -47,6 +47,7 @@ def _write_field(group: Any, table: Table, name: str, codecs: list[Any] | None) 
             dtype=np.dtype(field.dtype),
             chunks=(min(step, table.rows), *(max(1, length) for length in shape)),
             compressors=codecs,
+            dimension_names=["sample", *(f"{name}_{axis}" for axis in range(len(shape)))],
             attributes={"unit": field.unit, "role": field.role},
         )
     except (ValueError, TypeError) as error:

@@ -38,7 +38,9 @@ def locate(directory: str | Path) -> Path:
     for folder in (given, given / "dataset"):
         if holds_dataset(folder):
             return folder
-    if not given.is_dir():
+    if given.is_file():
+        what = "It is a file: give the folder of a session or dataset."
+    elif not given.is_dir():
         parent = given.absolute().parent
         around = [p.name for p in parent.iterdir()] if parent.is_dir() else []
         what = f"The folder does not exist. {parent} contains: {listed(around)}."

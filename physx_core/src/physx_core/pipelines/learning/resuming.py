@@ -23,14 +23,20 @@ def read_last_checkpoint(
         environment: The environment of the samples; all needed samples must be stored already.
     """
     found = checkpoint.find(session.network_dir, name, -1)
-    if environment is not None:
-        replays = environment.load_samples and not environment.only_first_epoch
-        if environment.always_produce or replays or found.progress.epoch == 0:
-            raise ConfigError(
-                "A training cannot be resumed while environments generate its samples, as they "
-                "would start over. Train on the stored samples: leave the environment out."
-            )
+    if not can_resume(environment, found.progress.epoch):
+        raise ConfigError(
+            "A training cannot be resumed while environments generate its samples, as they "
+            "would start over. Train on the stored samples: leave the environment out."
+        )
     return found
+
+
+def can_resume(environment: EnvironmentConfig | None, epochs: int) -> bool:
+    """Return whether a training that has finished some epochs needs its environments no more."""
+    if environment is None:
+        return True
+    replays = environment.load_samples and not environment.only_first_epoch
+    return epochs > 0 and not replays and not environment.always_produce
 
 
 def without_copied_dataset(session: Session, config: DatasetConfig) -> DatasetConfig:

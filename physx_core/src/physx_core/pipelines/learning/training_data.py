@@ -12,7 +12,7 @@ from physx_core.dataset import Dataset, Subset
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import RESERVED, Field
-from physx_core.pipelines.storage import record_rejected
+from physx_core.pipelines.storage import other_samples, record_rejected
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.sources.source import Source
 from physx_core.statistics import Normalization
@@ -87,8 +87,9 @@ class TrainingData:
         self._changed = False
         if source is None and not self._count(self._mode):
             raise DatasetError(
-                f'The dataset has no samples of mode "{self._mode}" to train on. '
-                f"It has: {listed(dataset.modes)}."
+                f'The dataset in {dataset.directory} has no samples of mode "{self._mode}" to '
+                f"train on. It has: {listed(dataset.modes)}."
+                f"{other_samples(dataset.directory, self._mode)}"
             )
         self.parts = self._split(replay)
         self._stored = self._stored_rows(source) if replay and source is not None else None
