@@ -84,20 +84,10 @@ def _validate(instance: Any, cls: Any) -> None:
         try:
             typeguard.check_type(value, hints[option.name])
         except typeguard.TypeCheckError as error:
-            raise ConfigError(f"{where} {_misfit(value, hints[option.name], error)}") from None
+            raise ConfigError(f"{where} is {value!r}, of the wrong type: {error}.") from None
         if value is None:
             continue
         _check_range(where, value, option.metadata)
-
-
-def _misfit(value: Any, hint: Any, error: Exception) -> str:
-    """Return what is wrong with the type of an option's value."""
-    wanted, own = _configuration_in(hint), type(value).__name__
-    if wanted is not None:
-        return f"is of type {own} but must be a {wanted.__name__}."
-    if type[Any] in typing.get_args(hint) and type(value).__module__ != "builtins":
-        return f'is an object, but must be its class, {own}, or a reference such as "plugin/name".'
-    return f"is {value!r}, of the wrong type: {error}."
 
 
 def _check_range(where: str, value: Any, metadata: Mapping[Any, Any]) -> None:

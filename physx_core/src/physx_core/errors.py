@@ -9,15 +9,11 @@ from collections.abc import Iterable, Mapping, Sequence
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Return `` Did you mean "x"?`` for the known name closest to `name`, or an empty string.
-
-    Upper and lower case count as equal.
-    """
+    """Return `` Did you mean "x"?`` for the known name closest to `name`, or an empty string."""
     import difflib
 
-    folded = {each.casefold(): each for each in known}
-    matches = difflib.get_close_matches(name.casefold(), folded, n=1, cutoff=0.5)
-    return f' Did you mean "{folded[matches[0]]}"?' if matches else ""
+    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f' Did you mean "{matches[0]}"?' if matches else ""
 
 
 def listed(names: Iterable[str]) -> str:

@@ -26,7 +26,6 @@ from physx_core import (
 )
 from physx_core.cli import main
 from physx_core.errors import (
-    ConfigError,
     DatasetError,
     DatasetNotFoundError,
     EnvironmentFailedError,
@@ -420,7 +419,7 @@ def test_a_session_is_a_configuration_file(said):
         (["info", "flat.toml"], "It is a file"),
         (["predict", "sessions/spring", "toy/spring"], 'no checkpoint "network_<number>"'),
         (["predict", "flat.toml", "toy/spring"], 'no session "flat.toml"'),
-        (["generate", "toy/SPRINT", "--batch-nb", "1", "--batch-size", "1"], 'mean "spring"'),
+        (["generate", "toy/sprint", "--batch-nb", "1", "--batch-size", "1"], 'mean "spring"'),
         (["generate", "flat.py:Nothing", "--batch-nb", "1", "--batch-size", "1"], "has: Mine."),
     ],
 )  # fmt: skip
@@ -451,10 +450,3 @@ def test_the_only_name_in_a_session_is_that_of_the_network():
     Training(other, data, new_session=False, epoch_nb=1, batch_size=5).execute()
     with pytest.raises(PhysxError, match="There are: line_0, other_0"):
         Prediction(NetworkConfig(), SPRING, step_nb=1).execute()
-
-
-def test_objects_in_the_place_of_classes_are_named():
-    with pytest.raises(ConfigError, match="environment is an object, but must be its class, Fails"):
-        EnvironmentConfig(Fails())
-    with pytest.raises(ConfigError, match="is of type EnvironmentConfig but must be a DatasetConf"):
-        Replay(SPRING, DatasetConfig())

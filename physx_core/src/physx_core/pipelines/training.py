@@ -15,7 +15,14 @@ from physx_core import checkpoint
 from physx_core.checkpoint import Progress
 from physx_core.components.group import Group
 from physx_core.components.network import Network
-from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, at_least, options
+from physx_core.config import (
+    DatasetConfig,
+    EnvironmentConfig,
+    NetworkConfig,
+    at_least,
+    options,
+    to_plain,
+)
 from physx_core.dataset import Dataset
 from physx_core.observers import statistics_observers
 from physx_core.pipelines.interrupt import deferred_interrupt
@@ -385,7 +392,10 @@ class Training(NewSessionPipeline):
         if self.checkpoint_path is None:
             return
         if error is None:
-            yield f"physx predict {path} ENVIRONMENT --step-nb N"
+            plain, kinds = to_plain(self.network_config), ("network", "transformation")
+            named = {kind: plain.get(kind, "") for kind in kinds}
+            words = [f"--network.{k} {shlex.quote(v)}" for k, v in named.items() if ":" in v]
+            yield " ".join(["physx predict", path, "ENVIRONMENT --step-nb N", *words])
             yield f"physx stats {path}"
         elif can_resume(self.environment_config, self.epoch_id):
             yield f"physx train {path} --resume"

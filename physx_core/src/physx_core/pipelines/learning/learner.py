@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import inspect
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,13 +13,7 @@ from physx_core.components.network import Network
 from physx_core.components.optimization import Optimization
 from physx_core.components.transformation import Transformation
 from physx_core.config import NetworkConfig
-from physx_core.errors import (
-    ConfigError,
-    MissingFieldError,
-    UnknownOptionError,
-    UsageError,
-    listed,
-)
+from physx_core.errors import ConfigError, MissingFieldError, UsageError, listed
 from physx_core.fields import Field
 from physx_core.plugins import import_component, resolve
 from physx_core.plugins.networks import resolve_network
@@ -334,10 +326,6 @@ def _create(
     try:
         component = make(**arguments)
     except TypeError as error:
-        known = _option_names(make)
-        unknown = arguments.keys() - known
-        if unknown and "module" not in known:  # an adapter passes them on to the module
-            raise UnknownOptionError(f"The {kind} {reference!r}", unknown, known) from error
         raise ConfigError(f"The {kind} {reference!r} rejects its arguments: {error}.") from error
     if not isinstance(component, base):
         raise ConfigError(
@@ -346,15 +334,3 @@ def _create(
             'example network="torch/module", network_kwargs={"module": "package.module:function"}.'
         )
     return component
-
-
-def _option_names(make: Any) -> set[str]:
-    """Return the options of a function, or of the constructors of a class and its bases."""
-    functions = [base.__init__ for base in make.__mro__] if isinstance(make, type) else [make]
-    names = set()
-    for function in functions:
-        with contextlib.suppress(ValueError, TypeError):  # one that is written in C
-            for name, option in inspect.signature(function).parameters.items():
-                if option.kind in (option.KEYWORD_ONLY, option.POSITIONAL_OR_KEYWORD):
-                    names.add(name)
-    return names - {"self"}
