@@ -110,7 +110,7 @@ class Pipeline(ABC):
                 self._resources = resources.pop_all()
         except BaseException:
             if self.session is not None:
-                remove_unused(self.session, opened=False)
+                self._remove_unused(opened=False)
             raise
         self._say(*self._plan())
         return self
@@ -136,11 +136,16 @@ class Pipeline(ABC):
 
     def _end(self, error: BaseException | None) -> None:
         """Say what the run left, or remove its session if that is nothing."""
-        if error is not None and remove_unused(self.session, opened=True):
-            self._say(f"session: {self.session.path} is removed, as the run kept nothing in it")
-        else:
+        if error is None or not self._remove_unused(opened=True):
             commands = (f"next: {command}" for command in self._next(error))
             self._say(*self._results(), *self.observers.outputs(), *commands)
+
+    def _remove_unused(self, *, opened: bool) -> bool:
+        """Remove the session if a failed run kept nothing in it; return whether it was removed."""
+        removed = remove_unused(self.session, opened=opened)
+        if removed:
+            self._say(f"session: {self.session.path} is removed, as the run kept nothing in it")
+        return removed
 
     def _say(self, *lines: str) -> None:
         """Print lines on stderr, in the process that writes the session."""
