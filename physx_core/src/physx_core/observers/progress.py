@@ -14,13 +14,17 @@ class ProgressBar(Observer):
 
     def __init__(self) -> None:
         self._bar: Any = None
-        self._is_terminal = sys.stderr.isatty()
+        closed = sys.stderr is None or sys.stderr.closed
+        self._stream = None if closed else sys.stderr
+        self._is_terminal = self._stream is not None and self._stream.isatty()
 
     def begin(self, task: str, total: int | None, unit: str) -> None:
         """Start a bar."""
         from tqdm.auto import tqdm
 
         self.end()
+        if self._stream is None:
+            return
         interval = 0.1 if self._is_terminal else 60.0
         self._bar = tqdm(
             desc=task,
@@ -31,7 +35,7 @@ class ProgressBar(Observer):
             miniters=None if self._is_terminal else 0,
             delay=0 if self._is_terminal else 60.0,
             unit_scale=True,
-            file=sys.stderr,
+            file=self._stream,
         )
 
     def advance(self, count: int) -> None:
@@ -49,7 +53,8 @@ class ProgressBar(Observer):
         """Print the text above the bar."""
         from tqdm.auto import tqdm
 
-        tqdm.write(text, file=sys.stderr)
+        if self._stream is not None:
+            tqdm.write(text, file=self._stream)
 
     def end(self) -> None:
         """Finish the bar and leave it visible."""

@@ -142,7 +142,7 @@ class DataGeneration(NewSessionPipeline):
     def _results(self) -> Iterable[str]:
         duration, made = self._duration, self.batch_id * self.batch_size
         yield f"{made} samples in {duration:.2f} s, {made / duration:.0f} samples/s"
-        yield describe_samples(self.dataset)
+        yield describe_samples(self.dataset.directory)
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         path = shlex.quote(str(self.session.path))

@@ -110,9 +110,9 @@ class Pipeline(ABC):
                 self._resources = resources.pop_all()
         except BaseException:
             if self.session is not None:
-                self._remove_unused(opened=False)
+                remove_unused(self.session, opened=False)
             raise
-        self._say(*self._plan())
+        self._say(f"session: {self.session.path}{self._why_here()}", *self._plan())
         return self
 
     def __exit__(
@@ -136,16 +136,11 @@ class Pipeline(ABC):
 
     def _end(self, error: BaseException | None) -> None:
         """Say what the run left, or remove its session if that is nothing."""
-        if error is None or not self._remove_unused(opened=True):
-            commands = (f"next: {command}" for command in self._next(error))
-            self._say(*self._results(), *self.observers.outputs(), *commands)
-
-    def _remove_unused(self, *, opened: bool) -> bool:
-        """Remove the session if a failed run kept nothing in it; return whether it was removed."""
-        removed = remove_unused(self.session, opened=opened)
-        if removed:
+        if error is not None and remove_unused(self.session, opened=True):
             self._say(f"session: {self.session.path} is removed, as the run kept nothing in it")
-        return removed
+            return
+        commands = (f"next: {command}" for command in self._next(error))
+        self._say(*self._results(), *self.observers.outputs(), *commands)
 
     def _say(self, *lines: str) -> None:
         """Print lines on stderr, in the process that writes the session."""
@@ -190,14 +185,10 @@ class Pipeline(ABC):
         environment: EnvironmentConfig | None,
         further: Iterable[Observer] = (),
     ) -> None:
-        """Say where the run writes, and open its observers.
-
-        Only the process that writes the session has any.
-        """
+        """Open the run's observers; only the process that writes the session has any."""
         if not self._leads:
             self.observers = Observers([])
             return
-        self._say(f"session: {self.session.path}{self._why_here()}")
         bars = [] if self.quiet else [ProgressBar()]
         observers: list[Observer] = [*bars, ScalarsFile(), *further]
         instance_nb = 0

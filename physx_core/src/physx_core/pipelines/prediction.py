@@ -174,7 +174,7 @@ class Prediction(Pipeline):
     def _results(self) -> Iterable[str]:
         yield f"{self.step_id} steps with {self.learner.config.network}"
         if self.dataset is not None:
-            yield describe_samples(self.dataset)
+            yield describe_samples(self.dataset.directory)
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         if self.dataset is not None:

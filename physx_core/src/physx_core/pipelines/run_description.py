@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 from physx_core.config import EnvironmentConfig, to_plain
 from physx_core.dataset import Dataset
+from physx_core.errors import PhysxError
 from physx_core.pipelines.learning.learner import Learner
 
 
@@ -50,10 +52,14 @@ def describe_environment_config(config: EnvironmentConfig | None) -> str:
     return f"{plain['environment']}{arguments}"
 
 
-def describe_samples(dataset: Dataset) -> str:
+def describe_samples(directory: Path) -> str:
     """Return a line with the number of samples of each mode of a dataset."""
-    counts = ", ".join(f"{dataset.num_samples(mode):,} {mode}" for mode in dataset.modes)
-    return f"samples: {counts or 'none'} in {dataset.directory}"
+    try:
+        with Dataset.open(directory) as dataset:
+            counts = [f"{dataset.num_samples(mode):,} {mode}" for mode in dataset.modes]
+    except PhysxError as error:  # the run's own error matters more
+        return f"samples: {error}"
+    return f"samples: {', '.join(counts) or 'none'} in {directory}"
 
 
 def describe_dataset(dataset: Dataset) -> str:

@@ -369,7 +369,7 @@ class Training(NewSessionPipeline):
 
     def _plan(self) -> Iterable[str]:
         if self.data.dataset.modes:
-            yield describe_samples(self.data.dataset)
+            yield describe_samples(self.data.dataset.directory)
         if self.group.size > 1:
             total, each, count = self.batch_size * self.group.size, self.batch_size, self.group.size
             yield f"batches of {total} samples, {each} in each of {count} processes"
@@ -383,7 +383,7 @@ class Training(NewSessionPipeline):
         if not math.isinf(self.best.loss):
             yield f"smallest loss {self.best.loss:.6g}, after epoch {self.best.epoch}"
         if self.environment_config is not None:
-            yield describe_samples(self.data.dataset)
+            yield describe_samples(self.data.dataset.directory)
         if self.checkpoint_path is not None:
             yield f"checkpoint: {self.checkpoint_path}"
 
