@@ -117,9 +117,10 @@ def test_info_tells_of_all_components():
 
 
 def test_info_tells_how_a_run_ended():
+    Session.create("sessions", "data_generation")
     config = EnvironmentConfig("toy/spring", {"period": "x"}, as_tcp_ip_client=False)
     with pytest.raises(EnvironmentFailedError):
-        DataGeneration(config, batch_nb=1, batch_size=1).execute()
+        DataGeneration(config, batch_nb=1, batch_size=1, new_session=False).execute()
     text = Path("sessions/data_generation/info.txt").read_text()
     assert "ended by EnvironmentFailedError after" in text
 

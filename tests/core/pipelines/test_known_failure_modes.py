@@ -122,8 +122,11 @@ def test_bad_data_are_named_in_whichever_step_they_come(fault, error, named, at)
         generate(fault, at)
     assert (caught.value.instance_id, caught.value.step) == (1, at)
     stored = at // 4 * 4
+    if not stored:
+        assert not Path("sessions/run").exists()
+        return
     with Dataset.open("sessions/run") as dataset:
-        assert (dataset.num_samples("training") if dataset.modes else 0) == stored
+        assert dataset.num_samples("training") == stored
 
 
 def test_lists_of_numbers_are_arrays():
