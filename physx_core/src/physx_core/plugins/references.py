@@ -195,17 +195,17 @@ def _attribute(kind: str, module: ModuleType, name: str, place: str) -> Any:
 
 
 def _classes(kind: str, module: ModuleType) -> list[str]:
-    """Return the names of the classes of a module that may be components of a kind."""
+    """Return the names of the classes of a module that may be meant by a reference."""
     from physx_core import components
 
     base = getattr(components, kind.capitalize(), None)
-    is_open = base is None or kind == "network"  # classes of a plugin's library are networks, too
-    return [
-        name
-        for name, found in vars(module).items()
-        if isinstance(found, type)
-        and (
-            (is_open and found.__module__ == module.__name__)
-            or (base is not None and issubclass(found, base) and found is not base)
-        )
-    ]
+    classes = {name: found for name, found in vars(module).items() if isinstance(found, type)}
+    if base is None:
+        return list(classes)
+    fitting = [name for name, found in classes.items() if issubclass(found, base) and found != base]
+    if kind != "network":
+        return fitting
+    own = [name for name, found in classes.items() if found.__module__ == module.__name__]
+    return list({*fitting, *own}) or list(
+        classes
+    )  # classes of a plugin's library are networks, too
