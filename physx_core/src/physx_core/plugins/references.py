@@ -206,6 +206,4 @@ def _classes(kind: str, module: ModuleType) -> list[str]:
     if kind != "network":
         return fitting
     own = [name for name, found in classes.items() if found.__module__ == module.__name__]
-    return list({*fitting, *own}) or list(
-        classes
-    )  # classes of a plugin's library are networks, too
+    return list({*fitting, *own}) or list(classes)  # or a library's own
