@@ -115,6 +115,17 @@ def test_the_file_lies_in_the_session_and_is_never_overwritten(opened, tmp_path)
     assert second.file == tmp_path / "run_2.rrd"
 
 
+def test_the_run_is_told_of_a_recording_that_is_there(opened, tmp_path):
+    visualizer = opened()
+    visualizer.close()
+    assert list(visualizer.outputs()) == []
+    visualizer = opened()
+    ball(visualizer)
+    visualizer.close()
+    file = tmp_path / "run.rrd"
+    assert list(visualizer.outputs()) == [f"recording: {file}  (rerun {file})"]
+
+
 def test_the_file_where_it_is_wanted(opened, tmp_path):
     visualizer = opened(path=str(tmp_path / "deep" / "here.rrd"))
     ball(visualizer)

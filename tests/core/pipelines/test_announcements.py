@@ -252,7 +252,7 @@ def test_neither_does_a_training_without_a_batch(said):
     made = generate().session.path
     data = DatasetConfig(existing_dir=made)
     with pytest.raises(ZeroDivisionError):
-        Loses(LINEAR, data, statistics=[Filming], epoch_nb=1, batch_size=5).execute()
+        Loses(LINEAR, data, epoch_nb=1, batch_size=5).execute()
     assert sessions() == ["spring"]
 
 
@@ -396,6 +396,8 @@ def test_resuming_needs_nothing_but_the_session(said):
     assert "3 of 3 epochs in T" in lines
     assert main(["train", "sessions/training/", "--resume", "--epoch-nb", "4"]) == 0
     assert "4 of 4 epochs in T" in said()
+    assert main(["train", "sessions/training", "--resume"]) == 0
+    assert any(line.startswith("nothing was left to train") for line in said())
     assert sessions() == ["spring", "training"]
 
 

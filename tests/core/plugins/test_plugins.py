@@ -176,3 +176,9 @@ def test_components_are_named_so_that_a_client_needs_no_metadata():
     assert locate("environment", "physx_core.toy:Spring") == "physx_core.toy:Spring"
     for unknown in ("toy/nothing", "nothing/spring", "nothing"):  # the client says what is wrong
         assert locate("environment", unknown) == unknown
+
+
+def test_of_many_components_the_nearest_are_named():
+    known = [f"Cart-v{number}" for number in range(50)] + ["Acrobot"]
+    text = str(ComponentNotFoundError("environment", "Acrobat", 'Plugin "gym"', known))
+    assert 'Did you mean "Acrobot"?' in text and "and 43 others (physx plugins)" in text

@@ -58,6 +58,7 @@ def test_headless_mode_leaves_a_picture(opened, tmp_path):
     for batch in range(10):
         visualizer.scalars({"loss/training": 1 / (batch + 1)}, batch, "batch")
     visualizer.close()
+    assert f"picture: {tmp_path / 'run.png'}" in visualizer.outputs()
     assert pixels(tmp_path / "run.png").shape == (200, 320, 3)
 
 

@@ -184,8 +184,18 @@ class Draws(Environment):
         self.set_training_data(x=np.ones(1))
 
 
-def test_environments_are_drawn():
+def test_environments_are_drawn(capsys):
     config = EnvironmentConfig(Draws, as_tcp_ip_client=False, visualizer="torch/tensorboard")
     DataGeneration(config, batch_nb=1, batch_size=2).execute()
     tags = read("sessions/data_generation").Tags()["tensors"]
     assert tags == ["environment_1/cloud_VERTEX"]
+    shown = "physx stats sessions/data_generation --tensorboard"
+    line = f"curves: sessions/data_generation/stats/tensorboard  ({shown})"
+    assert line in capsys.readouterr().err.splitlines()
+
+
+def test_a_board_without_anything_is_not_announced(folder):
+    board = TensorBoard()
+    board.open("run", folder, 1)
+    board.close()
+    assert list(board.outputs()) == []

@@ -136,11 +136,12 @@ class Pipeline(ABC):
 
     def _end(self, error: BaseException | None) -> None:
         """Say what the run left, or remove its session if that is nothing."""
-        if error is not None and remove_unused(self.session, opened=True):
+        outputs = self.observers.outputs()
+        if error is not None and not outputs and remove_unused(self.session, opened=True):
             self._say(f"session: {self.session.path} is removed, as the run kept nothing in it")
             return
         commands = (f"next: {command}" for command in self._next(error))
-        self._say(*self._results(), *self.observers.outputs(), *commands)
+        self._say(*self._results(), *outputs, *commands)
 
     def _say(self, *lines: str) -> None:
         """Print lines on stderr, in the process that writes the session."""

@@ -376,8 +376,10 @@ class Training(NewSessionPipeline):
 
     def _results(self) -> Iterable[str]:
         yield f"{self.epoch_id} of {self.epoch_nb} epochs in {self._duration:.2f} s"
-        if self.epoch_id:
+        if self.epoch_id > self._resumed.epoch:
             yield f"training loss {self.training_loss:.6g}"
+        elif self.epoch_id >= self.epoch_nb:
+            yield "nothing was left to train: epoch_nb (--epoch-nb) is the number of all epochs"
         if not math.isnan(self.validation_loss):
             yield f"validation loss {self.validation_loss:.6g}"
         if not math.isinf(self.best.loss):

@@ -43,7 +43,7 @@ class TensorBoard(Visualizer):
             raise ConfigError("interval and drawing_interval must be at least 0 (s).")
         self._interval, self._drawing_interval = interval, drawing_interval
         self._writer: Any = None
-        self._session = Path()
+        self._session, self._wrote = Path(), False
         self._waiting: dict[str, tuple[float, int]] = {}
         self._written = float("-inf")
         self._objects: dict[str, dict[str, Any]] = {}
@@ -61,7 +61,7 @@ class TensorBoard(Visualizer):
             raise MissingLibraryError(
                 "Writing for TensorBoard", "tensorboard", "tensorboard", "physx-torch"
             ) from error
-        self._session = session_dir
+        self._session, self._wrote = session_dir, False
         folder = session_dir / "stats" / "tensorboard"
         self._writer = SummaryWriter(str(folder), max_queue=1000, flush_secs=5)
 
@@ -69,6 +69,7 @@ class TensorBoard(Visualizer):
         """Write the numbers; those of batches at limited rate."""
         if self._writer is None:
             return
+        self._wrote = True
         self._waiting.update((name, (value, step)) for name, value in values.items())
         now = time.monotonic()
         if timeline != "batch" or now - self._written >= self._interval:
@@ -87,11 +88,13 @@ class TensorBoard(Visualizer):
         for name, array in values.items():
             finite = array[np.isfinite(array)]
             if finite.size:
+                self._wrote = True
                 self._writer.add_histogram(name, finite, step)
 
     def note(self, text: str) -> None:
         """Write the text to the text page."""
         if self._writer is not None:
+            self._wrote = True
             self._writer.add_text("notes", text)
 
     def events(self, instance_id: int, step: int, events: list[Event]) -> None:
@@ -130,6 +133,7 @@ class TensorBoard(Visualizer):
         """
         if self._writer is None:
             return
+        self._wrote = True
         points = np.asarray(positions, np.float32)
         colors = _colors(color, len(points))
         self._writer.add_mesh(
@@ -148,7 +152,9 @@ class TensorBoard(Visualizer):
             self._writer = None
 
     def outputs(self) -> Sequence[str]:
-        """Name the folder of the files: see `Observer.outputs`."""
+        """Name the folder of the files, if anything was written: see `Observer.outputs`."""
+        if not self._wrote:
+            return []
         shown = f"physx stats {shlex.quote(str(self._session))} --tensorboard"
         return [f"curves: {self._session / 'stats' / 'tensorboard'}  ({shown})"]
 
