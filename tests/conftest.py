@@ -1,7 +1,9 @@
 """What all tests share."""
 
 import os
+import shutil
 import signal
+import subprocess
 import time
 import uuid
 from pathlib import Path
@@ -16,6 +18,63 @@ settings.load_profile("physx")
 # A shell that starts the tests in the background has them ignore Ctrl-C, and every process that
 # they start inherits that; some tests press it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+class Machine:
+    """A network namespace, connected by a bridge in another one, as by a cable and a switch.
+
+    Attributes:
+        prefix: What a command begins with to run there.
+        address: Our address as seen from there.
+        own: Its own address.
+    """
+
+    def __init__(self):
+        self._name, self._net = f"physx{os.getpid() % 10000}", f"10.203.{os.getpid() % 250}"
+        self.prefix = ["ip", "netns", "exec", self._name]
+        self.address, self.own = f"{self._net}.1", f"{self._net}.2"
+
+    def connect(self):
+        n, switch = self._name, f"{self._name}s"
+        steps = [
+            f"ip netns add {n}",
+            f"ip netns add {switch}",
+            f"ip link add {n}a type veth peer name {n}b netns {switch}",
+            f"ip -n {switch} link add {n}c type veth peer name {n}d netns {n}",
+            f"ip -n {switch} link add {n}e type bridge",
+            *(f"ip -n {switch} link set {n}{port} master {n}e" for port in "bc"),
+            *(f"ip -n {switch} link set {n}{port} up" for port in "bce"),
+            f"ip addr add {self.address}/24 dev {n}a",
+            f"ip link set {n}a up",
+            f"ip -n {n} addr add {self.own}/24 dev {n}d",
+            *(f"ip -n {n} link set {device} up" for device in (f"{n}d", "lo")),
+        ]
+        for step in steps:
+            done = subprocess.run(step.split(), capture_output=True, text=True, check=False)
+            if done.returncode:
+                pytest.skip(f"{step}: {done.stderr.strip()}")
+
+    def unplug(self):
+        """Pull the cable: neither side hears of the other any more, or of the end."""
+        step = f"ip -n {self._name}s link set {self._name}c nomaster"
+        subprocess.run(step.split(), check=True)
+
+    def remove(self):
+        for name in (self._name, f"{self._name}s"):
+            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+
+
+@pytest.fixture
+def another_machine():
+    """A machine on the network; the test is skipped where none can be made."""
+    if shutil.which("ip") is None:
+        pytest.skip("the command ip (iproute2) is not installed")
+    machine = Machine()
+    try:
+        machine.connect()
+        yield machine
+    finally:
+        machine.remove()
 
 
 @pytest.fixture

@@ -214,6 +214,10 @@ class UnansweredError(ConnectionRefusedByPeerError):
     """Nothing responds at an address, or the connection ended before authentication."""
 
 
+class SilentPeerError(UnansweredError):
+    """What listens at an address did not respond in time."""
+
+
 # Sessions, datasets, checkpoints ------------------------------------------------------------
 
 

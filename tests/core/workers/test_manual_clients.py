@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
-import shutil
 import signal
 import socket
 import subprocess
@@ -346,34 +345,10 @@ def children_of(parent):
 # Another machine --------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def elsewhere():
-    """A network namespace with an address of its own: its prefix for commands, and our address."""
-    if shutil.which("ip") is None:
-        pytest.skip("the command ip (iproute2) is not installed")
-    name, net = f"physx{os.getpid() % 10000}", f"10.203.{os.getpid() % 250}"
-    steps = [
-        f"ip netns add {name}",
-        f"ip link add {name}a type veth peer name {name}b netns {name}",
-        f"ip addr add {net}.1/24 dev {name}a",
-        f"ip link set {name}a up",
-        f"ip -n {name} addr add {net}.2/24 dev {name}b",
-        f"ip -n {name} link set {name}b up",
-    ]
-    try:
-        for step in steps:
-            done = subprocess.run(step.split(), capture_output=True, text=True, check=False)
-            if done.returncode:
-                pytest.skip(f"{step}: {done.stderr.strip()}")
-        yield ["ip", "netns", "exec", name], f"{net}.1"
-    finally:
-        subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
-
-
 def test_a_client_on_another_machine_joins_with_the_token_and_not_without(
-    by_hand, join, port, elsewhere
+    by_hand, join, port, another_machine
 ):
-    prefix, address = elsewhere
+    prefix, address = another_machine.prefix, another_machine.address
     where = {"prefix": prefix, "address": f"{address}:{port}"}
     strangers = {**os.environ, "PHYSX_TOKEN": "another token than that"}
     loopback = join("--patience", "1", prefix=prefix, address=f"127.0.0.1:{port}")

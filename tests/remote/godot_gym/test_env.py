@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env
 
 from physx_core.errors import RemoteError, UsageError
 from physx_remote import serve
+from physx_remote.serving.spaces import to_json
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*Box observation space:UserWarning")
 
@@ -110,6 +111,41 @@ def test_an_action_of_another_shape(drive, action):
     with pytest.raises(RemoteError, match="The action"):
         env.client.step(action, env.requested_observation)
     env.step(1)
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "said"),
+    [
+        ("box", [[0, 0, 0], [0, np.nan, 0]], r'The action\["box"\]\[1\]\[1\] is nan'),
+        ("bounds", [0, np.inf], r'The action\["bounds"\]\[1\] is inf'),
+        ("bounds", [1e300, 0], r'The action\["bounds"\]\[0\] is inf'),
+        ("single", -np.inf, r'The action\["single"\] is -inf'),
+        ("whole", [0, 10, 0], r'The action\["whole"\]\[1\] is 10'),
+        ("whole", [0, 10**30, 0], r'The action\["whole"\] must be in'),
+        ("one", 3, r'The action\["one"\] is 3, which is not an element of Discrete'),
+        ("one", -3, r'The action\["one"\] is -3'),
+        ("bits", [[0, 1], [1, 2]], r'The action\["bits"\]\[1\]\[1\] is 2'),
+        ("several", [0, 4], r'The action\["several"\]\[1\] is 4'),
+        ("pair", [2, {"x y": 0}], r'The action\["pair"\]\[0\] is 2'),
+        ("pair", [1, {"x y": 3}], r'The action\["pair"\]\[1\]\["x y"\] is 3'),
+    ],
+)
+def test_an_action_that_the_space_does_not_hold_is_refused(drive, caplog, part, value, said):
+    env = drive(EverySpace)
+    env.reset(seed=1)
+    action = to_json(env.action_space, env.action_space.sample())
+    with pytest.raises(RemoteError, match=said):
+        env.client.step({**action, part: value}, env.requested_observation)
+    assert "Traceback" not in caplog.text
+    assert env.ended_of(env.client.step(action, env.requested_observation)) == (False, False)
+
+
+def test_how_far_a_continuous_action_goes_is_for_the_environment_to_say(drive, same):
+    here, there = gymnasium.make("Pendulum-v1"), drive("gym/Pendulum-v1")
+    here.reset(seed=1)
+    there.reset(seed=1)
+    action = np.array([50.0], np.float32)  # Pendulum clips it
+    assert same(here.step(action)[0], there.step(action)[0])
 
 
 def test_what_the_environment_raises_is_told(drive):

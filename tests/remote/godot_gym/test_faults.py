@@ -311,10 +311,40 @@ def _has_answer(peer):
 
 
 def test_more_clients_than_there_may_be(start, scene, peer_class, caplog):
-    service = start(scene, max_clients=2)
+    service = start(scene, max_clients=2, clients="serve")
     peers = [peer_class(service.address, service) for _ in range(3)]
-    assert peers[2].answer() is None
-    assert "too many are connected" in caplog.text
+    assert [peer.ask(LIVES) for peer in peers[:2]] == [ALIVE, ALIVE]
+    assert peers[2].ask(LIVES) is None
+    assert "Too many clients are connected: max_clients is 2" in caplog.text
     assert peers[0].ask(LIVES) == ALIVE
     for peer in peers:
         peer.leave()
+
+
+def test_clients_that_never_ask_keep_nobody_out(start, scene, peer_class, caplog):
+    service = start(scene, max_clients=4)
+    idle = []
+    for _ in range(50):
+        idle.append(peer_class(service.address, service))
+        service.poll(0.01)
+    idle[-1].send(b"\x05")  # not a whole request
+    peer = peer_class(service.address, service)
+    assert peer.ask(LIVES) == ALIVE
+    assert len(service.environment.communication.connections) <= 32 + 1
+    assert "too many strangers are connected" in caplog.text
+    for one in (*idle, peer):
+        one.leave()
+
+
+def test_a_flood_of_bad_requests_does_not_flood_the_log(start, scene, peer_class, caplog):
+    service = start(scene)
+    peer = peer_class(service.address, service)
+    for _ in range(200):
+        peer.error(b"[]")
+    said = [text for text in caplog.messages if "must be a JSON object" in text]
+    assert 10 <= len(said) <= 50
+    peer.leave()
+    service.close()
+    left_out = [text for text in caplog.messages if "more entries like these" in text]
+    assert left_out[0].endswith("about 127.0.0.1")
+    assert sum(int(text.split()[0]) for text in left_out) + len(said) == 200

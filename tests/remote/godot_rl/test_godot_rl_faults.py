@@ -102,6 +102,8 @@ def test_an_error_of_the_environment_is_told_and_all_agents_begin_anew(trainer, 
 def test_a_length_beyond_the_limit_ends_the_service(trainer, caplog):
     one = trainer()
     one.socket.sendall(struct.pack("<I", 1 << 30))
+    with pytest.raises(RemoteError, match=f"The trainer at .* is lost: .*{1 << 30}"):
+        one.service_ends()
     assert one.service_ends()
     assert str(1 << 30) in caplog.text
 

@@ -177,11 +177,56 @@ def test_fifty_clients_at_once(service):
 
 def test_too_many_clients(serving, env):
     service = serving(env, max_clients=2)
-    with connect(_text(service), token=TOKEN) as actor, _raw(service):
-        with pytest.raises(RemoteClosedError, match="too many"):
+    with connect(_text(service), token=TOKEN) as actor:
+        with (
+            PhysxObserver(_text(service), token=TOKEN),
+            pytest.raises(RemoteError, match="Too many clients are connected: max_clients is 2"),
+        ):
             PhysxObserver(_text(service), token=TOKEN)
         actor.reset()
     assert lives(service)
+
+
+def test_strangers_take_no_places_of_those_who_know_the_token(serving, env):
+    service = serving(env, max_clients=4)
+    with contextlib.ExitStack() as stack:
+        for _ in range(50):
+            stack.enter_context(_raw(service))
+        with connect(_text(service), token=TOKEN) as actor:
+            actor.reset()
+            with PhysxObserver(_text(service), token=TOKEN) as observer:
+                actor.step([0.0, 0.0])
+                assert observer.next(PATIENCE).number == 2
+        assert len(service.connections) <= 32 + 2
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ([0.0, np.nan], r"The action\[1\] of world 0 is nan, which is not a finite number"),
+        ([-np.inf, 0.0], r"The action\[0\] of world 0 is -inf"),
+    ],
+)
+def test_actions_that_are_not_finite_are_refused(service, env, value, said, caplog):
+    with connect(_text(service), token=TOKEN) as client:
+        client.reset()
+        with pytest.raises(RequestError, match=said):
+            client.step(value)
+        assert env.steps == 0
+        assert client.step([50.0, 0.0])[0].tolist() == [1.0, 1.0], "its own range is its own"
+    assert "Traceback" not in caplog.text
+
+
+def test_discrete_actions_beyond_their_range_are_refused(serving):
+    service = serving("gym/CartPole-v1", num_worlds=2)
+    with connect_vector(_text(service), token=TOKEN).client as client:
+        client.reset(seeds=[1, 2])
+        for wrong in (-1, 2):
+            with pytest.raises(RequestError, match=rf"The action of world 1 is {wrong}, which is"):
+                client.step({"action0": np.array([0, wrong])})
+            with pytest.raises(RequestError, match=rf"The action of world 1 is {wrong}, which is"):
+                client.step({"action0": np.array([wrong])}, [1])
+        client.step({"action0": np.array([0, 1])})
 
 
 # Clients that are trusted and err -----------------------------------------------------------------

@@ -19,9 +19,14 @@ from .handshake import TOKEN_VARIABLE as TOKEN_VARIABLE
 from .handshake import ServerHandshake as ServerHandshake
 from .handshake import introduce as introduce
 from .listener import Listener as Listener
+from .liveness import VANISHED as VANISHED
+from .liveness import is_loss as is_loss
+from .liveness import poll_peer as poll_peer
+from .liveness import prepare_connection as prepare_connection
 from .remote_errors import decode_error as decode_error
 from .remote_errors import encode_error as encode_error
 from .spin_wait import yield_core as yield_core
+from .strangers import Handshakes as Handshakes
 from .strangers import Strangers as Strangers
 from .tokens import find_token as find_token
 from .values import decode as decode

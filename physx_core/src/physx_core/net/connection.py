@@ -9,6 +9,8 @@ import time
 from abc import ABC, abstractmethod
 from typing import Any
 
+from physx_core.net.liveness import prepare_connection
+
 _MOST_AT_ONCE = 1 << 20
 
 
@@ -66,9 +68,7 @@ class Connection:
             name: The other side, for messages to people.
         """
         connected.setblocking(False)
-        with contextlib.suppress(OSError):  # a socket that is not TCP has no such options
-            connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        prepare_connection(connected)
         self.socket, self.reader, self.name = connected, reader, name
         self.heard = time.monotonic()
         self.closed = False

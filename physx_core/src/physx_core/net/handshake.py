@@ -13,7 +13,7 @@ import socket
 import struct
 import time
 
-from physx_core.errors import ConnectionRefusedByPeerError, UnansweredError
+from physx_core.errors import ConnectionRefusedByPeerError, SilentPeerError, UnansweredError
 from physx_core.net.frames import MAX_PAYLOAD, Frame, FrameReader, Kind, pack
 
 TOKEN_VARIABLE = "PHYSX_TOKEN"
@@ -84,7 +84,7 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
     """Prove to a server that this client knows the token, and have it prove the same.
 
     Args:
-        connection: Blocking socket, with a timeout.
+        connection: Blocking socket whose timeout is that of the whole handshake.
         token: The run's token.
         instance: Number of the instance to run, 0 for any that is free.
 
@@ -92,7 +92,8 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
         The reader of the connection.
 
     Raises:
-        UnansweredError: If the server does not answer, or ended the connection.
+        SilentPeerError: If the server does not answer in time.
+        UnansweredError: If the server ended the connection.
         ConnectionRefusedByPeerError: If the server has another version or another token, or is
             not a physx server.
     """
@@ -100,12 +101,12 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
     own = secrets.token_bytes(32)
     try:
         connection.sendall(pack(Kind.HELLO, _OPENING.pack(_MAGIC, VERSION, own)))
-        frame = reader.read(connection)
+        frame = _read_in_time(connection, reader)
+    except TimeoutError as error:
+        raise SilentPeerError("The server did not answer in time.") from error
     except (EOFError, OSError) as error:
-        raise UnansweredError(
-            f"The server ended the connection or did not answer ({error})."
-        ) from error
-    if frame is None or frame.kind is not Kind.CHALLENGE:
+        raise UnansweredError(f"The server ended the connection ({error}).") from error
+    if frame.kind is not Kind.CHALLENGE:
         raise ConnectionRefusedByPeerError("What answers at that address is not a physx server.")
     magic, version, other = _parse_opening(frame.payload[:-_PROOF_SIZE])
     if magic != _MAGIC or version != VERSION:
@@ -128,6 +129,19 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
         raise UnansweredError(f"The server ended the connection ({error}).") from error
     reader.limit = MAX_PAYLOAD
     return reader
+
+
+def _read_in_time(connection: socket.socket, reader: FrameReader) -> Frame:
+    """Return the next frame; one that comes in pieces has no more time than another."""
+    patience = connection.gettimeout()
+    until = None if patience is None else time.monotonic() + patience
+    while (frame := reader.take()) is None:
+        if until is not None:
+            connection.settimeout(max(until - time.monotonic(), 1e-3))
+        if not reader.receive(connection):
+            raise EOFError("end of stream")
+    connection.settimeout(patience)
+    return frame
 
 
 def _parse_opening(payload: bytearray) -> tuple[bytes, int, bytes]:

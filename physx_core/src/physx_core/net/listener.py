@@ -8,8 +8,10 @@ import selectors
 import socket
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
+from weakref import WeakSet
 
 from physx_core.net.connection import Connection
+from physx_core.net.liveness import LOOK_EVERY, has_vanished
 from physx_core.net.spin_wait import spin_until
 from physx_core.net.timers import Timers
 
@@ -29,16 +31,22 @@ class Listener(Generic[AnyConnection]):
         timers: Functions to be called later; whoever owns the listener calls those that are due.
     """
 
-    def __init__(self, accepted: Callable[[socket.socket, str], Any]) -> None:
+    def __init__(
+        self,
+        accepted: Callable[[socket.socket, str], Any],
+        vanished: Callable[[AnyConnection], Any],
+    ) -> None:
         """Start without listening.
 
         Args:
             accepted: Called with each new connection, and its other side as ``host:port``.
+            vanished: Called with a connection whose other side's machine no longer answers.
         """
         self.address = ("", 0)
         self.timers = Timers()
-        self._accepted = accepted
-        self._has_guests = False
+        self._accepted, self._vanished = accepted, vanished
+        self._connections: WeakSet[AnyConnection] = WeakSet()
+        self._is_watching = self._has_guests = False
         self._socket: socket.socket | None = None
         self._selector = selectors.DefaultSelector()
         self._waker, self._wakes = socket.socketpair()
@@ -74,6 +82,10 @@ class Listener(Generic[AnyConnection]):
     def add(self, connection: AnyConnection) -> None:
         """Watch a connection, until it is closed."""
         connection.attach(self._selector)
+        self._connections.add(connection)
+        if not self._is_watching:
+            self._is_watching = True
+            self.timers.add(LOOK_EVERY, self._look_for_vanished)
 
     def select(self, timeout: float | None, spin: float = 0.0) -> list[tuple[AnyConnection, int]]:
         """Return the connections with something to do, and the events.
@@ -133,6 +145,15 @@ class Listener(Generic[AnyConnection]):
         self._waker.close()
         self._wakes.close()
         self._selector.close()
+
+    def _look_for_vanished(self) -> None:
+        alive = [one for one in self._connections if not one.closed]
+        for connection in alive:
+            if has_vanished(connection.socket):
+                self._vanished(connection)
+        self._is_watching = bool(alive)
+        if self._is_watching:
+            self.timers.add(LOOK_EVERY, self._look_for_vanished)
 
     def _accept_again(self) -> None:
         if self._socket is not None:

@@ -1,4 +1,4 @@
-"""Strangers: connections that have not yet proved that they know the token."""
+"""Strangers: connections that have not yet shown that they belong to a server."""
 
 from __future__ import annotations
 
@@ -14,7 +14,51 @@ from physx_core.net.timers import Timers
 
 
 class Strangers(Generic[AnyConnection]):
-    """Connections whose handshake is under way: not too many, and none for too long.
+    """Connections that have not yet shown that they belong to a server: not too many.
+
+    Those that have do not count, so strangers do not keep them out.
+    """
+
+    def __init__(self, most: int, drop: Callable[[AnyConnection, str], None]) -> None:
+        """Start without any.
+
+        Args:
+            most: How many there are at most.
+            drop: Closes a connection for a reason and calls `forget`.
+        """
+        self._most, self._drop = most, drop
+        self._waiting: dict[AnyConnection, None] = {}
+
+    def __contains__(self, connection: AnyConnection) -> bool:
+        """Return whether a connection is still a stranger."""
+        return connection in self._waiting
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self._waiting)
+
+    def add(self, connection: AnyConnection) -> None:
+        """Count a new connection as a stranger.
+
+        Where there are too many, one of them is dropped at random: whoever occupies the places
+        cannot keep out a client that tries again.
+        """
+        if len(self._waiting) >= self._most:
+            self._drop(secrets.choice([*self._waiting]), "too many strangers are connected")
+        self._waiting[connection] = None
+
+    def forget(self, connection: AnyConnection) -> None:
+        """Forget a connection; nothing happens if it is not a stranger."""
+        self._waiting.pop(connection, None)
+
+    def drop_all(self) -> None:
+        """Drop all strangers, because the server ends."""
+        for connection in [*self._waiting]:
+            self._drop(connection, "")
+
+
+class Handshakes(Strangers[AnyConnection]):
+    """Strangers that have to prove that they know a token, and soon.
 
     Attributes:
         patience: How long a stranger may take for the next part of its handshake, in s.
@@ -37,23 +81,15 @@ class Strangers(Generic[AnyConnection]):
             drop: Closes a connection for a reason and calls `forget`.
             timers: Timers of the server.
         """
+        super().__init__(most, drop)
         self.patience = patience
-        self._token, self._most, self._drop, self._timers = token, most, drop, timers
+        self._token, self._timers = token, timers
         self._handshakes: dict[AnyConnection, ServerHandshake] = {}
         self._is_watching = False
 
-    def __contains__(self, connection: AnyConnection) -> bool:
-        """Return whether a connection is still a stranger."""
-        return connection in self._handshakes
-
     def add(self, connection: AnyConnection) -> None:
-        """Start the handshake with a new connection.
-
-        Where there are too many, one of them is dropped at random: whoever occupies the places
-        cannot keep out a client that tries again.
-        """
-        if len(self._handshakes) >= self._most:
-            self._drop(secrets.choice([*self._handshakes]), "too many are connected")
+        """Start the handshake with a new connection; see `Strangers.add`."""
+        super().add(connection)
         self._handshakes[connection] = ServerHandshake(self._token)
         if not self._is_watching:
             self._is_watching = True
@@ -76,12 +112,8 @@ class Strangers(Generic[AnyConnection]):
 
     def forget(self, connection: AnyConnection) -> None:
         """Forget a connection; nothing happens if it is not a stranger."""
+        super().forget(connection)
         self._handshakes.pop(connection, None)
-
-    def drop_all(self) -> None:
-        """Drop all strangers, because the server ends."""
-        for connection in [*self._handshakes]:
-            self._drop(connection, "")
 
     def _drop_silent(self) -> None:
         limit = time.monotonic() - self.patience

@@ -16,7 +16,14 @@ from physx_remote.godot_gym.messages import DESCRIPTION, Messages, read_extensio
 from physx_remote.godot_gym.wire import OUTCOME, observation_fields
 from physx_remote.serving.client_link import RequestLink
 from physx_remote.serving.connect_options import ConnectOptions
-from physx_remote.serving.spaces import Space, SpaceTree, build_space, to_json
+from physx_remote.serving.spaces import (
+    NONSENSE,
+    Space,
+    SpaceTree,
+    build_space,
+    check_shape,
+    to_json,
+)
 
 Parts = dict[str, dict[str, Any] | None]
 """The parts ``agent`` and ``world`` of an answer; None for an absent one."""
@@ -116,7 +123,7 @@ class GodotGymClient(Closeable):
             return {}
         try:
             description = json.loads(text)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise RemoteProtocolError(
                 f"The server's description is not valid JSON: {error}."
             ) from error
@@ -125,6 +132,11 @@ class GodotGymClient(Closeable):
                 f"The server's description has another version: {text[:100]}. Install the same "
                 "version of physx-remote on both sides."
             )
+        for part in ("messages", "spaces"):
+            if not isinstance(description.get(part, {}), dict):
+                raise RemoteProtocolError(
+                    f'The server\'s description has invalid "{part}": {text[:100]}.'
+                )
         return description
 
     def close(self) -> None:
@@ -242,25 +254,34 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
                 f"The answer lacks the field {error} of the observation; it has {list(agent)}. "
                 "Override observation_of, or give requested_observation."
             ) from None
-        parts = zip(self._observations.leaves, values, strict=True)
-        return self._observations.join(_to_leaf(leaf, value) for leaf, value in parts)
+        parts = zip(self._names, self._observations.leaves, values, strict=True)
+        return self._observations.join(_to_leaf(name, leaf, value) for name, leaf, value in parts)
 
     def reward_of(self, data: Parts) -> float:
         """Return the reward in an answer."""
-        return float((data["world"] or {}).get("reward", 0.0))
+        try:
+            return float((data["world"] or {}).get("reward", 0.0))
+        except NONSENSE as error:
+            raise _unexpected("reward_of", error) from error
 
     def ended_of(self, data: Parts) -> tuple[bool, bool]:
         """Return whether the episode is terminated, and whether it is truncated."""
         world = data["world"] or {}
         ended = world.get("terminated", world.get("done", False))
-        return bool(ended), bool(world.get("truncated", False))
+        try:
+            return bool(ended), bool(world.get("truncated", False))
+        except NONSENSE as error:
+            raise _unexpected("ended_of", error) from error
 
     def info_of(self, data: Parts) -> dict[str, Any]:
         """Return the info in an answer: ``info``, and the world's other fields by name."""
         world = data["world"] or {}
         others = {n: v for n, v in world.items() if n not in OUTCOME and n != "done"}
         text = world.get("info")
-        return {**others, **json.loads(text)} if text else others
+        try:
+            return {**others, **json.loads(text)} if text else others
+        except NONSENSE as error:
+            raise _unexpected("info_of", error) from error
 
     # ----------------------------------------------------------------------------------------
 
@@ -287,7 +308,12 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
             raise RemoteError(
                 f"The server does not describe its {kind}s: give {kind}_space=, a Gymnasium space."
             )
-        parts = {name: _unbounded(field) for name, field in fields.items()}
+        try:
+            parts = {name: _unbounded(field) for name, field in fields.items()}
+        except ValueError as error:
+            raise RemoteProtocolError(
+                f"The server describes {kind}s that do not fit into memory: {error}."
+            ) from error
         return parts["observation"] if [*parts] == ["observation"] else spaces.Dict(parts)
 
     def _all_fields(self) -> dict[str, list[str]]:
@@ -308,24 +334,32 @@ def _to_list(value: Any) -> Any:
 
 def _unbounded(field: Field) -> Space:
     dtype = np.dtype(field.dtype)
+    check_shape(field.shape or ())
     if dtype.kind == "f":
         return spaces.Box(-np.inf, np.inf, field.shape, dtype.type)
     low, high = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
     return spaces.Box(low, high, field.shape, np.int8 if dtype.kind == "b" else dtype.type)
 
 
-def _to_leaf(leaf: Space, value: Any) -> Any:
+def _unexpected(method: str, error: BaseException) -> RemoteProtocolError:
+    return RemoteProtocolError(
+        f"The answer has other values than {method} expects: {error}. Override {method}."
+    )
+
+
+def _to_leaf(name: str, leaf: Space, value: Any) -> Any:
     """Return a received value with the type and shape of its space."""
-    if isinstance(leaf, spaces.Discrete):
-        return leaf.dtype.type(value)
-    source = np.frombuffer(value, np.uint8) if isinstance(value, bytes) else value
-    array = np.asarray(source, leaf.dtype)
     try:
+        if isinstance(leaf, spaces.Discrete):
+            return leaf.dtype.type(value)
+        source = np.frombuffer(value, np.uint8) if isinstance(value, bytes) else value
+        array = np.asarray(source, leaf.dtype)
         return array if array.shape == leaf.shape else array.reshape(leaf.shape)
-    except ValueError:
+    except NONSENSE as error:
         raise RemoteProtocolError(
-            f"A part of the observation has {array.size} values, but {leaf} has shape {leaf.shape}."
-        ) from None
+            f'The field "{name}" of the observation does not fit {leaf}: {error}. Override '
+            "observation_of, or give observation_space."
+        ) from error
 
 
 def _check_given(observation_space: Any, action_space: Any, requested: Any) -> None:

@@ -57,7 +57,9 @@ class Communication(SocketService):
                 connection.
             max_request: Longest request in bytes; a client that sends a longer one is closed.
             patience: How long a client may be silent, in s, while another waits; None: forever.
-            max_clients: How many clients may be connected; further ones are closed at once.
+            max_clients: How many clients may be connected; further ones are closed at their first
+                request. There may be as many connections without any whole request besides, or 32;
+                where another comes, one of those is closed.
 
         Raises:
             ConfigError: If a value is out of range.
@@ -161,16 +163,17 @@ class Communication(SocketService):
     def on_open(self, connection: RequestConnection) -> None:
         """Close a further client, or log that it waits."""
         if self._served is None or self._clients == "serve":
-            LOG.info("%s connected", connection.name)
+            self.log.info(connection.name, "%s connected", connection.name)
         elif self._clients == "refuse" and not self._served.ended:
             self.drop(connection, f"turned away while {self._served.name} is served")
         else:
-            LOG.info("%s waits until %s leaves", connection.name, self._served.name)
+            name, served = connection.name, self._served.name
+            self.log.info(name, "%s waits until %s leaves", name, served)
 
     def on_close(self, connection: RequestConnection) -> None:
         """Make room for the next client."""
         if connection is self._served:
-            LOG.info("%s left", connection.name)
+            self.log.info(connection.name, "%s left", connection.name)
             self._served = None
 
     def admits(self, connection: RequestConnection) -> bool:
@@ -207,12 +210,9 @@ class Communication(SocketService):
         """Report an error in the log and to the client."""
         expected = isinstance(error, RequestError)
         text = str(error) if expected else f"{type(error).__name__}: {error}"
-        LOG.error(
-            "A request of %s failed: %s",
-            connection.name,
-            text,
-            exc_info=None if expected else error,
-        )
+        cause = None if expected else error
+        name = connection.name
+        self.log.error(name, "A request of %s failed: %s", name, text, cause=cause)
         if self._answered:
             return
         if self._errors == "close":

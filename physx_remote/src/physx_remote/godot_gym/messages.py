@@ -9,8 +9,9 @@ every unknown part.
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Callable, Iterable, Mapping
-from functools import cached_property
+from functools import cache, cached_property
 from types import ModuleType
 from typing import Any, TypeAlias
 
@@ -20,6 +21,7 @@ from physx_core import Field
 from physx_core.errors import ConfigError, MissingLibraryError, RemoteError, RemoteProtocolError
 from physx_core.fields import FieldLike, as_fields
 from physx_core.typing import Array
+from physx_remote.serving.spaces import NONSENSE
 
 AGENT, WORLD = "agent_data", "world_data"
 ERROR, DESCRIPTION = 1000, 1001
@@ -27,8 +29,10 @@ ERROR, DESCRIPTION = 1000, 1001
 MessageField: TypeAlias = FieldLike
 """A field as in `physx_core.fields.as_fields`, or ``(name, str)`` or ``(name, bytes)``."""
 
-_Readers: TypeAlias = "list[tuple[str, Callable[[Any], Any]]]"
+_NamedReaders: TypeAlias = "list[tuple[str, Callable[[Any], Any]]]"
+_Readers: TypeAlias = tuple[_NamedReaders, _NamedReaders]
 
+_INVALID: tuple[type[Exception], ...] = (ConfigError, *NONSENSE)
 _LENGTH_DELIMITED = 2
 _MANY = 32
 
@@ -116,15 +120,29 @@ class Messages:
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Messages:
-        """Generate the messages that `to_dict` described."""
-        parts = {part: [_from_dict(field) for field in plain[part]] for part in ("agent", "world")}
-        return cls.of_fields(**parts)
+        """Generate the messages that `to_dict` described.
+
+        Raises:
+            RemoteProtocolError: If the description is not valid.
+        """
+        try:
+            parts = {
+                name: [_from_dict(each) for each in plain[name]] for name in ("agent", "world")
+            }
+            return cls.of_fields(**parts)
+        except _INVALID as error:
+            raise RemoteProtocolError(
+                "The other side sent an invalid description of messages, "
+                f"{reprlib.repr(plain)}: {error!r}."
+            ) from error
 
     def read(self, body: bytes) -> dict[str, dict[str, Any] | None]:
         """Return the parts ``agent`` and ``world`` of an answer, each by field name.
 
         A part that is not in the answer is None. Repeated numbers are arrays, of the declared
-        shape if there is one; those that are not in the answer are left out.
+        shape if there is one; those that are not in the answer are left out. Messages are
+        dictionaries by field name, repeated ones lists of them, and maps dictionaries by key; a
+        message that is not in the answer is left out.
 
         Raises:
             RemoteError: If the answer is an error.
@@ -145,10 +163,15 @@ class Messages:
             if error_text is not None:
                 raise RemoteError(f"The other side reports: {error_text}")
         agent, world = self._readers
-        return {
-            "agent": _values(message.agent_data, agent) if has_agent else None,
-            "world": _values(message.world_data, world) if has_world else None,
-        }
+        try:
+            return {
+                "agent": _values(message.agent_data, agent) if has_agent else None,
+                "world": _values(message.world_data, world) if has_world else None,
+            }
+        except NONSENSE as error:
+            raise RemoteProtocolError(
+                f"An answer of {len(body)} bytes does not fit the fields of the messages: {error}."
+            ) from error
 
     @cached_property
     def _readers(self) -> tuple[_Readers, _Readers]:
@@ -160,30 +183,40 @@ class Messages:
         )
 
 
-def fill(storage: Any, **values: Any) -> None:
-    """Write values into a message: arrays, numbers, strings or bytes, by field name.
+def fill(storage: Any, /, **values: Any) -> None:
+    """Write values into a message, by field name; what a field held before is replaced.
+
+    A field takes what its type says: a number, a string, bytes, or an array of uint8 for bytes; a
+    repeated one takes an array or a list. A field that is a message takes a dictionary by field
+    name, or a message; a repeated one takes a list of those. A map takes a dictionary by key.
+
+    Args:
+        storage: The message.
+        values: The values.
 
     Raises:
         ConfigError: If the message does not have a field, or the field does not take a value.
     """
+    _fill(storage, values)
+
+
+def _fill(storage: Any, values: Mapping[str, Any]) -> None:
     for name, value in values.items():
         try:
             present = getattr(storage, name)
-        except AttributeError:
+        except (AttributeError, TypeError):
             known = ", ".join(storage.DESCRIPTOR.fields_by_name)
             raise ConfigError(
                 f'The message {storage.DESCRIPTOR.name} has no field "{name}". It has: {known}.'
             ) from None
         try:
             if not isinstance(present, (bool, int, float, str, bytes)):
-                _extend(storage, name, present, value)
-            elif isinstance(present, bytes) and not isinstance(value, bytes):
-                setattr(storage, name, np.ascontiguousarray(value, np.uint8).tobytes())
-            elif isinstance(value, (np.ndarray, np.generic)):
-                setattr(storage, name, value.item())
+                _replace(storage, name, present, value)
+            elif isinstance(present, bytes):
+                setattr(storage, name, _to_bytes(value))
             else:
-                setattr(storage, name, value)
-        except (TypeError, ValueError, OverflowError) as error:
+                setattr(storage, name, _plain(value))
+        except (TypeError, ValueError, LookupError, OverflowError, AttributeError) as error:
             raise ConfigError(
                 f'The field "{name}" of {storage.DESCRIPTOR.name} does not take {value!r:.100}: '
                 f"{error}."
@@ -216,8 +249,58 @@ def _varint(number: int) -> bytes:
     return bytes(encoded)
 
 
-def _extend(storage: Any, name: str, repeated: Any, value: Any) -> None:
-    """Set a repeated field; long floating arrays are copied in wire format."""
+def _replace(storage: Any, name: str, present: Any, value: Any) -> None:
+    """Set a field that is a message, a map or repeated."""
+    is_list = type(value) is list and value and type(value[0]) in (float, int)
+    if is_list or type(value) is np.ndarray:
+        _set_numbers(storage, name, present, value)
+        return
+    field = storage.DESCRIPTOR.fields_by_name[name]
+    if field.message_type is None:
+        if _TYPES[field.type] in ("string", "bytes"):
+            convert = _plain if _TYPES[field.type] == "string" else _to_bytes
+            _check_list(value)
+            storage.ClearField(name)
+            present.extend([convert(item) for item in value])
+        else:
+            _set_numbers(storage, name, present, value)
+        return
+    if not _is_repeated(field):
+        storage.ClearField(name)
+        _set_message(getattr(storage, name), value)
+    elif _is_map(field):
+        _set_map(storage, name, present, field.message_type.fields_by_name["value"], value)
+    else:
+        _check_list(value)
+        storage.ClearField(name)
+        for item in value:
+            _set_message(present.add(), item)
+
+
+def _set_message(storage: Any, value: Any) -> None:
+    """Set an empty message to a message, or to a dictionary by field name."""
+    if isinstance(value, Mapping):
+        storage.SetInParent()
+        _fill(storage, value)
+    else:
+        storage.CopyFrom(value)
+
+
+def _set_map(storage: Any, name: str, present: Any, content: Any, value: Any) -> None:
+    """Set a map to a dictionary; `content` describes what its values are."""
+    if not isinstance(value, Mapping):
+        raise TypeError("a map takes a dictionary")
+    storage.ClearField(name)
+    for key, item in value.items():
+        if content.message_type is not None:
+            _set_message(present[_plain(key)], item)
+        else:
+            convert = _to_bytes if _TYPES[content.type] == "bytes" else _plain
+            present[_plain(key)] = convert(item)
+
+
+def _set_numbers(storage: Any, name: str, repeated: Any, value: Any) -> None:
+    """Set a repeated field of numbers; long floating arrays are copied in wire format."""
     if len(repeated):
         storage.ClearField(name)
     if isinstance(value, list) and value and type(value[0]) in (float, int):
@@ -239,14 +322,40 @@ def _extend(storage: Any, name: str, repeated: Any, value: Any) -> None:
     repeated.extend(value.ravel().tolist())
 
 
+def _plain(value: Any) -> Any:
+    """Return a value with NumPy's numbers as Python's."""
+    return value.item() if isinstance(value, (np.ndarray, np.generic)) else value
+
+
+def _to_bytes(value: Any) -> bytes:
+    if isinstance(value, bytes):
+        return value
+    return np.ascontiguousarray(value, np.uint8).tobytes()
+
+
+def _check_list(value: Any) -> None:
+    if isinstance(value, (str, bytes, Mapping)):
+        raise TypeError("a repeated field takes a list")
+
+
 def _values(part: Any, readers: _Readers) -> dict[str, Any]:
     """Return the values of a message; absent ones are left out."""
-    read = ((name, reader(getattr(part, name))) for name, reader in readers)
-    return {name: value for name, value in read if value is not None}
+    fields, messages = readers
+    read = ((name, reader(getattr(part, name))) for name, reader in fields)
+    values = {name: value for name, value in read if value is not None}
+    for name, reader in messages:
+        if part.HasField(name):
+            values[name] = reader(getattr(part, name))
+    return values
 
 
 def _readers_of(descriptor: Any, declared: Mapping[str, Field | type]) -> _Readers:
-    return [(field.name, _reader(field, declared.get(field.name))) for field in descriptor.fields]
+    """Return the readers of a message's fields, those of its single messages apart."""
+    readers: _Readers = ([], [])
+    for field in descriptor.fields:
+        is_message = field.message_type is not None and not _is_repeated(field)
+        readers[is_message].append((field.name, _reader(field, declared.get(field.name))))
+    return readers
 
 
 def _reader(field: Any, declared: Field | type | None) -> Callable[[Any], Any]:
@@ -254,16 +363,23 @@ def _reader(field: Any, declared: Field | type | None) -> Callable[[Any], Any]:
     kind, repeated = _TYPES[field.type], _is_repeated(field)
     if isinstance(declared, Field):
         return _declared_reader(declared, np.dtype(declared.dtype), kind, repeated)
-    if kind == "message":
-
-        def nested(value: Any) -> Any:
-            readers = _readers_of(field.message_type, {})
-            return [_values(v, readers) for v in value] if repeated else _values(value, readers)
-
-        return nested
+    if field.message_type is not None and _is_map(field):
+        read = _reader_of_one(field.message_type.fields_by_name["value"])
+        return lambda entries: {key: read(value) for key, value in entries.items()}
+    if field.message_type is not None and repeated:
+        read = _reader_of_one(field)
+        return lambda values: [read(value) for value in values]
     if repeated and kind in _ARRAYS:
         return lambda value: np.fromiter(value, _ARRAYS[kind], len(value))
-    return list if repeated else lambda value: value
+    return list if repeated else _reader_of_one(field)
+
+
+def _reader_of_one(field: Any) -> Callable[[Any], Any]:
+    """Return a function from one element of a field to its value."""
+    if field.message_type is None:
+        return lambda value: value
+    readers = cache(lambda: _readers_of(field.message_type, {}))  # later: it may hold itself
+    return lambda value: _values(value, readers())
 
 
 def _declared_reader(
@@ -290,6 +406,10 @@ def _declared_reader(
         )
 
     return array
+
+
+def _is_map(field: Any) -> bool:
+    return bool(field.message_type.GetOptions().map_entry)
 
 
 def _is_repeated(field: Any) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import reprlib
 import socket
 from collections.abc import Mapping
 from typing import Any, Unpack
@@ -24,8 +25,7 @@ from physx_remote.godot_rl.json_spaces import (
 )
 from physx_remote.serving.client_link import RequestLink
 from physx_remote.serving.connect_options import ConnectOptions
-from physx_remote.serving.framing import add_prefix
-from physx_remote.serving.spaces import Space
+from physx_remote.serving.spaces import NONSENSE, Space, check_shape
 
 VERSION = {"major_version": "0", "minor_version": "7"}
 """Version of the protocol in the handshake."""
@@ -51,10 +51,6 @@ class _Incoming(RequestLink):
                     f"No application connected to {self.name} within {patience:g} s. Start it with "
                     "this port, or give a longer connect_timeout."
                 ) from error
-
-    def tell(self, body: bytes) -> None:
-        """Send a message that has no answer."""
-        self._socket.sendall(add_prefix(body))
 
 
 class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
@@ -156,7 +152,7 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
         """
         told = self._ask({"type": "action", "action": acted}, "step")
         observations = [self._observation(one) for one in _each(told, "obs", self.num_envs)]
-        rewards = np.array(_each(told, "reward", self.num_envs, (int, float)), np.float64)
+        rewards = self._rewards(_each(told, "reward", self.num_envs, (int, float)))
         done = np.array(_each(told, "done", self.num_envs, (bool, int, float)), bool)
         infos = self._infos(told)
         for info in infos:
@@ -166,17 +162,24 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
         truncated = done & np.array(cut)
         return observations, rewards, done & ~truncated, truncated, infos
 
+    def _rewards(self, told: list[Any]) -> Array:
+        try:
+            return np.array(told, np.float64)
+        except OverflowError as error:
+            raise RemoteProtocolError(f"The application sent an invalid reward: {error}.") from None
+
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method without arguments of all agents, and return their answers."""
         if args or kwargs:
             raise UsageError("godot-rl can only call methods without arguments.")
-        return tuple(self._ask({"type": "call", "method": name}, "call")["returns"])
+        told = self._ask({"type": "call", "method": name}, "call")
+        return tuple(_each(told, "returns", self.num_envs, object))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Have the application end, and end the connection."""
         try:
             self._link.tell(b'{"type": "close"}')
-        except OSError:
+        except RemoteError:
             pass  # already gone
         finally:
             self._link.close()
@@ -194,7 +197,9 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
         if isinstance(told, dict) and told.get("type") == kind:
             return told
         if isinstance(told, dict) and told.get("type") == "error":
-            raise RemoteError(f"{self._link.name}: {told.get('error')}: {told.get('message')}")
+            said = [told.get(key) for key in ("error", "message")]
+            texts = (one if isinstance(one, str) else reprlib.repr(one) for one in said)
+            raise RemoteError(": ".join([self._link.name, *texts]))
         raise RemoteProtocolError(f"{self._link.name} answered {body[:100]!r} instead of a {kind}.")
 
     def _infos(self, told: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -205,8 +210,13 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _merge(self, each: list[dict[str, Any]]) -> dict[str, Any]:
         infos: dict[str, Any] = {}
-        for agent, info in enumerate(each):
-            infos = self._add_info(infos, info, agent)
+        try:
+            for agent, info in enumerate(each):
+                infos = self._add_info(infos, info, agent)
+        except NONSENSE as error:
+            raise RemoteProtocolError(
+                f"The infos of the agents do not fit together: {error}."
+            ) from error
         return infos
 
     def _batch(self, observations: list[Any]) -> Any:
@@ -218,10 +228,10 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
         """Return one agent's observation."""
         try:
             values = {n: read_observation(n, part, told[n]) for n, part in self._observed.items()}
-        except (KeyError, TypeError, ValueError) as error:
+        except NONSENSE as error:
             raise RemoteProtocolError(
-                f"The application sent the observation {told!r:.100}, which does not fit its "
-                f"description {self._observed}: {error!r}."
+                f"The application sent the observation {reprlib.repr(told)}, which does not fit "
+                f"its description {self._observed}: {error!r}."
             ) from error
         is_dict = isinstance(self.single_observation_space, spaces.Dict)
         return values if is_dict else values[OBSERVATION]
@@ -286,7 +296,7 @@ def _each(told: Mapping[str, Any], key: str, count: int, kind: Any = dict) -> li
     is_list = isinstance(values, list) and len(values) == count
     if not is_list or not all(isinstance(value, kind) for value in values or ()):
         raise RemoteProtocolError(
-            f'The application sent {values!r:.100} as "{key}" instead of a list of {count}.'
+            f'The application sent {reprlib.repr(values)} as "{key}" instead of a list of {count}.'
         )
     return list(values or ())
 
@@ -295,22 +305,27 @@ def _count(told: Mapping[str, Any]) -> int:
     count: Any = told.get("n_agents")
     if type(count) in (int, float) and 1 <= count < 1 << 20:  # Godot sends integers as 2.0
         return int(count)
-    raise RemoteProtocolError(f"The application reported {count!r} agents.")
+    raise RemoteProtocolError(f"The application reported {reprlib.repr(count)} agents.")
 
 
 def _spaces(told: Mapping[str, Any], key: str, count: int, make: Any) -> dict[str, Space]:
     """Return the spaces of an agent's entries, which must be the same for all agents."""
     given: Any = told.get(key)
     each = given if isinstance(given, list) else [given] * count
-    if len(each) != count or any(one != each[0] for one in each):
-        raise RemoteError(
-            f"The application's agents do not all have the same {key}, so they cannot be driven "
-            f"together: {given!r:.200}"
-        )
     try:
-        return {name: make(name, entry) for name, entry in each[0].items()}
-    except (AttributeError, KeyError, TypeError, ValueError, AssertionError) as error:
-        raise RemoteProtocolError(f"The {key} {each[0]!r:.200} is not valid: {error!r}.") from error
+        if len(each) != count or any(one != each[0] for one in each):
+            raise RemoteError(
+                f"The application's agents do not all have the same {key}, so they cannot be "
+                f"driven together: {reprlib.repr(given)}"
+            )
+        parts = {name: make(name, entry) for name, entry in each[0].items()}
+        for space in parts.values():
+            check_shape(space.shape or (), count)
+    except NONSENSE as error:
+        raise RemoteProtocolError(
+            f"The {key} {reprlib.repr(each)} is not valid: {error!r}."
+        ) from error
+    return parts
 
 
 def _whole(parts: dict[str, Space], alone: str) -> Space:

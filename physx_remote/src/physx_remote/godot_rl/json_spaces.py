@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from physx_core.errors import ActionError, ConfigError, listed
-from physx_remote.serving.spaces import Leaf, Path, Space, SpaceTree
+from physx_remote.serving.spaces import Leaf, Path, Space, SpaceTree, check_shape
 
 IMAGE = "2d"
 """Mark of an image's key; the value is bytes in hexadecimal."""
@@ -222,7 +222,7 @@ def observation_space_of(name: str, entry: Mapping[str, Any]) -> Space:
         return spaces.Discrete(int(entry["size"]))
     if entry["space"] != "box":
         raise ValueError(f"unknown space {entry['space']!r}")
-    shape = tuple(int(size) for size in entry["size"])
+    shape = check_shape(int(size) for size in entry["size"])
     if IMAGE in name:
         return spaces.Box(0, 255, shape, np.uint8)
     low, high = entry.get("low", -np.inf), entry.get("high", np.inf)
@@ -236,7 +236,7 @@ def action_space_of(name: str, entry: Mapping[str, Any]) -> Space:
         return spaces.Discrete(size)
     if entry["action_type"] != "continuous":
         raise ValueError(f"unknown action_type {entry['action_type']!r}")
-    return spaces.Box(-1.0, 1.0, (size,), np.float32)
+    return spaces.Box(-1.0, 1.0, check_shape([size]), np.float32)
 
 
 def read_observation(name: str, space: Space, given: Any) -> Any:

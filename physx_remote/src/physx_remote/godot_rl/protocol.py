@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 from physx_core.errors import (
     ActionError,
     ConfigError,
+    PhysxError,
     RemoteError,
     RemoteProtocolError,
     RequestError,
@@ -181,8 +182,13 @@ class _GodotRLService(SocketService):
 
     def on_close(self, connection: RequestConnection) -> None:
         """End with the trainer."""
-        LOG.info("The trainer at %s is gone", connection.name)
+        self.log.info(connection.name, "The trainer at %s is gone", connection.name)
         self.close()
+
+    def on_fault(self, connection: RequestConnection, error: PhysxError) -> None:
+        """End with the error: the trainer does not learn of it."""
+        super().on_fault(connection, error)
+        raise RemoteError(f"The trainer at {connection.name} is lost: {error}") from error
 
     def handle(self, connection: RequestConnection, body: bytes) -> Work | None:
         """Handle one message."""
@@ -218,7 +224,8 @@ class _GodotRLService(SocketService):
         """Report an error in the log and to the trainer, which ends at the unknown message."""
         text = "; ".join([str(error), *getattr(error, "__notes__", [])])
         is_foreign = not isinstance(error, (RemoteError, ActionError))
-        LOG.error("The trainer's request failed: %s", text, exc_info=error if is_foreign else None)
+        cause = error if is_foreign else None
+        self.log.error(connection.name, "The trainer's request failed: %s", text, cause=cause)
         name = type(error).__name__
         self._send(connection, {"type": "error", "error": name, "message": text})
 

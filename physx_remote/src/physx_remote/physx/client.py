@@ -9,12 +9,12 @@ from typing import Any, NamedTuple, Unpack
 import gymnasium
 import numpy as np
 
-from physx_core import Closeable, PhysxError
+from physx_core import Closeable
 from physx_core.errors import ConfigError, RemoteProtocolError
 from physx_core.net import Kind, pack_value
 from physx_core.typing import Array
 from physx_remote.physx.link import PhysxLink
-from physx_remote.physx.space_arrays import SpaceArrays
+from physx_remote.physx.space_arrays import SpaceArrays, is_array
 from physx_remote.physx.wire import (
     ACT,
     REWARD,
@@ -24,9 +24,12 @@ from physx_remote.physx.wire import (
     split_infos,
 )
 from physx_remote.serving.connect_options import TokenOptions
-from physx_remote.serving.spaces import build_space
+from physx_remote.serving.spaces import NONSENSE, build_space, check_shape
 
 LOG = logging.getLogger("physx.remote")
+
+_INVALID: tuple[type[Exception], ...] = (RemoteProtocolError, *NONSENSE)
+_FLOAT, _BOOL = np.dtype(np.float64), np.dtype(np.bool_)
 
 
 class Outcomes(NamedTuple):
@@ -66,19 +69,11 @@ class PhysxClient(Closeable):
             RemoteError: If nothing answers, another client acts already, or the tokens differ.
         """
         self._link = PhysxLink(address, ACT, **options)
-        try:
-            told = self._link.introduction
-            self.observations, self.actions = read_spaces(told)
-            self.name = str(told["name"])
-            self.num_worlds = int(told["num_worlds"])
-            self.has_snapshots = bool(told["snapshot"])
-            self.render_mode: str | None = told["render_mode"]
-            self.metadata = {"render_modes": list(told["render_modes"])}
-            if told["render_fps"] is not None:
-                self.metadata["render_fps"] = told["render_fps"]
-        except BaseException:
-            self._link.close()
-            raise
+        told = read_introduction(self._link)
+        self.observations, self.actions = told.observations, told.actions
+        self.name, self.num_worlds = told.name, told.num_worlds
+        self.has_snapshots, self.render_mode = told.has_snapshots, told.render_mode
+        self.metadata = told.metadata
         self._names = {REWARD, *self.observations.names, TERMINATED, TRUNCATED}
         self._number = 0
         self._left_out: set[str] = set()
@@ -135,7 +130,10 @@ class PhysxClient(Closeable):
         Raises:
             PhysxError: If the environment has no snapshots, or too many are kept.
         """
-        return int(self.ask({"do": "snapshot", "world": world}))
+        number = self.ask({"do": "snapshot", "world": world})
+        if type(number) is not int:
+            raise self._link.nonsense("a snapshot without a number")
+        return number
 
     def restore(self, snapshot: int, world: int = 0) -> Outcomes:
         """Restore a snapshot, of any world, into a world.
@@ -202,9 +200,9 @@ class PhysxClient(Closeable):
         """
         notes, arrays = self._answer(self._number - back)
         if not isinstance(arrays, dict) or arrays.keys() != self._names:
-            raise self._nonsense("an answer without the arrays of worlds")
-        if any(np.shape(array)[:1] != (count,) for array in arrays.values()):
-            raise self._nonsense("an answer about other worlds than requested")
+            raise self._link.nonsense("an answer without the arrays of worlds")
+        if not (fit_outcome(arrays, count) and self.observations.fit(arrays, count)):
+            raise self._link.nonsense("an answer that does not fit the worlds and their spaces")
         if notes is None:
             return Outcomes(arrays, [{} for _ in range(count)])
         infos, left_out = split_infos(notes, count)
@@ -233,16 +231,14 @@ class PhysxClient(Closeable):
         while True:
             frame = self._link.receive()
             if frame.number != number:
-                raise self._nonsense(f"an answer to request {frame.number} instead of {number}")
+                raise self._link.nonsense(
+                    f"an answer to request {frame.number} instead of {number}"
+                )
             if frame.kind in (Kind.ANSWER, Kind.REFUSAL):
                 return notes, self._link.decode(frame)
             if frame.kind is not Kind.NOTES:
-                raise self._nonsense(f"a message {frame.kind.name}")
+                raise self._link.nonsense(f"a message {frame.kind.name}")
             notes = self._link.decode(frame)
-
-    def _nonsense(self, what: str) -> PhysxError:
-        self._link.close(f"it sent {what}")
-        return RemoteProtocolError(f"{self._link.name} sent {what}. The connection is closed.")
 
 
 class PhysxEnv(gymnasium.Env[Any, Any]):
@@ -325,9 +321,63 @@ class PhysxEnv(gymnasium.Env[Any, Any]):
         self.client.close()
 
 
-def read_spaces(told: Mapping[str, Any]) -> tuple[SpaceArrays, SpaceArrays]:
-    """Return the spaces of observations and actions in a service's introduction."""
-    return (
-        SpaceArrays(build_space(told["observation_space"]), "observation"),
-        SpaceArrays(build_space(told["action_space"]), "action"),
+class Introduction(NamedTuple):
+    """What a service says of itself.
+
+    Attributes:
+        observations: Space of one world's observations, as arrays.
+        actions: Space of one world's actions, as arrays.
+        name: What is served.
+        num_worlds: How many worlds there are.
+        has_snapshots: Whether the state of a world can be kept and restored.
+        render_mode: How the worlds are rendered; None: not at all.
+        metadata: Metadata of a Gymnasium environment.
+    """
+
+    observations: SpaceArrays
+    actions: SpaceArrays
+    name: str
+    num_worlds: int
+    has_snapshots: bool
+    render_mode: str | None
+    metadata: dict[str, Any]
+
+
+def read_introduction(link: PhysxLink) -> Introduction:
+    """Return what the service of a connection says of itself, after checking it.
+
+    Raises:
+        RemoteProtocolError: If it is nonsense; the connection is closed.
+    """
+    told = link.introduction
+    try:
+        observations = SpaceArrays(build_space(told["observation_space"]), "observation")
+        actions = SpaceArrays(build_space(told["action_space"]), "action")
+        count, metadata = told["num_worlds"], {"render_modes": list(told["render_modes"])}
+        if type(count) is not int or count < 1:
+            raise ValueError(f"{count!r:.40} worlds")
+        for leaf in (*observations.leaves, *actions.leaves):
+            check_shape(leaf.shape or (), count)
+        if told["render_fps"] is not None:
+            metadata["render_fps"] = told["render_fps"]
+        return Introduction(
+            observations,
+            actions,
+            str(told["name"]),
+            count,
+            bool(told["snapshot"]),
+            told["render_mode"],
+            metadata,
+        )
+    except _INVALID as error:
+        raise link.nonsense(f"an invalid introduction: {error}") from error
+    except BaseException:
+        link.close()
+        raise
+
+
+def fit_outcome(arrays: Mapping[str, Any], count: int) -> bool:
+    """Return whether rewards and ends that were received are those of `count` worlds."""
+    return is_array(arrays[REWARD], _FLOAT, (count,)) and all(
+        is_array(arrays[name], _BOOL, (count,)) for name in (TERMINATED, TRUNCATED)
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import select
 import socket
 import time
 from typing import Any, ClassVar
@@ -10,10 +9,12 @@ from typing import Any, ClassVar
 from physx_core.errors import (
     ConfigError,
     ConnectionRefusedByPeerError,
+    PhysxError,
     RemoteClosedError,
     RemoteError,
     RemoteProtocolError,
     RemoteTimeoutError,
+    SilentPeerError,
     UnansweredError,
 )
 from physx_core.net import (
@@ -45,6 +46,7 @@ class PhysxLink(ClientConnection):
     """
 
     _server: ClassVar[str] = "service"
+    _advice: ClassVar[str] = "Give a longer timeout if its steps take that long."
 
     def __init__(
         self,
@@ -81,9 +83,7 @@ class PhysxLink(ClientConnection):
         try:
             self._reader = self._handshake(found, role, max(until - time.monotonic(), 1.0))
             self._reader.limit = max_answer
-            self._poll = select.poll()
-            self._poll.register(self._socket, select.POLLIN)
-            self._socket.setblocking(False)
+            self._begin()
             self.introduction = self._receive_introduction(connect_timeout)
         except BaseException:
             self._socket.close()
@@ -94,6 +94,11 @@ class PhysxLink(ClientConnection):
         self._socket.settimeout(patience)
         try:
             return introduce(self._socket, token, role)
+        except SilentPeerError as error:
+            raise RemoteTimeoutError(
+                f"{self.name} did not answer within {patience:.3g} s. It may be stopped, or speak "
+                "another protocol; give a longer connect_timeout if it is busy for that long."
+            ) from error
         except UnansweredError as error:
             raise RemoteClosedError(
                 f"{self.name} did not answer like a service of physx: {error} It may have "
@@ -110,11 +115,12 @@ class PhysxLink(ClientConnection):
     def _receive_introduction(self, patience: float) -> dict[str, Any]:
         """Return the service's description of itself."""
         frame = self.receive(patience)
-        if frame.kind is Kind.ERROR:
-            error = decode_error(frame.payload)
-            self.close(str(error))
-            raise error
-        told = self.decode(frame) if frame.kind is Kind.SETUP else None
+        try:
+            told = self.decode(frame) if frame.kind in (Kind.SETUP, Kind.ERROR) else None
+        except RemoteError:
+            raise
+        except PhysxError as error:
+            raise RemoteError(f"{self.name} refuses: {error}") from error
         if not isinstance(told, dict) or told.get("service") != SERVICE:
             raise RemoteError(
                 f"{self.name} does not serve environments; it may be the server of a run, for "
@@ -137,26 +143,7 @@ class PhysxLink(ClientConnection):
 
     def send(self, message: bytes) -> None:
         """Send a message."""
-        self._check_open()
-        try:
-            sent = self._socket.send(message)
-            if sent < len(message):
-                self._send_rest(memoryview(message)[sent:])
-        except BlockingIOError:
-            self._send_rest(memoryview(message))
-        except OSError as error:
-            raise self._broken(error) from error
-
-    def _send_rest(self, rest: memoryview) -> None:
-        poll = select.poll()
-        poll.register(self._socket, select.POLLOUT)
-        try:
-            while rest:
-                if not poll.poll(_milliseconds(self.timeout)):
-                    raise self._late()
-                rest = rest[self._socket.send(rest) :]
-        except OSError as error:
-            raise self._broken(error) from error
+        self._send(message, self.timeout)
 
     def receive(self, patience: float | None = None) -> Frame:
         """Return the next message.
@@ -164,9 +151,10 @@ class PhysxLink(ClientConnection):
         Args:
             patience: How long to wait, in s; None: as long as an answer may take.
         """
-        frame = self.look(self.timeout if patience is None else patience)
+        limit = self.timeout if patience is None else patience
+        frame = self.look(limit)
         if frame is None:
-            raise self._late()
+            raise self._late(limit)
         return frame
 
     def look(self, patience: float | None) -> Frame | None:
@@ -179,7 +167,7 @@ class PhysxLink(ClientConnection):
         until, left = None, patience
         try:
             while True:
-                if not self._reader.has_buffered and not self._poll.poll(_milliseconds(left)):
+                if not self._reader.has_buffered and not self._wait(left):
                     return None
                 frame = self._reader.read(self._socket)
                 if frame is not None:
@@ -189,7 +177,7 @@ class PhysxLink(ClientConnection):
                     left = until - time.monotonic()
                     if left <= 0:
                         return None
-        except EOFError as error:
+        except (EOFError, OSError) as error:
             raise self._broken(error) from error
         except ConnectionRefusedByPeerError as error:
             self.close(str(error))
@@ -201,7 +189,7 @@ class PhysxLink(ClientConnection):
     def decode(self, frame: Frame) -> Any:
         """Return the value in a message."""
         try:
-            if frame.kind is not Kind.REFUSAL:
+            if frame.kind not in (Kind.REFUSAL, Kind.ERROR):
                 return decode(frame.payload)
             refusal = decode_error(frame.payload)
         except ConnectionRefusedByPeerError as error:
@@ -209,16 +197,10 @@ class PhysxLink(ClientConnection):
             raise RemoteProtocolError(f"{self.name}: {error}") from error
         raise refusal
 
-    def _late(self) -> RemoteTimeoutError:
-        self.close(f"an answer took longer than {self.timeout} s")
-        return RemoteTimeoutError(
-            f"{self.name} did not answer in time ({self.timeout} s). The connection is closed; "
-            "give a longer timeout if its steps take that long."
-        )
-
-    def _broken(self, error: Exception) -> RemoteClosedError:
-        self.close(str(error))
-        return RemoteClosedError(f"{self.name} ended the connection: {error}.")
+    def nonsense(self, what: str) -> RemoteProtocolError:
+        """Close the connection; return the error for a service that sent something."""
+        self.close(f"it sent {what}")
+        return RemoteProtocolError(f"{self.name} sent {what}. The connection is closed.")
 
 
 def _open_socket(address: tuple[str, int], role: int, patience: float) -> socket.socket:
@@ -231,13 +213,8 @@ def _open_socket(address: tuple[str, int], role: int, patience: float) -> socket
                 connected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BACKLOG)
             connected.settimeout(patience)
             connected.connect(place)
-            connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             return connected
         except OSError as failed:
             connected.close()
             error = failed
     raise error
-
-
-def _milliseconds(seconds: float | None) -> float | None:
-    return None if seconds is None else max(0.0, 1000 * seconds)

@@ -12,8 +12,9 @@ from physx_core import Closeable
 from physx_core.errors import RemoteProtocolError
 from physx_core.net import Frame, Kind, pack_value, parse_address
 from physx_core.typing import Array
-from physx_remote.physx.client import read_spaces
+from physx_remote.physx.client import fit_outcome, read_introduction
 from physx_remote.physx.link import PhysxLink
+from physx_remote.physx.space_arrays import is_array
 from physx_remote.physx.wire import (
     COUNT,
     IS_RESET,
@@ -25,6 +26,7 @@ from physx_remote.physx.wire import (
     split_infos,
 )
 from physx_remote.serving.connect_options import TokenOptions
+from physx_remote.serving.spaces import NONSENSE
 
 
 @dataclass(frozen=True)
@@ -79,10 +81,11 @@ class PhysxObserver(Closeable):
         """
         place = parse_address(address) if isinstance(address, str) else address
         self._link = PhysxLink(place, OBSERVE, **options)
-        self._observations, self._actions = read_spaces(self._link.introduction)
+        told = read_introduction(self._link)
+        self._observations, self._actions = told.observations, told.actions
         self.observation_space = self._observations.space
         self.action_space = self._actions.space
-        self.num_worlds = int(self._link.introduction["num_worlds"])
+        self.num_worlds = told.num_worlds
         self._notes: Frame | None = None
         self._asked = 0
 
@@ -131,11 +134,18 @@ class PhysxObserver(Closeable):
         notes, self._notes = self._notes, None
         try:
             worlds = arrays[WORLDS]
-            infos: list[dict[str, Any]] = [{} for _ in worlds]
+            count = len(worlds)
+            has_actions = any(name in arrays for name in self._actions.names)
+            if not (
+                is_array(worlds, np.dtype(np.int64), (count,))
+                and fit_outcome(arrays, count)
+                and self._observations.fit(arrays, count)
+                and (not has_actions or self._actions.fit(arrays, count))
+            ):
+                raise ValueError("arrays of other worlds or spaces")
+            infos: list[dict[str, Any]] = [{} for _ in range(count)]
             if notes is not None and notes.number == frame.number:
-                infos, _ = split_infos(self._link.decode(notes), len(worlds))
-            names = self._actions.names
-            has_actions = bool(names) and names[0] in arrays
+                infos, _ = split_infos(self._link.decode(notes), count)
             return Seen(
                 number=int(arrays.get(COUNT, frame.number)),
                 worlds=worlds,
@@ -147,7 +157,7 @@ class PhysxObserver(Closeable):
                 truncated=np.asarray(arrays[TRUNCATED]),
                 infos=infos,
             )
-        except (KeyError, TypeError) as error:
+        except NONSENSE as error:
             raise self._nonsense(frame) from error
 
     def _nonsense(self, frame: Frame) -> RemoteProtocolError:

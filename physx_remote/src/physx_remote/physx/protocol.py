@@ -46,7 +46,9 @@ class Physx(Protocol):
             token_file: File that holds the token, readable by its owner alone.
             handshake_timeout: How long a client may take to prove that it knows the token, in s.
             max_request: Longest request in bytes; a client that sends a longer one is closed.
-            max_clients: How many clients may be connected; further ones are closed at once.
+            max_clients: How many clients may be connected; further ones are told so. There may be
+                as many connections without a proof of the token besides, or 32; where another
+                comes, one of those is closed.
             max_snapshots: How many snapshots are kept at most.
             options: Must be empty.
         """

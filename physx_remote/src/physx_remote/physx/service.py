@@ -14,9 +14,9 @@ from physx_core.net import (
     HANDSHAKE_LIMIT,
     Frame,
     FrameReader,
+    Handshakes,
     Kind,
     Reader,
-    Strangers,
     decode,
     describe_flat,
     encode_error,
@@ -37,7 +37,6 @@ from physx_remote.physx.wire import (
 )
 from physx_remote.physx.world_requests import Change, WorldRequests, wrap_error
 from physx_remote.serving.connection import RequestConnection
-from physx_remote.serving.service import LOG
 from physx_remote.serving.socket_service import SocketService, Work
 from physx_remote.serving.spaces import describe_space
 from physx_remote.serving.worlds import Worlds
@@ -71,10 +70,8 @@ class PhysxService(SocketService):
         self._requests = WorldRequests(worlds, max_snapshots)
         self._introduction = self._introduce()
         self._max_request = max_request
+        self._handshake_timeout = handshake_timeout
         self._open()
-        self._strangers: Strangers[RequestConnection] = Strangers(
-            token, handshake_timeout, max_clients, self.drop, self._listener.timers
-        )
         self._actor: RequestConnection | None = None
         self._observers: dict[RequestConnection, bool] = {}  # whether a change was skipped
         self._seen = 0
@@ -107,16 +104,25 @@ class PhysxService(SocketService):
         """Return a reader of frames."""
         return FrameReader(HANDSHAKE_LIMIT)
 
-    def on_open(self, connection: RequestConnection) -> None:
-        """Wait for a new client to prove that it knows the token."""
-        self._strangers.add(connection)
+    def new_strangers(self) -> Handshakes[RequestConnection]:
+        """Return what has new clients prove that they know the token."""
+        self._handshakes = Handshakes[RequestConnection](
+            self.token,
+            self._handshake_timeout,
+            self.max_strangers,
+            self.drop,
+            self._listener.timers,
+        )
+        return self._handshakes
+
+    def on_first_message(self, connection: RequestConnection) -> None:
+        """Do nothing: the handshake decides who is a client."""
 
     def on_close(self, connection: RequestConnection) -> None:
         """Forget a client; the worlds keep their state."""
-        self._strangers.forget(connection)
         self._observers.pop(connection, None)
         if connection is self._actor:
-            LOG.info("%s acts no longer", connection.name)
+            self.log.info(connection.name, "%s acts no longer", connection.name)
             self._actor = None
             self._requests.forget_snapshots()
 
@@ -129,7 +135,7 @@ class PhysxService(SocketService):
     def handle(self, connection: RequestConnection, body: Frame) -> Work | None:
         """Handle one frame."""
         kind, number, payload = body
-        if connection in self._strangers:
+        if connection in self._handshakes:
             self._greet(connection, body)
             return None
         try:
@@ -150,7 +156,7 @@ class PhysxService(SocketService):
     def _greet(self, connection: RequestConnection, frame: Frame) -> None:
         """Continue the handshake."""
         try:
-            answer, role = self._strangers.greet(connection, frame)
+            answer, role = self._handshakes.greet(connection, frame)
         except ConnectionRefusedByPeerError as error:
             self.drop(connection, str(error))
             return
@@ -169,8 +175,9 @@ class PhysxService(SocketService):
 
     def _admit(self, connection: RequestConnection, role: int) -> None:
         """Assign a client its role."""
+        self.welcome(connection)
         if role == OBSERVE:
-            LOG.info("%s looks on", connection.name)
+            self.log.info(connection.name, "%s looks on", connection.name)
             connection.limit_backlog(_BACKLOG)
             self._observers[connection] = False
             return
@@ -187,7 +194,7 @@ class PhysxService(SocketService):
             )
         if actor is not None:
             self.drop(actor)
-        LOG.info("%s acts", connection.name)
+        self.log.info(connection.name, "%s acts", connection.name)
         self._actor = connection
 
     # Requests -------------------------------------------------------------------------------
@@ -197,6 +204,8 @@ class PhysxService(SocketService):
         if not isinstance(request, dict):
             raise RequestError("A request is a dictionary.")
         what = request.get("do")
+        if not isinstance(what, str):
+            raise RequestError(f'"do" must name what to do, not {what!r:.60}.')
         if what == "last":
             self.send(connection, self._latest(Kind.ANSWER, number))
             return None
@@ -218,7 +227,8 @@ class PhysxService(SocketService):
             for wait in change.work:
                 yield wait
                 if connection.closed:
-                    LOG.info("%s left in the middle of a request", connection.name)
+                    name = connection.name
+                    self.log.info(name, "%s left in the middle of a request", name)
                     return
             self._publish(connection, number, change)
         except Exception as error:
@@ -226,12 +236,9 @@ class PhysxService(SocketService):
 
     def _refuse(self, connection: RequestConnection, number: int, error: Exception) -> None:
         """Report an error in the log and to the client."""
-        told = error if isinstance(error, PhysxError) else wrap_error(error)
-        is_own_fault = not isinstance(error, RequestError)
-        LOG.error(
-            "A request of %s failed: %s", connection.name, told,
-            exc_info=error if is_own_fault else None,
-        )  # fmt: skip
+        told, name = error if isinstance(error, PhysxError) else wrap_error(error), connection.name
+        cause = error if error is not told or error.__cause__ is not None else None
+        self.log.error(name, "A request of %s failed: %s", name, told, cause=cause)
         self.send(connection, pack(Kind.REFUSAL, encode_error(told), number))
 
     # Answers --------------------------------------------------------------------------------

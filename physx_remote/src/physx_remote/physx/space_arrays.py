@@ -10,7 +10,14 @@ from gymnasium import spaces
 
 from physx_core.errors import ActionError, RequestError
 from physx_core.typing import Array
-from physx_remote.serving.spaces import Space, SpaceTree, cast_exactly
+from physx_remote.serving.spaces import (
+    Space,
+    SpaceTree,
+    cast_exactly,
+    find_invalid,
+    invalid_value,
+    subscripts,
+)
 
 
 class SpaceArrays(SpaceTree):
@@ -49,9 +56,10 @@ class SpaceArrays(SpaceTree):
         for array, part in zip(arrays, self.split(value), strict=True):
             _put(array, row, part)
 
-    def check(self, arrays: Mapping[str, Any], count: int) -> None:
-        """Check received arrays of `count` worlds."""
-        for name, dtype, shape, _ in self._parts:
+    def check(self, arrays: Mapping[str, Any], worlds: Sequence[int]) -> None:
+        """Check received arrays of some worlds."""
+        count = len(worlds)
+        for (name, dtype, shape, leaf), path in zip(self._parts, self.paths, strict=True):
             array = arrays.get(name)
             if not isinstance(array, np.ndarray):
                 raise RequestError(f"The actions lack the array {name} of {self.space}.")
@@ -60,6 +68,18 @@ class SpaceArrays(SpaceTree):
                     f"The array {name} has type {array.dtype} and shape {array.shape}, not {dtype} "
                     f"and {(count, *shape)}: {count} worlds with actions in {self.space}."
                 )
+            index = find_invalid(leaf, array)
+            if index is not None:
+                entry = subscripts((*path, *index[1:]))
+                place = f"The action{entry} of world {worlds[index[0]]}"
+                raise invalid_value(leaf, place, array[index])
+
+    def fit(self, arrays: Mapping[str, Any], count: int) -> bool:
+        """Return whether received arrays are those of `count` worlds."""
+        return all(
+            is_array(arrays.get(name), dtype, (count, *shape))
+            for name, dtype, shape, _ in self._parts
+        )
 
     def rows(self, arrays: Mapping[str, Array], count: int) -> list[Any]:
         """Return the value of each of `count` worlds: views of the arrays."""
@@ -102,6 +122,11 @@ class SpaceArrays(SpaceTree):
         except (TypeError, ValueError, LookupError, OverflowError) as error:
             raise ActionError(f"{value!r:.200} is not in {self.space}: {error!r}.") from error
         return arrays
+
+
+def is_array(value: Any, dtype: np.dtype[Any], shape: tuple[int, ...]) -> bool:
+    """Return whether a received value is an array of a type and shape."""
+    return type(value) is np.ndarray and value.dtype == dtype and value.shape == shape
 
 
 def _put(array: Array, row: int, value: Any) -> None:

@@ -9,10 +9,11 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from physx_core.errors import ActionError, ConfigError, EpisodeError
+from physx_core.errors import ActionError, ConfigError, EpisodeError, RemoteProtocolError
 from physx_core.typing import Array
 from physx_remote.physx.client import PhysxClient
 from physx_remote.physx.wire import REWARD, TERMINATED, TRUNCATED
+from physx_remote.serving.spaces import NONSENSE
 
 
 class PhysxVectorEnv(VectorEnv[Any, Any, Any]):
@@ -181,8 +182,17 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any]):
         infos: dict[str, Any] = {}
         for world in sorted(found):
             if found[world]:
-                infos = self._add_info(infos, found[world], world)
+                infos = self._joined(infos, found[world], world)
         return infos
+
+    def _joined(self, infos: dict[str, Any], info: dict[str, Any], world: int) -> dict[str, Any]:
+        try:
+            return self._add_info(infos, info, world)
+        except NONSENSE as error:
+            raise RemoteProtocolError(
+                f"The infos of the worlds do not fit together, for example that of world {world}: "
+                f"{error}."
+            ) from error
 
     def render(self) -> tuple[Any, ...]:
         """Return what each world renders."""

@@ -57,6 +57,7 @@ def split_infos(value: Any, count: int) -> tuple[list[dict[str, Any]], list[str]
     """
     if isinstance(value, dict):
         infos, left_out = value.get("infos"), value.get("left_out")
-        if isinstance(infos, list) and isinstance(left_out, list) and len(infos) == count:
-            return [info if isinstance(info, dict) else {} for info in infos], left_out
+        is_named = isinstance(left_out, list) and all(isinstance(name, str) for name in left_out)
+        if is_named and isinstance(infos, list) and len(infos) == count:
+            return [info if isinstance(info, dict) else {} for info in infos], list(left_out or ())
     raise RemoteProtocolError(f"The other side sent infos that do not belong to {count} worlds.")

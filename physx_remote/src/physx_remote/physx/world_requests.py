@@ -71,7 +71,7 @@ class WorldRequests:
             raise RequestError(
                 f"Actions must be the arrays {self._actions.names}, not {[*arrays]}."
             )
-        self._actions.check(arrays, len(worlds))
+        self._actions.check(arrays, worlds)
         rows = self._actions.rows(arrays, len(worlds))
         return Change(worlds, False, self._step(worlds, rows), arrays)
 
@@ -139,12 +139,13 @@ class WorldRequests:
         """Forget all snapshots."""
         self._snapshots.clear()
 
-    def answer(self, what: Any, request: Mapping[str, Any]) -> Any:
+    def answer(self, what: str, request: Mapping[str, Any]) -> Any:
         """Carry out a request that changes no world, and return the answer."""
         if what == "snapshot":
             return self._snapshot(self._world(request))
         if what == "forget":
-            return self._snapshots.pop(request.get("snapshot", 0), None) is not None
+            number = request.get("snapshot")
+            return isinstance(number, int) and self._snapshots.pop(number, None) is not None
         if what == "render":
             world = self._world(request)
             with _Place("render", world):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import select
 import socket
 from collections.abc import Callable
 from typing import ClassVar
 
 from physx_core.errors import RemoteClosedError, RemoteError, RemoteTimeoutError
-from physx_core.net import retry
+from physx_core.net import VANISHED, is_loss, poll_peer, prepare_connection, retry
 
 _RETRY = 0.1
 
@@ -15,18 +17,23 @@ _RETRY = 0.1
 class ClientConnection:
     """A connection to a server, which cannot be opened again.
 
+    Every wait ends after its time, and within about 15 s if the server's machine no longer answers.
+
     Attributes:
         name: The server as ``host:port``.
     """
 
     _server: ClassVar[str] = "server"
     """What the other side is called in messages."""
+    _advice: ClassVar[str] = "It may be busy with another client, or be waiting for it."
+    """What to do if it does not answer in time, or why it does not."""
     _socket: socket.socket
 
     def __init__(self, address: tuple[str, int]) -> None:
         """Keep the address."""
         self.name = "{}:{}".format(*address)
         self._why_closed = ""
+        self._readable, self._writable = select.poll(), select.poll()
 
     def _reach(self, connect: Callable[[float], socket.socket], patience: float) -> socket.socket:
         """Return a connected socket; try again as long as nothing listens.
@@ -44,6 +51,60 @@ class ClientConnection:
             ) from error
         except OSError as error:
             raise RemoteError(f"{self.name} cannot be reached: {error}.") from error
+
+    def _begin(self) -> None:
+        """Prepare the connected socket for `_send` and `_wait`."""
+        prepare_connection(self._socket)
+        self._socket.setblocking(False)
+        self._readable.register(self._socket, select.POLLIN)
+        self._writable.register(self._socket, select.POLLOUT)
+
+    def _send(self, message: bytes, patience: float | None) -> None:
+        """Send a message.
+
+        Args:
+            message: The message.
+            patience: How long the server may read nothing of it, in s; None: for ever.
+        """
+        self._check_open()
+        rest = memoryview(message)
+        try:
+            while True:
+                with contextlib.suppress(BlockingIOError):
+                    rest = rest[self._socket.send(rest) :]
+                if not rest:
+                    return
+                if not poll_peer(self._writable, self._socket, patience):
+                    raise self._late(patience)
+        except OSError as error:
+            raise self._broken(error) from error
+
+    def _wait(self, patience: float | None) -> bool:
+        """Wait until something can be read, and return whether it can.
+
+        Args:
+            patience: How long to wait, in s; None: for ever.
+
+        Raises:
+            OSError: If the server's machine no longer answers.
+        """
+        return poll_peer(self._readable, self._socket, patience)
+
+    def _late(self, patience: float | None) -> RemoteTimeoutError:
+        """Close the connection; return the error for an answer that does not come in time."""
+        self.close(f"an answer took longer than {patience} s")
+        return RemoteTimeoutError(
+            f"{self.name} did not answer within {patience} s. The connection is closed. "
+            f"{self._advice}"
+        )
+
+    def _broken(self, error: Exception) -> RemoteClosedError:
+        """Close the connection; return the error for one that was ended."""
+        is_lost = is_loss(error.__cause__ or error)
+        self.close(VANISHED if is_lost else str(error))
+        if is_lost:
+            return RemoteClosedError(f"The connection to {self.name} is lost: {VANISHED}.")
+        return RemoteClosedError(f"{self.name} ended the connection: {error}.")
 
     def _check_open(self) -> None:
         """Check that the connection is not closed."""

@@ -6,7 +6,7 @@ import socket
 import time
 from typing import Any
 
-from physx_core.errors import ConfigError, RemoteClosedError, RemoteTimeoutError
+from physx_core.errors import ConfigError, RemoteClosedError
 from physx_remote.serving.client_connection import ClientConnection
 from physx_remote.serving.framing import MAX_ANSWER, PrefixReader, add_prefix
 
@@ -14,7 +14,7 @@ _LONGEST = 1e9
 
 
 class RequestLink(ClientConnection):
-    """A connection on which each message is answered by one message; every wait has an end.
+    """A connection on which each message is answered by one message.
 
     After any failure it is closed: a late answer must not be taken for that of another message.
     """
@@ -46,48 +46,39 @@ class RequestLink(ClientConnection):
         self._timeout = timeout
         self._reader = PrefixReader(max_answer)
         self._socket = self._connected(address, connect_timeout)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket.settimeout(timeout)
+        self._begin()
 
     def _connected(self, address: tuple[str, int], patience: float) -> socket.socket:
         return self._reach(lambda left: socket.create_connection(address, left), patience)
 
+    def tell(self, body: bytes) -> None:
+        """Send a message that has no answer."""
+        self._send(add_prefix(body), self._timeout)
+
     def exchange(self, body: bytes) -> bytes:
         """Send a message and return the answer to it."""
-        self._check_open()
         try:
-            self._socket.sendall(add_prefix(body))
+            self.tell(body)
             return self._answer()
-        except TimeoutError as error:
-            self.close(f"an answer took longer than {self._timeout} s")
-            raise RemoteTimeoutError(
-                f"{self.name} did not answer within {self._timeout} s; it may be busy with another "
-                "client, or be waiting for it. The connection is closed."
-            ) from error
         except OSError as error:
-            self.close(str(error))
-            raise RemoteClosedError(f"The connection to {self.name} broke: {error}.") from error
+            raise self._broken(error) from error
         except BaseException as error:
             self.close(f"{type(error).__name__} {error}".rstrip())
             raise
 
     def _answer(self) -> bytes:
-        until = None if self._timeout is None else time.monotonic() + self._timeout
+        left = self._timeout
+        until = None if left is None else time.monotonic() + left
         while True:
+            if not self._wait(left):
+                raise self._late(self._timeout)
             if not self._reader.receive(self._socket):
                 place = f" within an answer, after {n} bytes" if (n := self._reader.waiting) else ""
                 raise RemoteClosedError(f"{self.name} ended the connection{place}.")
             body = self._reader.take()
             if body is not None:
-                break
-            if until is not None:
-                left = until - time.monotonic()
-                if left <= 0:
-                    raise TimeoutError
-                self._socket.settimeout(left)
-        if until is not None:
-            self._socket.settimeout(self._timeout)
-        return body
+                return body
+            left = None if until is None else max(0.0, until - time.monotonic())
 
 
 def _check_time(name: str, seconds: Any) -> None:

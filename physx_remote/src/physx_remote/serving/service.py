@@ -30,6 +30,10 @@ class Service(Closeable):
         Returns:
             False once the service has ended: closed here, or by the other side where the
             protocol says so.
+
+        Raises:
+            RemoteError: If it has ended because the only other side violated the protocol, or its
+                machine no longer answers.
         """
 
     def run(self) -> None:

@@ -12,14 +12,16 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from physx_core.errors import PhysxError, RemoteError
-from physx_core.net import Listener, Reader
+from physx_core.errors import PhysxError, RemoteClosedError, RemoteError
+from physx_core.net import VANISHED, Listener, Reader, Strangers, is_loss
+from physx_remote.serving.client_log import ClientLog
 from physx_remote.serving.connection import MOMENT, RequestConnection
 from physx_remote.serving.framing import PrefixReader
-from physx_remote.serving.service import LOG, Service
+from physx_remote.serving.service import Service
 
 _READ = selectors.EVENT_READ
 _SLICE = 0.02
+_FEW = 32
 
 Work = Iterator[float]
 """A request in progress: yields the time in s after which it goes on."""
@@ -31,21 +33,26 @@ class SocketService(Service):
     `handle` is called with one message at a time, of any connection. While the work that it returns
     is in progress no other message is handled, but connections are accepted, read and closed, and
     timers run. A client that sends faster than it is served, or does not read its answers, waits.
+    A connection is a stranger at first, and a client once `welcome` was called.
 
     Attributes:
         connections: All open connections.
+        log: Log of what the clients do.
     """
 
     def __init__(self, *, max_clients: int = 256) -> None:
         """Start without any connection.
 
         Args:
-            max_clients: How many connections are open at most; further ones are closed at once.
+            max_clients: How many clients there are at most; further ones are turned away. There
+                may be as many strangers besides, or 32; where another comes, one has to go.
         """
         self.address = ("", 0)
         self.connections: list[RequestConnection] = []
         self._max_clients = max_clients
+        self.log = ClientLog(self.after)
         self._listener: Listener[RequestConnection]
+        self._strangers: Strangers[RequestConnection]
         self._ready: deque[RequestConnection] = deque()
         self._work: tuple[RequestConnection, Work] | None = None
         self._recent: RequestConnection | None = None
@@ -62,6 +69,17 @@ class SocketService(Service):
     def on_open(self, connection: RequestConnection) -> None:
         """Handle a new connection."""
 
+    def on_first_message(self, connection: RequestConnection) -> None:
+        """Handle that a stranger sent a whole message; by default it is a client from now on."""
+        self.welcome(connection)
+
+    def on_fault(self, connection: RequestConnection, error: PhysxError) -> None:
+        """Handle a violation of the protocol, or the loss of the client's machine.
+
+        By default the connection is dropped.
+        """
+        self.drop(connection, str(error))
+
     def on_close(self, connection: RequestConnection) -> None:
         """Handle the end of a connection; nothing can be sent on it."""
 
@@ -75,6 +93,15 @@ class SocketService(Service):
     def new_reader(self) -> Reader:
         """Return the reader of a new connection."""
         return PrefixReader()
+
+    def new_strangers(self) -> Strangers[RequestConnection]:
+        """Return what holds the connections that are no clients yet; called once."""
+        return Strangers(self.max_strangers, self.drop)
+
+    @property
+    def max_strangers(self) -> int:
+        """How many connections that are no clients yet there may be at most."""
+        return max(self._max_clients, _FEW)
 
     @property
     def is_listening(self) -> bool:
@@ -108,10 +135,24 @@ class SocketService(Service):
         self._open()
         host, port = connected.getpeername()[:2]
         connection = RequestConnection(connected, self.new_reader(), f"{host}:{port}")
+        self._strangers.add(connection)
         self.connections.append(connection)
         self._listener.add(connection)
         self.on_open(connection)
         return connection
+
+    def welcome(self, connection: RequestConnection) -> None:
+        """Count a connection as a client from now on.
+
+        Raises:
+            RemoteError: If there are too many.
+        """
+        self._strangers.forget(connection)
+        if len(self.connections) - len(self._strangers) > self._max_clients:
+            raise RemoteError(
+                f"Too many clients are connected: max_clients is {self._max_clients}. Try again "
+                "when one has left."
+            )
 
     def send(self, connection: RequestConnection, *parts: bytes | memoryview) -> None:
         """Send parts as one piece; a broken connection is dropped without an error."""
@@ -132,9 +173,10 @@ class SocketService(Service):
         if connection.closed:
             return
         if reason:
-            LOG.warning("Connection of %s ended: %s", connection.name, reason)
+            self.log.warning(connection.name, "Connection of %s ended: %s", connection.name, reason)
         connection.close()
         self.connections.remove(connection)
+        self._strangers.forget(connection)
         if connection in self._ready:
             self._ready.remove(connection)
         self.on_close(connection)
@@ -174,7 +216,8 @@ class SocketService(Service):
             self._open()
         if not self._came_soon(timeout):
             self._look(timeout)
-        if self._work is not None or self._ready or self._listener.timers.next < math.inf:
+        is_due = self._listener.timers.next <= time.monotonic()
+        if self._work is not None or self._ready or is_due:
             self._turn()
         else:
             self._has_more = False
@@ -193,7 +236,7 @@ class SocketService(Service):
             if not connection.receive_soon():
                 return False
         except OSError as error:
-            self.drop(connection, str(error))
+            self._broken(connection, error)
             return True
         self._answer(connection)
         return True
@@ -210,7 +253,8 @@ class SocketService(Service):
         with self._lock:
             if not (self._is_open or self._released):
                 self._is_open = True
-                self._listener = Listener(self._meet)
+                self._listener = Listener(self._meet, self._give_up)
+                self._strangers = self.new_strangers()
 
     def _release(self) -> None:
         with self._lock:
@@ -222,6 +266,7 @@ class SocketService(Service):
             self._work = None
             for connection in [*self.connections]:
                 self.drop(connection)
+            self.log.summarize()
             self._listener.close()
 
     def _wait(self, timeout: float | None) -> float | None:
@@ -297,7 +342,7 @@ class SocketService(Service):
         if not isinstance(error, Exception):
             self.drop(connection, f"interrupted by {type(error).__name__}")
             raise error
-        LOG.error("A request of %s failed", connection.name, exc_info=error)
+        self.log.error(connection.name, "A request of %s failed", connection.name, cause=error)
         self.drop(connection, f"{type(error).__name__}: {error}")
 
     def _after(self, connection: RequestConnection) -> None:
@@ -309,14 +354,14 @@ class SocketService(Service):
             self._recent = connection
             return
         try:
-            if connection.next_body():
+            if self._take_body(connection):
                 self._ready.append(connection)
             elif connection.ended and not connection.outgoing:
                 half = connection.reader.waiting
                 self.drop(connection, f"in the middle of a message ({half} bytes)" if half else "")
                 return
         except PhysxError as error:
-            self.drop(connection, str(error))
+            self.on_fault(connection, error)
             return
         connection.watch()
 
@@ -333,7 +378,7 @@ class SocketService(Service):
             if events & selectors.EVENT_READ:
                 connection.receive()
         except OSError as error:
-            self.drop(connection, str(error))
+            self._broken(connection, error)
             return
         if had_body and connection.ended and not self.admits(connection):
             self.drop(connection, "it left before its turn")
@@ -347,17 +392,30 @@ class SocketService(Service):
     def _answer(self, connection: RequestConnection) -> None:
         """Handle the message that has just arrived, if no other waits."""
         try:
-            if connection.next_body() and self.admits(connection) and not connection.outgoing:
+            if self._take_body(connection) and self.admits(connection) and not connection.outgoing:
                 self._begin(connection)
                 return
         except PhysxError as error:
-            self.drop(connection, str(error))
+            self.on_fault(connection, error)
             return
         self._after(connection)
 
+    def _take_body(self, connection: RequestConnection) -> bool:
+        """Put the next whole message into `body`; return whether there is one."""
+        if not connection.next_body():
+            return False
+        if connection in self._strangers:
+            self.on_first_message(connection)
+        return True
+
     def _meet(self, connected: socket.socket, name: str) -> None:
-        if len(self.connections) >= self._max_clients:
-            connected.close()
-            LOG.warning("%s was turned away: too many are connected", name)
+        self.adopt(connected)
+
+    def _broken(self, connection: RequestConnection, error: OSError) -> None:
+        if is_loss(error):
+            self._give_up(connection)
         else:
-            self.adopt(connected)
+            self.drop(connection, str(error))
+
+    def _give_up(self, connection: RequestConnection) -> None:
+        self.on_fault(connection, RemoteClosedError(VANISHED))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Iterable, Iterator, Mapping
 from functools import reduce
 from operator import getitem
@@ -17,6 +18,14 @@ from physx_core.typing import Array
 Space: TypeAlias = spaces.Space[Any]
 Leaf: TypeAlias = spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete
 Path: TypeAlias = tuple[Any, ...]
+
+NONSENSE: tuple[type[Exception], ...] = (
+    *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError),
+    *(RecursionError, MemoryError),
+)
+"""What may be raised where received data are not what the protocol says."""
+
+_LARGEST = 1 << 26
 
 KINDS = "Box, Discrete, MultiBinary, MultiDiscrete, Dict and Tuple"
 
@@ -83,10 +92,59 @@ def cast_exactly(value: Any, dtype: np.dtype[Any]) -> Array:
         return array
     if array.dtype.kind not in "biuf":
         raise ValueError("these are not numbers")
-    typed = array.astype(dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        typed = array.astype(dtype)
     if dtype.kind in "biu" and not (typed == array).all():
         raise ValueError(f"{dtype} cannot hold these numbers")
     return typed
+
+
+def find_invalid(leaf: Leaf, values: Array) -> tuple[int, ...] | None:
+    """Return where the first value is that no element of a space holds; None if there is none.
+
+    Floating values must be finite. Their bounds are the environment's own concern, as in Gymnasium:
+    many environments clip them, or take more than they announce. Whole numbers must be in range.
+
+    Args:
+        leaf: The space.
+        values: Elements of the space, with any leading axes.
+    """
+    if isinstance(leaf, spaces.Box) and values.dtype.kind == "f":
+        valid = np.isfinite(values)
+    else:
+        low, high = _range(leaf)
+        valid = (values >= low) & (values <= high)
+    if valid.all():
+        return None
+    return tuple(np.argwhere(~valid)[0].tolist())
+
+
+def _range(leaf: Leaf) -> tuple[Any, Any]:
+    """Return the least and the largest elements of a space of whole numbers."""
+    if isinstance(leaf, spaces.Box):
+        return leaf.low, leaf.high
+    if isinstance(leaf, spaces.MultiBinary):
+        return 0, 1
+    count = leaf.n if isinstance(leaf, spaces.Discrete) else leaf.nvec
+    return leaf.start, leaf.start + (count - 1)
+
+
+def invalid_value(leaf: Leaf, place: str, value: Any) -> RequestError:
+    """Return the error for a value that no element of a space holds.
+
+    Args:
+        leaf: The space.
+        place: What the value is, such as ``The action[2]``.
+        value: The value.
+    """
+    is_float = isinstance(leaf, spaces.Box) and np.issubdtype(leaf.dtype, np.floating)
+    wanted = "a finite number" if is_float else f"an element of {leaf}"
+    return RequestError(f"{place} is {value}, which is not {wanted}.")
+
+
+def subscripts(keys: Iterable[Any]) -> str:
+    """Return keys and indices as they are written in Python, such as ``["arm"][2]``."""
+    return "".join(f'["{key}"]' if isinstance(key, str) else f"[{key}]" for key in keys)
 
 
 # Plain data for JSON ---------------------------------------------------------------------------
@@ -119,22 +177,25 @@ def build_space(plain: Mapping[str, Any]) -> Space:
     """Return the space that a description of `describe_space` stands for."""
     try:
         return _build(plain)
-    except (KeyError, TypeError, ValueError, AssertionError, AttributeError) as error:
+    except NONSENSE as error:
         raise RemoteProtocolError(
-            f"The other side sent an invalid description of a space, {plain!r:.200}: {error!r}."
+            "The other side sent an invalid description of a space, "
+            f"{reprlib.repr(plain):.200}: {error!r}."
         ) from error
 
 
 def _build(plain: Mapping[str, Any]) -> Space:
     match plain["kind"]:
         case "Box":
-            shape, dtype = tuple(plain["shape"]), np.dtype(plain["dtype"])
+            shape, dtype = check_shape(plain["shape"]), np.dtype(plain["dtype"])
             low, high = (_limits(plain[side], shape, dtype) for side in ("low", "high"))
             return spaces.Box(low, high, shape, dtype.type)
         case "Discrete":
             return spaces.Discrete(plain["n"], start=plain["start"], dtype=plain["dtype"])
         case "MultiBinary":
-            return spaces.MultiBinary(plain["n"])
+            bits = plain["n"]
+            check_shape(bits if isinstance(bits, list) else [bits])
+            return spaces.MultiBinary(bits)
         case "MultiDiscrete":
             dtype = np.dtype(plain["dtype"]).type
             return spaces.MultiDiscrete(plain["nvec"], dtype=dtype, start=plain["start"])
@@ -144,6 +205,24 @@ def _build(plain: Mapping[str, Any]) -> Space:
         case "Tuple":
             return spaces.Tuple([_build(part) for part in plain["spaces"]])
     raise ValueError(f"unknown kind {plain['kind']!r}")
+
+
+def check_shape(sizes: Iterable[Any], num_worlds: int = 1) -> tuple[int, ...]:
+    """Return a shape that was received.
+
+    Args:
+        sizes: The shape.
+        num_worlds: How many arrays of that shape there are.
+
+    Raises:
+        ValueError: If it is not the shape of an array that fits into memory.
+    """
+    shape = tuple(sizes)
+    if not all(type(size) is int and size >= 0 for size in shape):
+        raise ValueError(f"{reprlib.repr(shape)} is not a shape")
+    if num_worlds * math.prod(shape) > _LARGEST:
+        raise ValueError(f"more than {_LARGEST} numbers, in arrays of shape {reprlib.repr(shape)}")
+    return shape
 
 
 def _bounds(array: Array) -> Any:
@@ -159,9 +238,10 @@ def _number(value: float) -> float | str:
 
 
 def _limits(plain: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
-    numbers = plain if isinstance(plain, list) else [plain] * math.prod(shape)
+    numbers = plain if isinstance(plain, list) else [plain]
     values = [float(number) if isinstance(number, str) else number for number in numbers]
-    return np.array(values, dtype).reshape(shape)
+    array = np.array(values, dtype)
+    return array.reshape(shape) if isinstance(plain, list) else np.full(shape, array[0])
 
 
 def to_json(space: Space, value: Any) -> Any:
@@ -186,4 +266,8 @@ def from_json(space: Space, plain: Any, place: str = "The action") -> Any:
         raise RequestError(f"{place} must be in {space}, not {plain!r:.100}: {error!r}.") from None
     if value.shape != (space.shape or ()):
         raise RequestError(f"{place} has shape {value.shape}, but {space} has shape {space.shape}.")
+    if isinstance(space, Leaf):
+        index = find_invalid(space, value)
+        if index is not None:
+            raise invalid_value(space, f"{place}{subscripts(index)}", value[index])
     return value.dtype.type(value) if isinstance(space, spaces.Discrete) else value

@@ -9,6 +9,7 @@ from physx_core.errors import ConfigError, ConnectionRefusedByPeerError, Unanswe
 from physx_core.net.addresses import parse_address, retry
 from physx_core.net.frames import Kind
 from physx_core.net.handshake import introduce
+from physx_core.net.liveness import prepare_connection
 from physx_core.net.remote_errors import decode_error
 from physx_core.net.values import decode
 from physx_core.workers.client.link import RunEnded, WorkerLink
@@ -47,8 +48,7 @@ def join(
 def _try_to_join(address: str, token: str, instance: int) -> tuple[WorkerLink, dict[str, Any]]:
     connection = _connect(address)
     try:
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        prepare_connection(connection)
         reader = introduce(connection, token, instance)
         connection.settimeout(None)
     except BaseException:

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from physx_core.net.frames import Frame, FrameReader, Kind
+from physx_core.net.liveness import poll_peer
 from physx_core.net.remote_errors import decode_error
 from physx_core.net.spin_wait import spin_until
 from physx_core.net.values import decode, pack_value
@@ -37,7 +38,7 @@ class WorkerLink:
     """Connection to the server, authenticated; blocking.
 
     A thread watches the connection: a process whose server is gone exits within about a second,
-    even during a long step.
+    even during a long step, and within about 15 s if the server's machine no longer answers.
 
     Attributes:
         spins: Whether to look for an answer without sleeping, for 0.2 ms.
@@ -156,7 +157,11 @@ class WorkerLink:
     def _watch(self) -> None:
         poll = select.poll()
         poll.register(self._connection, _HANGUP)
-        poll.poll()
+        try:
+            poll_peer(poll, self._connection, None)
+        except TimeoutError:
+            with contextlib.suppress(OSError):  # end the wait of a call that sends or receives
+                self._connection.shutdown(socket.SHUT_RDWR)
         if self._over.wait(_CLEANUP_TIME):
             return
         if os.getsid(0) == os.getpid():  # it was launched and has a process group of its own

@@ -7,6 +7,7 @@ import time
 
 from physx_core.components.launcher import ClientHandle
 from physx_core.errors import ClientError
+from physx_core.net.liveness import VANISHED
 from physx_core.workers.server.peer import Peer
 
 _LINES_TIME = 0.1  # for the last lines of its standard error to arrive
@@ -30,6 +31,8 @@ def exit_error(number: int, peer: Peer | None, handle: ClientHandle | None) -> C
         return ClientError(number, what, stderr=stderr)
     made = 0 if peer is None else peer.received
     when = "before it connected" if peer is None else f"after {made} rows"
+    if peer is not None and peer.has_vanished:
+        return ClientError(number, f"was lost {when}: {VANISHED}.")
     if handle is None:
         return ClientError(number, f"closed the connection {when}. Its own terminal may say why.")
     handle.wait(time.monotonic() + _LEAVE_TIME)

@@ -34,6 +34,7 @@ class Peer(Connection):
         failed_row: Row, counted from 0, that the error kept it from making.
         last_step: Step of its last row, -1 before the first.
         offense: The violation of the protocol for which it was cut off; empty if there is none.
+        has_vanished: Whether its machine no longer answers.
         finished: Whether it reported that its environment is closed.
         vacant: Whether another client may take the instance's place.
         has_told_fields: Whether it sent the fields of its rows.
@@ -63,7 +64,7 @@ class Peer(Connection):
         self.failed_row = 0
         self.last_step = -1
         self.offense = ""
-        self.finished = self.vacant = self.has_told_fields = False
+        self.has_vanished = self.finished = self.vacant = self.has_told_fields = False
         self.requests = self.shown = 0
         self.journal: Journal | None = None
         self._arrived = 0  # of a long frame, when the peer was last heard of

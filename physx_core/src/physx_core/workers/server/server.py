@@ -17,9 +17,10 @@ from physx_core.errors import (
 from physx_core.net.addresses import format_address
 from physx_core.net.frames import MAX_PAYLOAD, Frame, Kind, pack
 from physx_core.net.listener import Listener
+from physx_core.net.liveness import is_loss
 from physx_core.net.remote_errors import decode_error, encode_error
 from physx_core.net.spin_wait import has_core_for_each
-from physx_core.net.strangers import Strangers
+from physx_core.net.strangers import Handshakes
 from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.peer import Peer
@@ -75,8 +76,8 @@ class Server:
         self._requests = ServiceRequests(services)
         self._setup, self._replaces = setup, replaces
         self._ending = self._has_news = False
-        self._listener = Listener[Peer](self._meet)
-        self._strangers = Strangers(
+        self._listener = Listener[Peer](self._meet, self._give_up)
+        self._strangers = Handshakes[Peer](
             token, _HANDSHAKE_TIME, _MAX_STRANGERS, self._drop, self._listener.timers
         )
         self._dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
@@ -223,7 +224,8 @@ class Server:
                     # The others get their turn; the selector finds the rest. And rows are moved to
                     # their places while they are in the processor's cache.
                     return
-        except EOFError:
+        except EOFError as error:
+            peer.has_vanished = is_loss(error.__cause__)
             self._drop(peer)
         except ConnectionRefusedByPeerError as error:
             peer.offense = str(error)
@@ -266,6 +268,11 @@ class Server:
         elif self._replaces(peer.instance_id, None):
             peer.journal = Journal()
         peer.send(pack(Kind.SETUP, self._setup(peer)))
+
+    def _give_up(self, peer: Peer) -> None:
+        """Drop a client whose machine no longer answers."""
+        peer.has_vanished = True
+        self._drop(peer)
 
     def _drop(self, peer: Peer, reason: str = "") -> None:
         if peer.closed:
