@@ -16,7 +16,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import re
-import tomllib
 import warnings
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
@@ -31,6 +30,7 @@ from physx_core.components.optimization import Optimization
 from physx_core.config import NetworkConfig, to_plain
 from physx_core.errors import CheckpointError, PhysxError, SessionError, listed
 from physx_core.fields import Field
+from physx_core.parsing import parse_toml
 from physx_core.statistics import Normalization
 
 FORMAT_VERSION = 2
@@ -452,7 +452,7 @@ def _read(path: Path, *, content: bool = True) -> Checkpoint:
 
 def _parse(content: bytes) -> dict[str, Any]:
     """Return the content of a description that is as it was written."""
-    plain = tomllib.loads(content.decode())
+    plain = parse_toml(content)
     version, checksum = plain["format_version"], plain.get("checksum")
     if type(version) is not int:
         raise ValueError(f"'format_version' is {version!r}")

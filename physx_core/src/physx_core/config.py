@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, dataclass_transform
 
 from physx_core.errors import ConfigError, ConfigFileError, UnknownOptionError, UsageError
+from physx_core.parsing import parse_toml
 
 __all__ = [
     "MODES",
@@ -285,13 +286,11 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     Raises:
         ConfigFileError: If the file is missing, cannot be read, or is not TOML.
     """
-    import tomllib
-
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return parse_toml(Path(path).read_bytes())
     except FileNotFoundError:
         raise ConfigFileError(f"There is no configuration file {path}.") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ConfigFileError(f"{path} is not valid TOML: {error}.") from None
     except OSError as error:
         raise ConfigFileError(f"{path} cannot be read: {error.strerror or error}.") from None

@@ -117,7 +117,11 @@ class ComponentNotFoundError(PhysxError):
 
 
 class ReferenceFormError(PhysxError):
-    """The reference to a component has an invalid form."""
+    """The reference to a component has an invalid form, or names what is no such component."""
+
+
+class UntrustedReferenceError(PhysxError):
+    """A file that was read names code that is no component of an installed plugin."""
 
 
 # Samples ------------------------------------------------------------------------------------

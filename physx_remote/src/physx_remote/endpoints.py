@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 from physx_core.errors import ConfigError, UsageError
 from physx_core.net import check_address, parse_address
-from physx_core.plugins import resolve
+from physx_core.plugins import find
 from physx_remote.serving.protocol import Protocol, find_protocol
 from physx_remote.serving.service import Service
 from physx_remote.serving.worlds import call_with, is_gymnasium_id, open_worlds
@@ -149,7 +149,7 @@ def _find_scene(environment: Any, arguments: Mapping[str, Any]) -> RLEnvironment
     if isinstance(environment, str):
         if ":" not in environment or is_gymnasium_id(environment):
             return None
-        environment = resolve("environment", environment)
+        environment = find("environment", environment)
     if inspect.isclass(environment) and issubclass(environment, RLEnvironment):
         environment = call_with(environment, arguments)
     elif arguments and isinstance(environment, RLEnvironment):

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from physx_core.errors import ComponentNotFoundError, ConfigError, listed, nearest
-from physx_core.plugins import resolve
+from physx_core.plugins import import_component
 
 
 def find_classes(module: ModuleType, base: type[Any]) -> dict[str, type[Any]]:
@@ -40,7 +40,7 @@ def choose(what: str, given: Any, known: Mapping[str, Any]) -> Any:
         return known[given]
     if ":" in given:
         try:
-            return resolve("network", given)
+            return import_component(what, given)
         except ComponentNotFoundError as error:
             raise ConfigError(
                 f'There is no {what} "{given}".{nearest(error.name, error.known)}'
@@ -51,8 +51,20 @@ def choose(what: str, given: Any, known: Mapping[str, Any]) -> Any:
     )
 
 
-def make(what: str, factory: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-    """Return ``factory(*args, **kwargs)``."""
+def make(
+    what: str, base: type[Any], factory: Callable[..., Any], /, *args: Any, **kwargs: Any
+) -> Any:
+    """Return ``factory(*args, **kwargs)``; a class that is not derived from `base` is not called.
+
+    Args:
+        what: Kind of the object for messages, for example ``"loss"``.
+        base: Class that its class must be derived from.
+        factory: A class, or a function that returns an object.
+        args: Its arguments.
+        kwargs: Its keyword arguments.
+    """
+    if isinstance(factory, type) and not issubclass(factory, base):
+        raise ConfigError(f"The {what} {factory.__name__} is not derived from {base.__name__}.")
     try:
         return factory(*args, **kwargs)
     except (TypeError, ValueError) as error:
@@ -75,7 +87,7 @@ def make_activation(option: str, given: Any, channels: int) -> torch.nn.Module:
     known = find_classes(torch.nn.modules.activation, torch.nn.Module)
     chosen = choose("activation", given, {**known, "Identity": torch.nn.Identity})
     slopes = {"num_parameters": channels} if chosen is torch.nn.PReLU else {}
-    made = make("activation", chosen, **slopes)
+    made = make("activation", torch.nn.Module, chosen, **slopes)
     if not isinstance(made, torch.nn.Module):
         raise ConfigError(f"{option} is {given!r} but must be a torch.nn.Module class.")
     return made

@@ -57,11 +57,14 @@ def test_groups_become_names_or_modes(folder, tmp_path):
         }
 
 
-def test_the_index_of_a_dataset_is_read_too(folder, tmp_path):
+def test_the_index_of_a_dataset_leads_to_other_files(folder, tmp_path):
     with Dataset.create(folder, max_file_size=1.7e-5) as dataset:
         dataset.append("training", {"x": np.arange(500.0)})
-    import_file(folder / "run.h5", tmp_path / "back")
-    with Dataset.open(tmp_path / "back") as back:
+    for place in (folder / "run.h5", folder):
+        with pytest.raises(ExchangeError, match=r"Dataset\.merge"):
+            import_file(place, tmp_path / "back")
+    with Dataset.create(tmp_path / "back") as back:
+        back.merge(folder)
         assert_array_equal(back["training"]["x"][:], np.arange(500.0))
 
 
@@ -221,16 +224,70 @@ def test_links_out_of_an_hdf5_file_are_not_followed(folder, tmp_path):
         layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "x", (10, 3))
         file.create_virtual_dataset("x", layout)
 
+    def beside(file):
+        layout = h5py.VirtualLayout((10, 3), "f8")
+        layout[:] = h5py.VirtualSource("other.h5", "x", (10, 3))
+        file.create_virtual_dataset("x", layout)
+
     def loop(file):
         file.create_group("a")
         file["a/b"] = file["a"]
 
-    for number, make in enumerate((external, soft, raw, virtual, loop)):
+    for number, make in enumerate((external, soft, raw, virtual, beside, loop)):
         with h5py.File(tmp_path / f"{number}.h5", "w") as file:
             make(file)
-        with pytest.raises(ExchangeError, match="link|another folder|contains itself"):
+        with pytest.raises(ExchangeError, match="link|other files|contains itself"):
             import_file(tmp_path / f"{number}.h5", folder)
     assert not folder.exists()
+
+
+# Sizes ------------------------------------------------------------------------------------------
+
+
+def write_archive_that_says(path, nbytes):
+    """An archive whose list of contents says that its only array has this size."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({nbytes // 8},), }}"
+        content = (header.ljust(117) + "\n").encode()
+        content = b"\x93NUMPY\x01\x00" + len(content).to_bytes(2, "little") + content
+        archive.writestr("x.npy", content + bytes(2**20))
+        archive.infolist()[0].file_size = nbytes + len(content)
+
+
+def test_what_unpacks_to_far_more_than_the_file_is_refused(folder, tmp_path):
+    write_archive_that_says(tmp_path / "a.npz", 5 * 10**9)
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file.create_dataset("x", (10**10,), "f8", chunks=(10**6,))
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file.create_dataset("x", (10**15, 0), "f8")
+    with h5py.File(tmp_path / "d.h5", "w") as file:
+        file.create_dataset("x", (10**8,), "f8", chunks=(10**8,), compression="gzip")
+    with h5py.File(tmp_path / "e.h5", "w") as file:
+        group = file
+        for _ in range(40):
+            inner = group.create_group("a")
+            group["b"], group = inner, inner
+        group["x"] = X
+    for name, message in {
+        "a.npz": "holds 5 GB.*--max-bytes 5000000",
+        "b.h5": "holds 80 GB.*--max-bytes 80000000000",
+        "c.h5": "--max-bytes",
+        "d.h5": "chunks of 800000000 bytes",
+        "e.h5": "more than 10000 datasets",
+    }.items():
+        with pytest.raises(ExchangeError, match=message):
+            import_file(tmp_path / name, folder)
+    assert not folder.exists()
+
+
+def test_the_user_may_allow_more(folder, tmp_path):
+    x = np.zeros((35, 10**6))
+    np.savez_compressed(tmp_path / "a.npz", x=x)
+    with pytest.raises(ExchangeError, match="max_bytes"):
+        import_file(tmp_path / "a.npz", folder)
+    assert import_file(tmp_path / "a.npz", folder, max_bytes=x.nbytes + 1000) == {"training": 35}
+    with pytest.raises(ExchangeError, match="max_bytes"):
+        import_file(tmp_path / "a.npz", folder, max_bytes=1000)
 
 
 @pytest.mark.parametrize("form", ["npz", "hdf5-single"])

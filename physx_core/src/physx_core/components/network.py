@@ -52,6 +52,20 @@ class Network(ABC):
             seed: Not negative.
         """
 
+    @classmethod  # noqa: B027
+    def check_arguments(cls, arguments: Mapping[str, Any], path: Path) -> None:
+        """Check arguments from a checkpoint against its parameters, before a network is created.
+
+        So that a small file cannot have a network of any size created.
+
+        Args:
+            arguments: Keyword arguments of the constructor.
+            path: File that `save_parameters` wrote.
+
+        Raises:
+            CheckpointError: If the parameters are not those of such a network.
+        """
+
     @classmethod
     def join_group(cls, device: str) -> Group:
         """Join the processes that were started to train this network together.

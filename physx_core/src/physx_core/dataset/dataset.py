@@ -399,7 +399,7 @@ class Dataset(Closeable):
         """
         self._for_writing().flush()
 
-    def update_info(self, **values: Any) -> None:
+    def update_info(self, /, **values: Any) -> None:
         """Set entries of `info` and store them.
 
         Args:

@@ -14,6 +14,7 @@ from physx_core.errors import SessionError
 
 HEADER = ("timeline", "step", "name", "value")
 FLUSH_SECONDS = 0.2
+_LONGEST_LINE = 2**16
 
 
 class ScalarsFile(Observer):
@@ -90,14 +91,17 @@ def read_scalars(session_dir: Path) -> dict[tuple[str, str], dict[int, float]]:
     if not path.is_file():
         raise SessionError(f"There is no {path}: a session has statistics after a training.")
     found: dict[tuple[str, str], dict[int, float]] = {}
-    with path.open(encoding="utf-8", newline="") as stream:
-        for timeline, step, name, value in _rows(path, stream):
-            found.setdefault((timeline, name), {})[step] = value
+    try:
+        with path.open(encoding="utf-8", newline="") as stream:
+            for timeline, step, name, value in _rows(path, stream):
+                found.setdefault((timeline, name), {})[step] = value
+    except (csv.Error, UnicodeDecodeError, OSError) as error:
+        raise SessionError(f"{path} is damaged: {error}.") from error
     return found
 
 
 def _rows(path: Path, stream: io.TextIOBase) -> Iterator[tuple[str, int, str, float]]:
-    lines = csv.reader(line for line in stream if line.endswith("\n"))
+    lines = csv.reader(_complete_lines(stream))
     if tuple(next(lines, ())) not in (HEADER, ()):
         raise SessionError(f"{path} is not a file of physx: it must begin with {','.join(HEADER)}.")
     for line in lines:
@@ -105,4 +109,13 @@ def _rows(path: Path, stream: io.TextIOBase) -> Iterator[tuple[str, int, str, fl
             timeline, step, name, value = line
             yield timeline, int(step), name, float(value)
         except ValueError as error:
-            raise SessionError(f"{path} is damaged: {','.join(line)} ({error}).") from error
+            text = ",".join(line)
+            raise SessionError(f"{path} is damaged: {text:.200} ({str(error)[:200]}).") from error
+
+
+def _complete_lines(stream: io.TextIOBase) -> Iterator[str]:
+    while line := stream.readline(_LONGEST_LINE):
+        if len(line) == _LONGEST_LINE:
+            raise csv.Error(f"a line has more than {_LONGEST_LINE} characters")
+        if line.endswith("\n"):
+            yield line

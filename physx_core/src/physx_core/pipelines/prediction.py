@@ -68,6 +68,9 @@ class Prediction(Pipeline):
     record: bool = False
     """Store samples and predictions in the session's dataset, mode "prediction"; rejected samples
     too, with `record_wrong_samples`."""
+    trust: bool = field(default=False, metadata={"recorded": False})
+    """Import whatever the checkpoint names, which can be any code, not only components of installed
+    plugins."""
 
     kind: ClassVar[str] = "prediction"
     learner: Learner = field(init=False, repr=False)
@@ -150,7 +153,7 @@ class Prediction(Pipeline):
         network, environment = self.network_config, self.environment_config
         seed = choose_seed(environment.seed)
         self.session = Session.existing(self.session_dir, self.session_name)
-        self.learner = load_learner(self.session.path, network)
+        self.learner = load_learner(self.session.path, network, trust=self.trust)
         config = self.dataset_config or DatasetConfig()
         self._stored, replayed = None, None
         if environment.load_samples:

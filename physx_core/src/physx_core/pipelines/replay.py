@@ -20,10 +20,12 @@ from physx_core.errors import ConfigError
 from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
 from physx_core.pipelines.stored_rows import StoredRows
+from physx_core.plugins.references import check_recorded, is_recorded_as
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 
 _RECORDED = ("environment", "env_kwargs", "num_clients", "simulations_per_step")
+_MOST_CLIENTS = 64
 
 
 @options
@@ -51,6 +53,9 @@ class Replay(NewSessionPipeline):
     step_nb: int | None = at_least(-1, None)
     """Number of steps, starting over after the last sample; None: until each sample was shown once;
     -1: until Ctrl-C."""
+    trust: bool = field(default=False, metadata={"recorded": False})
+    """Import whatever the dataset names as its environment, which can be any code, not only
+    components of installed plugins."""
 
     kind: ClassVar[str] = "replay"
     source: Source = field(init=False, repr=False)
@@ -112,7 +117,9 @@ class Replay(NewSessionPipeline):
         dataset = resources.enter_context(Dataset.open(config.existing_dir))
         self._stored = StoredRows(dataset, config.mode)
         if self.environment_config is None:
-            self.environment_config = from_plain(EnvironmentConfig, recorded_environment(dataset))
+            self.environment_config = from_plain(
+                EnvironmentConfig, recorded_environment(dataset, trust=self.trust)
+            )
         environment = self.environment_config
         seed = choose_seed(environment.seed)
         self.session = self._create_session()
@@ -132,11 +139,42 @@ class Replay(NewSessionPipeline):
         yield f"{self.step_id} steps of {to_plain(environment)['environment']}"
 
 
-def recorded_environment(dataset: Dataset) -> dict[str, Any]:
-    """Return the options of the environment that a dataset was generated with."""
+def recorded_environment(
+    dataset: Dataset, given: Any = None, *, trust: bool = False
+) -> dict[str, Any]:
+    """Return the options of the environment that a dataset was generated with.
+
+    Args:
+        dataset: The dataset, which may come from a stranger.
+        given: The environment that the user named; None: the dataset's. If it is another one, the
+            dataset's options do not apply.
+        trust: Whether the dataset may name any class.
+
+    Raises:
+        ConfigError: If the dataset does not name its environment.
+        UntrustedReferenceError: If it names code that is no component of an installed plugin.
+    """
     info: Mapping[str, Any] = dataset.info
-    if not isinstance(info.get("environment"), str):
+    recorded = info.get("environment")
+    if given is not None and not is_recorded_as(given, recorded):
+        return {}
+    if not isinstance(recorded, str):
         raise ConfigError(
             f"The dataset in {dataset.directory} does not name its environment: name one."
+        )
+    check_recorded(
+        "environment",
+        dataset.directory / "dataset.json",
+        recorded if given is None else None,
+        info.get("env_kwargs"),
+        f"physx replay {dataset.directory} REFERENCE (in Python EnvironmentConfig(...)) and its "
+        "arguments",
+        trust=trust,
+    )
+    count = info.get("num_clients", 1)
+    if not trust and isinstance(count, int) and count > _MOST_CLIENTS:
+        raise ConfigError(
+            f"{dataset.directory} asks for {count} processes. If that is right, --trust (in Python "
+            "trust=True); otherwise give the environment's options yourself."
         )
     return {name: info[name] for name in _RECORDED if name in info}

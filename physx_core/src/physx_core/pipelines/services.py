@@ -8,11 +8,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from physx_core import files
 from physx_core.components.scene import Event
 from physx_core.components.visualizer import Observer
 from physx_core.errors import ConnectionRefusedByPeerError, DatasetError, UsageError
 from physx_core.net.values import decode, encode
-from physx_core.pipelines.storage import PARAMETERS
+from physx_core.pipelines.storage import LARGEST_PARAMETERS, PARAMETERS
 from physx_core.typing import Batch, Sample
 
 Predict: TypeAlias = Callable[[Batch], Batch]
@@ -71,12 +72,20 @@ class RunServices:
         for place in (self._source_dir, self._dir):
             path = place / PARAMETERS.format(instance_id) if place is not None else None
             if path is not None and path.exists():
-                try:
-                    values |= decode(path.read_bytes())
-                except ConnectionRefusedByPeerError as error:
-                    raise DatasetError(f"{path} is damaged: {error}") from error
+                values |= _read_parameters(path)
         return values
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:
         """Pass drawing events to the observers."""
         self._observer.events(instance_id, step, events)
+
+
+def _read_parameters(path: Path) -> dict[str, Any]:
+    """Return the values in a file, which may come with a stranger's dataset."""
+    try:
+        values = decode(files.read_content(path, LARGEST_PARAMETERS))
+    except (OSError, ConnectionRefusedByPeerError) as error:
+        raise DatasetError(f"{path} cannot be read: {error}.") from error
+    if not isinstance(values, dict):
+        raise DatasetError(f"{path} cannot be read: it does not hold parameters by name.")
+    return values

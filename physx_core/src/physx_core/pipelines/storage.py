@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,8 @@ from physx_core.sources.source import Source
 
 PARAMETERS = "parameters_{}.bin"
 """Name of the file beside a dataset that contains an instance's saved parameters."""
+LARGEST_PARAMETERS = 2**32
+"""Bytes of such a file."""
 
 
 def open_own(session: Session, config: DatasetConfig) -> Dataset:
@@ -183,7 +184,9 @@ def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
     with Dataset.open(config.existing_dir) as existing:
         dataset.update_info(**existing.info, copied_from=str(existing.directory))
         for path in existing.directory.glob(PARAMETERS.format("*")):
-            shutil.copyfile(path, dataset.directory / path.name)
+            with files.storing(f"{path}, copied into the session,"):
+                content = files.read_content(path, LARGEST_PARAMETERS)
+                files.replace(dataset.directory / path.name, content)
 
 
 def is_copy(directory: Path) -> bool:

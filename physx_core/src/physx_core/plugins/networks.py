@@ -13,7 +13,7 @@ from typing import Any
 from physx_core.components.network import Network
 from physx_core.errors import ConfigError
 from physx_core.plugins.entries import OFFICIAL, PLUGINS
-from physx_core.plugins.references import resolve
+from physx_core.plugins.references import check_kind, find, resolve
 from physx_core.plugins.registry import available, load
 
 _ADAPTER = "module"
@@ -26,9 +26,10 @@ def resolve_network(reference: Any, arguments: Mapping[str, Any]) -> tuple[Any, 
         reference: As in `resolve`; also a class derived from one of a plugin's library.
         arguments: The user's keyword arguments.
     """
-    found = resolve("network", reference)
+    found = find("network", reference)
     library = _library_of(found)
     if library is None:
+        check_kind("network", reference, found)
         return found, dict(arguments)
     if _ADAPTER in arguments:
         raise ConfigError(

@@ -1,12 +1,17 @@
-"""References: names of components, and how they are resolved."""
+"""References: names of components, and how they are resolved.
+
+What the user names may be any code. What a file names may only be components of installed plugins,
+``"plugin/name"``: see `check_recorded`.
+"""
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal, overload
@@ -18,6 +23,7 @@ from physx_core.errors import (
     PhysxError,
     PluginError,
     ReferenceFormError,
+    UntrustedReferenceError,
 )
 from physx_core.plugins.hookspecs import KINDS
 from physx_core.plugins.registry import load
@@ -32,6 +38,9 @@ if TYPE_CHECKING:
         Visualizer,
     )
     from physx_core.simulation import Backend
+
+_MOST_VALUES = 10_000
+"""Values in the arguments of a component that a file names."""
 
 
 @overload
@@ -68,11 +77,11 @@ def resolve(kind: str, reference: Any) -> Any:
         PluginNotFoundError: If the plugin is not installed.
         PluginError: If it is installed but broken.
         ComponentNotFoundError: If the plugin, module or script has no component of that name.
-        ReferenceFormError: If the reference has none of the forms above.
+        ReferenceFormError: If the reference has none of the forms above, or names a class of
+            another kind.
     """
-    if kind not in KINDS:
-        raise ReferenceFormError(f'"{kind}" is not a kind of component: {", ".join(KINDS)}.')
-    component = _find(kind, reference)
+    component = find(kind, reference)
+    check_kind(kind, reference, component)
     return component() if kind == "backend" and isinstance(component, type) else component
 
 
@@ -101,7 +110,7 @@ def locate(kind: str, reference: Any) -> str:
             name = next(iter(components))
         component = components[name]
         place = reference_of(component)
-        return place if place == component or _find(kind, place) is component else text
+        return place if place == component or find(kind, place) is component else text
     except (PhysxError, LookupError, AttributeError):  # the other process reports the error
         return text
 
@@ -115,12 +124,135 @@ def import_component(kind: str, reference: str) -> Any:
 
     Raises:
         ComponentNotFoundError: If the module or script has no object of that name.
+        ReferenceFormError: If it belongs to Python's standard library, which has no components.
     """
     place, _, name = reference.rpartition(":")
-    return _attribute(kind, _module(kind, place), name, place)
+    found = _attribute(kind, _module(kind, place), name, place)
+    if _is_standard(found):
+        raise ReferenceFormError(
+            f'"{reference}" belongs to Python\'s standard library and is no {kind}.'
+        )
+    return found
 
 
-def _find(kind: str, reference: Any) -> Any:
+def _is_standard(found: Any) -> bool:
+    while isinstance(found, functools.partial):
+        found = found.func
+    module = getattr(found, "__module__", None) or type(found).__module__
+    return str(module).partition(".")[0] in sys.stdlib_module_names
+
+
+def check_kind(kind: str, reference: Any, found: Any) -> None:
+    """Check that a reference names a class of its kind, or a function, before it is called.
+
+    Args:
+        kind: See `resolve`.
+        reference: The reference, for messages.
+        found: The object that it names.
+
+    Raises:
+        ReferenceFormError: If it does not.
+    """
+    base = _base_of(kind)
+    if isinstance(found, type) and not issubclass(found, base):
+        raise ReferenceFormError(
+            f'"{_place_of(reference)}" is a class that is not derived from {base.__name__}, so it '
+            f"is no {kind}."
+        )
+    if not callable(found) and not isinstance(found, base):
+        raise ReferenceFormError(f'"{reference}" is a {type(found).__name__}, which is no {kind}.')
+
+
+def _base_of(kind: str) -> type[Any]:
+    from physx_core import components
+    from physx_core.simulation import Backend
+
+    if kind == "backend":
+        return Backend
+    name = "Observer" if kind == "visualizer" else kind.title()
+    base: type[Any] = getattr(components, name)
+    return base
+
+
+# References in files ------------------------------------------------------------------------
+
+
+def check_recorded(
+    kind: str, file: object, reference: Any, arguments: Any, advice: str, *, trust: bool
+) -> None:
+    """Check that a file names components of installed plugins only, in arguments, too.
+
+    Any text with a colon may name code, as in ``"module:Class"``.
+
+    Args:
+        kind: Kind of the component.
+        file: Path of the file.
+        reference: The reference in the file; None: the user named the component.
+        arguments: Its keyword arguments in the file.
+        advice: How the user names the component instead.
+        trust: Whether the user trusts the file; then it may also name classes.
+
+    Raises:
+        UntrustedReferenceError: If it names anything else.
+    """
+    if trust:
+        is_code = isinstance(reference, str) and ":" in reference
+        if is_code and not isinstance(find(kind, reference), type):
+            raise UntrustedReferenceError(
+                f'{file} names "{reference}", which is no class. A function is not taken from a '
+                f"file, even if you trust it. Name it yourself: {advice}."
+            )
+        return
+    for where, text in _texts((kind, reference), (f"{kind}_kwargs", arguments)):
+        if ":" in text:
+            raise UntrustedReferenceError(
+                f'{file} has {where} = "{text:.200}", which may be any code. A file may only name '
+                'components of installed plugins, as in "plugin/name". If you know this one, name '
+                f"it yourself: {advice}. If you trust everything that the file names: --trust (in "
+                "Python trust=True)."
+            )
+
+
+def _texts(*values: tuple[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield all texts in nested plain data, each with the place where it is."""
+    left = list(values)
+    for _ in range(_MOST_VALUES):
+        if not left:
+            return
+        where, value = left.pop()
+        if isinstance(value, str):
+            yield where, value
+        elif isinstance(value, Mapping):
+            left += [(f"{where}.{key}", item) for key, item in value.items()]
+        elif isinstance(value, (list, tuple)):
+            left += [(where, item) for item in value]
+    raise UntrustedReferenceError(
+        f"{values[0][0]}_kwargs in a file have more than {_MOST_VALUES} values. If that is right: "
+        "--trust (in Python trust=True)."
+    )
+
+
+def is_recorded_as(given: Any, recorded: Any) -> bool:
+    """Return whether a component that the user named is the one that a file names.
+
+    Scripts and modules may lie elsewhere by now, so of ``"module:Class"`` only the class counts.
+    """
+    texts = [_place_of(given), _place_of(recorded)]
+    if not all(":" in text for text in texts):
+        return texts[0] == texts[1]
+    return texts[0].rpartition(":")[2] == texts[1].rpartition(":")[2]
+
+
+def _place_of(component: Any) -> str:
+    if isinstance(component, type):
+        return f"{component.__module__}:{component.__qualname__}"
+    return str(component)
+
+
+def find(kind: str, reference: Any) -> Any:
+    """Return the object that a reference names, of whatever type it is; see `resolve`."""
+    if kind not in KINDS:
+        raise ReferenceFormError(f'"{kind}" is not a kind of component: {", ".join(KINDS)}.')
     if not isinstance(reference, str):
         if isinstance(reference, type):
             return reference

@@ -95,6 +95,19 @@ def shape_of_object(thing: WorldObject) -> CollisionShape:
 
 def moments(shape: CollisionShape, mass: float) -> Vector:
     """Return the principal moments of inertia of a solid body, shape (3,), in kg m²."""
+    try:
+        found = _moments(shape, mass)
+    except (OverflowError, ZeroDivisionError):
+        found = np.full(3, math.inf)
+    if not ((found > 0) & np.isfinite(found)).all():
+        raise ModelError(
+            f'Object "{shape.body}" of {mass} kg has the size {shape.size} in m: its moments of '
+            "inertia cannot be represented as numbers."
+        )
+    return found
+
+
+def _moments(shape: CollisionShape, mass: float) -> Vector:
     if shape.kind == "sphere":
         return np.full(3, 0.4 * mass * shape.size[0] ** 2)
     if shape.kind in ("capsule", "cylinder"):

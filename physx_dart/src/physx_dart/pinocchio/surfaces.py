@@ -81,7 +81,8 @@ class Heights(Surface):
         grid = (points[:, :2] - self.field.corner()) / spacing
         last = np.array(heights.shape) - 1
         outside = ((grid < 0) | (grid > last)).any(axis=1)
-        cell = np.clip(np.floor(grid), 0, last - 1).astype(np.intp)
+        # A state that is not finite has distances that are not either, and is reported by the step.
+        cell = np.clip(np.floor(np.nan_to_num(grid)), 0, last - 1).astype(np.intp)
         x, y = (grid - cell).T
         i, j = cell.T
         low, high = heights[i, j], heights[i + 1, j + 1]

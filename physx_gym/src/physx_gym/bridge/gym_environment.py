@@ -11,7 +11,7 @@ import numpy as np
 from physx_core import Field
 from physx_core.components import Environment
 from physx_core.errors import ConfigError
-from physx_core.plugins import resolve
+from physx_core.plugins import import_component
 from physx_gym.bridge.make_env import make_env
 from physx_gym.bridge.policy import single_action
 from physx_gym.spaces import SpaceFields
@@ -122,7 +122,7 @@ class GymEnvironment(Environment):
                 f'policy is "{policy}" but must be "random", "network" or '
                 '"package.module:function".'
             )
-        found: Callable[[Any], Any] = resolve("environment", policy)
+        found: Callable[[Any], Any] = import_component("policy", policy)
         return found
 
     def _ask_network(self, observation: Any) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 
 from physx_core.errors import ConfigError, nearest
-from physx_core.plugins import resolve
+from physx_core.plugins import import_component
 
 
 def make_env(env: str, options: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
@@ -22,7 +22,10 @@ def make_env(env: str, options: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
     """
     _, colon, name = env.rpartition(":")
     if colon and name.replace(".", "").isidentifier():
-        made = resolve("environment", env)(**options)
+        make = import_component("environment", env)
+        if isinstance(make, type) and not issubclass(make, gymnasium.Env):
+            raise ConfigError(f"{env} is a class that is not derived from gymnasium.Env.")
+        made = make(**options)
         if not isinstance(made, gymnasium.Env):
             raise ConfigError(f"{env} returned a {type(made).__name__}, not a gymnasium.Env.")
         return made

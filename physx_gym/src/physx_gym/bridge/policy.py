@@ -35,6 +35,7 @@ class Policy:
         env: gymnasium.Env[Any, Any] | gymnasium.vector.VectorEnv[Any, Any, Any],
         *,
         network: NetworkConfig | None = None,
+        trust: bool = False,
     ) -> None:
         """Load the network.
 
@@ -42,12 +43,13 @@ class Policy:
             session: Folder of the session that trained it, or of its checkpoints.
             env: Environment for whose spaces it is.
             network: Which checkpoint to load, and other changes; None: the last one.
+            trust: Whether to import whatever the checkpoint names; see `load_learner`.
 
         Raises:
             CheckpointError: If there is no checkpoint, or it is damaged.
             ConfigError: If the network reads a field that the observation does not have.
         """
-        self._learner = load_learner(session, network)
+        self._learner = load_learner(session, network, trust=trust)
         if isinstance(env, gymnasium.vector.VectorEnv):
             self._many = True
             observed, acted = env.single_observation_space, env.single_action_space

@@ -25,6 +25,9 @@ class ShowLog:
     """Write a plot of the columns of all files to this file."""
     replay: str | None = None
     """Write a recording of all episodes, side by side, for the viewer to this file (.rrd)."""
+    backend: str | None = None
+    """Engine that provides the robots of the replay; by default that of each log, which may only
+    name one of an installed plugin."""
 
 
 def run(words: Sequence[str]) -> None:
@@ -39,7 +42,8 @@ def run(words: Sequence[str]) -> None:
     if options.replay is not None:
         from physx_gym.show.replaying import replay
 
-        print(f"recording: {replay(logs, path=options.replay)}")
+        written = replay(logs, path=options.replay, backend=options.backend)
+        print(f"recording: {written}")
     if options.plot is None and options.replay is None:
         for log in logs:
             _print_table(log, options.columns)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from typing import Any
 
 from physx_core.config import read_toml
 from physx_core.errors import ConfigError, ConfigFileError
+from physx_core.parsing import parse_json
 from physx_gym.blocks.block import ControllerBlock, ObserverBlock
 from physx_gym.env.layers.block_layers import ControlledEnv, ObservedEnv
 from physx_gym.pipeline.tables import build, check_table, find, find_environment
@@ -111,10 +111,10 @@ def load_pipeline(path: str | Path) -> Recipe:
 
 def _read_json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parse_json(path.read_bytes())
     except FileNotFoundError:
         raise ConfigFileError(f"There is no configuration file {path}.") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ConfigFileError(f"{path} is not valid JSON: {error}.") from None
 
 

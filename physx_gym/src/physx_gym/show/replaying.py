@@ -138,7 +138,7 @@ def _backend(log: Log, given: Any) -> Backend:
     if not is_told and not (isinstance(reference, str) and ":" not in reference):
         raise LogError(
             f"The log {log.path} is of the engine {reference!r}, which is not an installed plugin. "
-            'If you trust it, name it: replay(..., backend="...").'
+            'If you trust it, name it: --backend REFERENCE (in Python replay(..., backend="...")).'
         )
     found: Backend = plugins.resolve("backend", reference)
     return found

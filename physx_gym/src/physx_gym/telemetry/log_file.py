@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from physx_core.errors import LogError
+from physx_core.parsing import parse_json
 from physx_gym.telemetry.episode_log import FORMAT, TIME, VERSION, Column, Log
 
 _NAMES_WIDTH = 4096
@@ -86,7 +86,7 @@ class _Reader:
         version = self._file.attrs.get("version")
         if version != VERSION:
             raise self._error(f"has the version {version}; this physx reads version {VERSION}")
-        constants = json.loads(self._values(self._file, "constants", "u1", 1).tobytes())
+        constants = parse_json(self._values(self._file, "constants", "u1", 1).tobytes())
         if not isinstance(constants, dict):
             raise self._error("has constants that are not a dictionary")
         variables: dict[str, Column] = {}

@@ -10,7 +10,7 @@ from inspect import isabstract
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from physx_core.errors import ConfigError, RemoteError, UnknownOptionError, listed, nearest
-from physx_core.plugins import resolve
+from physx_core.plugins import find
 
 if TYPE_CHECKING:
     import gymnasium
@@ -104,7 +104,7 @@ def find_protocol(reference: str | type[Protocol]) -> type[Protocol]:
         module, _, name = PROTOCOLS[reference].partition(":")
         found = getattr(import_module(module), name)
     else:
-        found = resolve("environment", reference)
+        found = find("environment", reference)
     if not (isinstance(found, type) and issubclass(found, Protocol)) or isabstract(found):
         raise ConfigError(
             f"{reference} is not a protocol: it must be a subclass of physx_remote.Protocol that "

@@ -11,7 +11,7 @@ import gymnasium
 from physx_core import Closeable, PhysxError
 from physx_core.components import Environment
 from physx_core.errors import ComponentNotFoundError, ConfigError, UsageError
-from physx_core.plugins import available, load, resolve
+from physx_core.plugins import available, find, load
 from physx_remote.serving.sample_env import SampleEnv
 
 _PLUGIN = "gym"
@@ -174,7 +174,7 @@ def open_worlds(
         ConfigError: If an environment does not take the arguments.
         UsageError: If several worlds of one existing environment are requested, or a function
             returns something else than an environment.
-        PhysxError: If the reference cannot be resolved: see `physx_core.plugins.resolve`.
+        PhysxError: If the reference cannot be resolved: see `physx_core.plugins.find`.
     """
     if type(num_worlds) is not int or num_worlds < 1:
         raise ConfigError(f"num_worlds is {num_worlds!r} but must be an integer of at least 1.")
@@ -208,7 +208,7 @@ def _make_world(
     if isinstance(environment, str):
         if is_gymnasium_id(environment):
             return _make_gymnasium(environment.removeprefix(_PREFIX), arguments)
-        environment = resolve("environment", environment)
+        environment = find("environment", environment)
     if isinstance(environment, type) and issubclass(environment, Environment):
         return SampleEnv(environment, **arguments, instance_id=number + 1, instance_nb=num_worlds)
     if not callable(environment):

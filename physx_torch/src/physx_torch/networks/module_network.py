@@ -58,7 +58,8 @@ class ModuleNetwork(TorchNetwork):
         }
         chosen = choose("module", module, {})
         given = [name for name, value in names.items() if value is not None]
-        made = make("module", chosen, **_module_arguments(chosen, given, module_kwargs, arguments))
+        kwargs = _module_arguments(chosen, given, module_kwargs, arguments)
+        made = make("module", torch.nn.Module, chosen, **kwargs)
         if not isinstance(made, torch.nn.Module):
             raise ConfigError(f"{module!r} returned {type(made).__name__}, not a torch.nn.Module.")
         if isinstance(made, TorchNetwork):

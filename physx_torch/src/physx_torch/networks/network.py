@@ -22,7 +22,7 @@ from physx_core.errors import (
 from physx_core.typing import Array, Batch, Tensors
 from physx_torch.devices import find_device
 from physx_torch.parallel import join_group
-from physx_torch.storage.parameters import check_match, read_tensors, write_tensors
+from physx_torch.storage.parameters import check_match, read_shapes, read_tensors, write_tensors
 
 DATA_TYPES = {"float32": torch.float32, "float64": torch.float64}
 """Floating types that a network can compute in, by name."""
@@ -91,6 +91,21 @@ class TorchNetwork(torch.nn.Module, Network):
     def set_seed(cls, seed: int) -> None:
         """Seed torch's random numbers, those of every device."""
         torch.manual_seed(seed)
+
+    @classmethod
+    def check_arguments(cls, arguments: Mapping[str, Any], path: Path) -> None:
+        """Check arguments from a checkpoint against its parameters, before a network is created.
+
+        Raises:
+            CheckpointError: If the parameters are not those of such a network.
+        """
+        shapes = read_shapes(path)
+        try:
+            with torch.device("meta"):  # where tensors have no memory
+                made = cls(**arguments)
+        except RuntimeError:  # it needs the values of tensors; if it is invalid, this is seen later
+            return
+        check_match(path, cls.__name__, shapes, made._state())
 
     @classmethod
     def join_group(cls, device: str) -> Group:
@@ -237,9 +252,8 @@ class TorchNetwork(torch.nn.Module, Network):
             CheckpointError: If the file is missing, damaged or of another architecture; the network
                 is not changed then.
         """
-        tensors, _ = read_tensors(path)
-        check_match(path, type(self).__name__, tensors, self._state())
-        self.load_state_dict(tensors)
+        check_match(path, type(self).__name__, read_shapes(path), self._state())
+        self.load_state_dict(read_tensors(path)[0])
 
     def _state(self) -> dict[str, Any]:
         """Return parameters, buffers and extra states, without other entries of the state."""

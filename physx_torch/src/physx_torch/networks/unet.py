@@ -25,6 +25,7 @@ Modules = list[torch.nn.Module]
 
 GROUPS = 8
 """Largest number of groups of channels for group normalization."""
+_MOST_STEPS = 16
 NORMALIZATIONS = ("none", "batch", "group")
 
 
@@ -266,6 +267,7 @@ def _check_numbers(inputs: Any, outputs: Any, first_layer: Any, steps: Any) -> N
     numbers = {f"nb_{name}_channels": value for name, value in channels.items()}
     for name, value in {**numbers, "nb_steps": steps}.items():
         _check(name, value, _positive(value), "a positive integer")
+    _check("nb_steps", steps, steps <= _MOST_STEPS, f"at most {_MOST_STEPS}")
 
 
 def _check_options(nb_dims: Any, normalization: Any, border_mode: Any, data_scale: Any) -> None:

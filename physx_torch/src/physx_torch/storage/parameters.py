@@ -54,6 +54,20 @@ def _system_error(error: Exception) -> Exception:
     return OSError(int(number[1]), os.strerror(int(number[1]))) if number else error
 
 
+def read_shapes(path: Path) -> dict[str, torch.Size]:
+    """Return the shapes of the tensors in a safetensors file, which are not read."""
+    if not path.is_file():
+        raise CheckpointError(f"There is no file {path}.")
+    try:
+        with safetensors.safe_open(path, framework="pt") as file:
+            return {
+                name: torch.Size(file.get_slice(name).get_shape())
+                for name in file.keys()  # noqa: SIM118
+            }
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path} is damaged or not a safetensors file: {error}.") from error
+
+
 def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
     """Return the tensors, on the processor, and the metadata of a safetensors file."""
     if not path.is_file():
@@ -67,21 +81,23 @@ def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
         raise CheckpointError(f"{path} is damaged or not a safetensors file: {error}.") from error
 
 
-def check_match(path: Path, name: str, found: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+def check_match(
+    path: Path, name: str, found: Mapping[str, torch.Size], own: Mapping[str, Any]
+) -> None:
     """Check that the tensors of a file fit a network, by name and shape.
 
     Args:
         path: The file, for the message.
         name: The network's name, for the message.
-        found: Tensors of the file.
+        found: Shapes of the tensors of the file.
         own: Tensors of the network.
     """
     lines = [f"{key}: not in the file" for key in own if key not in found]
     lines += [f"{key}: only in the file" for key in found if key not in own]
     lines += [
-        f"{key}: {tuple(found[key].shape)} in the file, {tuple(own[key].shape)} in the network"
+        f"{key}: {tuple(found[key])} in the file, {tuple(own[key].shape)} in the network"
         for key in own
-        if key in found and found[key].shape != own[key].shape
+        if key in found and found[key] != own[key].shape
     ]
     if lines:
         raise CheckpointError(

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from physx_core.errors import CheckpointError
+from physx_core.parsing import parse_json
 from physx_torch.storage.parameters import read_tensors, write_tensors
 
 _KEY = "state"
@@ -26,8 +27,8 @@ def read_state(path: Path) -> dict[str, Any]:
     """Return the state that `write_state` wrote, with tuples as lists."""
     tensors, texts = read_tensors(path)
     try:
-        state: dict[str, Any] = _join(json.loads(texts[_KEY]), tensors)
-    except (KeyError, TypeError, ValueError) as error:
+        state: dict[str, Any] = _join(parse_json(texts[_KEY]), tensors)
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{path} does not contain the state of an optimization.") from error
     return state
 

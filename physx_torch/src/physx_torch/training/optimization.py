@@ -117,7 +117,7 @@ class TorchOptimization(Optimization):
             raise ConfigError('A training needs a loss, for example loss="MSELoss".')
         chosen = choose("loss", loss, known)
         if isinstance(chosen, type):
-            chosen = make("loss", chosen, **self._loss_kwargs)
+            chosen = make("loss", object, chosen, **self._loss_kwargs)
         elif self._loss_kwargs:
             raise ConfigError(f"loss_kwargs needs a loss that is a class, not {chosen!r}.")
         if not callable(chosen):
@@ -151,7 +151,7 @@ class TorchOptimization(Optimization):
             raise ConfigError(f"{type(network).__name__} is not a TorchNetwork.")
         chosen = choose("optimizer", optimizer, find_classes(torch.optim, torch.optim.Optimizer))
         trained = [p for p in network.parameters() if p.requires_grad]
-        made = make("optimizer", chosen, trained, **kwargs)
+        made = make("optimizer", torch.optim.Optimizer, chosen, trained, **kwargs)
         if not isinstance(made, torch.optim.Optimizer):
             raise ConfigError(f"{optimizer!r} returned {type(made).__name__}, not an optimizer.")
         closure = inspect.signature(made.step).parameters.get("closure")
@@ -196,7 +196,7 @@ class TorchOptimization(Optimization):
         if self.optimizer is None:
             raise UsageError("set_scheduler() needs set_optimizer() before it.")
         chosen = choose("scheduler", scheduler, find_classes(torch.optim.lr_scheduler, LRScheduler))
-        made = make("scheduler", chosen, self.optimizer, **kwargs)
+        made = make("scheduler", LRScheduler, chosen, self.optimizer, **kwargs)
         if not isinstance(made, LRScheduler):
             raise ConfigError(f"{scheduler!r} returned {type(made).__name__}, not a scheduler.")
         self.scheduler = made

@@ -31,6 +31,10 @@ class ExportNetwork:
     """Name of the checkpoints in the session, if there are several names."""
     which_network: int = -1
     """Number of the checkpoint; -1: the last."""
+    network: Annotated[str | None, tyro.conf.arg(name="network.network")] = None
+    """The network's reference, if it is no component of an installed plugin."""
+    trust: bool = False
+    """Import whatever the checkpoint names, which can be any code."""
 
 
 def run(words: Sequence[str]) -> None:
@@ -38,7 +42,8 @@ def run(words: Sequence[str]) -> None:
     options = tyro.cli(ExportNetwork, args=words, prog="physx export-network")
     place = Path(options.directory)
     path = checkpoint.find(place, options.network_name, options.which_network).path
-    learner = load_learner(path, NetworkConfig(device="cpu"))
+    config = NetworkConfig(options.network, device="cpu")
+    learner = load_learner(path, config, trust=options.trust)
     file = Path(options.output) if options.output else place / f"{path.name}.{options.to}"
     learner.export(file, options.to)
     network = learner.network

@@ -1,4 +1,4 @@
-"""``physx import``: import an npz or HDF5 file as a dataset."""
+"""``physx import``: import an npz or HDF5 file, or a DeepPhysX dataset."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ class Import:
     """
 
     file: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE")]
-    """A NumPy archive (npz) or an HDF5 file."""
+    """A NumPy archive (npz), an HDF5 file, a DeepPhysX database, or the folder of a DeepPhysX
+    dataset or session."""
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
     """The dataset's folder; rows are added to an existing dataset with these fields."""
     mode: str | None = None
@@ -30,6 +31,9 @@ class Import:
     By default the modes of the file, or else training."""
     fields: tuple[str, ...] = ()
     """Arrays to import; by default all."""
+    max_bytes: int | None = None
+    """How many bytes the arrays may have; by default 100 times the size of the file, and at least
+    0.27 GB."""
 
 
 def run(words: Sequence[str]) -> None:
@@ -43,6 +47,7 @@ def run(words: Sequence[str]) -> None:
             options.directory,
             mode=options.mode,
             fields=options.fields,
+            max_bytes=options.max_bytes,
             advance=bar.advance,
         )
     finally:

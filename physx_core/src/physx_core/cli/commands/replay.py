@@ -53,9 +53,16 @@ def _visualizer_plugins() -> list[str]:
 def _given(words: Sequence[str], plain: dict[str, Any]) -> dict[str, Any]:
     """Return default options of the environment: `plain`, and those recorded in the dataset."""
     named = list(itertools.takewhile(lambda word: not word.startswith("-"), words))
-    if len(named) == 1 and "--environment.environment" not in words:
+    environment = named[1] if len(named) > 1 else _value(words, "--environment.environment")
+    if named:
         with Dataset.open(named[0]) as dataset:
-            plain |= recorded_environment(dataset)
-    elif len(named) < 2 and "--environment.environment" not in words:
+            plain |= recorded_environment(dataset, environment, trust="--trust" in words)
+    elif environment is None:
         return {}
+    plain.pop("environment" if environment else "", None)
     return {"environment": plain}
+
+
+def _value(words: Sequence[str], option: str) -> str | None:
+    """Return the word after an option."""
+    return words[words.index(option) + 1] if option in words[:-1] else None

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
+import math
 from collections.abc import Iterator, Sequence
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,10 @@ COMPRESSIONS = {"none": None, "gzip": "gzip", "lzf": "lzf"}
 _CHUNK = 2**20
 _ATTRIBUTE = 60000
 """Bytes that fit into an attribute."""
+_MOST_ITEMS = 10_000
+_LARGEST_CHUNK = 2**28
+_UNREADABLE = (OSError, RuntimeError, KeyError, TypeError, ValueError)
+"""What HDF5 raises for a file that is damaged or holds types that NumPy does not have."""
 
 
 def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
@@ -90,6 +96,8 @@ def _write_field(group: Any, table: Table, name: str, compression: str | None, s
 class Hdf5Column:
     """A dataset of an HDF5 file; see `Column`."""
 
+    problem = ""
+
     def __init__(self, place: str, dataset: Any) -> None:
         self.shape: tuple[int, ...] = dataset.shape or ()
         self.dtype: np.dtype[Any] = dataset.dtype
@@ -107,44 +115,61 @@ class Hdf5Column:
 
 
 @contextlib.contextmanager
-def open_columns(path: Path) -> Iterator[tuple[dict[str, Column], Notes]]:
-    """Open a file; yield its datasets by their paths, and the notes in its attributes."""
+def open_columns(path: Path, limit: int) -> Iterator[tuple[dict[str, Column], Notes]]:
+    """Open a file; yield its datasets by their paths, and the notes in its attributes.
+
+    What the datasets say about their size is checked when they are chosen.
+    """
     import h5py
 
     with contextlib.ExitStack() as files:
         try:
             file = files.enter_context(h5py.File(path, "r"))
-            columns = _columns(path, file, "", set())
+            columns = dict(_columns(path, file, "", set(), itertools.count()))
             notes = Notes.parse(file.attrs.get("physx", "{}"))
-        except (OSError, RuntimeError, KeyError) as error:
+        except ExchangeError:
+            raise
+        except _UNREADABLE as error:
             raise ExchangeError(f"{path} cannot be read as HDF5: {error}.") from error
         yield columns, notes
 
 
-def _columns(path: Path, group: Any, prefix: str, seen: set[Any]) -> dict[str, Column]:
-    """Return the datasets below a group; what leads out of the file is rejected, not followed."""
+def _columns(
+    path: Path, group: Any, prefix: str, seen: set[Any], items: Iterator[int]
+) -> Iterator[tuple[str, Column]]:
+    """Yield the datasets below a group; what leads out of the file is rejected, not followed."""
     import h5py
 
-    columns: dict[str, Column] = {}
     for name in group:
         place = f'"{prefix}{name}" of {path}'
+        if next(items) == _MOST_ITEMS:  # groups that contain each other may be few
+            raise ExchangeError(f"{path} has more than {_MOST_ITEMS} datasets and groups.")
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):
             raise ExchangeError(f"{place} is a link, and links are not followed.")
         item = group[name]
         if isinstance(item, h5py.Dataset):
-            if _is_external(item):
-                raise ExchangeError(f"{place} stores its values in files of another folder.")
-            columns[f"{prefix}{name}"] = Hdf5Column(place, item)
+            _check_storage(place, item)
+            yield f"{prefix}{name}", Hdf5Column(place, item)
         elif isinstance(item, h5py.Group):
             address = h5py.h5o.get_info(item.id).addr
             if address in seen:
                 raise ExchangeError(f"{place} is a group that contains itself.")
-            columns |= _columns(path, item, f"{prefix}{name}/", {*seen, address})
-    return columns
+            yield from _columns(path, item, f"{prefix}{name}/", {*seen, address}, items)
 
 
-def _is_external(dataset: Any) -> bool:
+def _check_storage(place: str, dataset: Any) -> None:
+    """Check that the values are in the file itself, in pieces that fit into memory."""
     if dataset.is_virtual:
-        names = [source.file_name for source in dataset.virtual_sources()]
-        return any(PurePath(name).name != name for name in names)
-    return bool(dataset.external)
+        raise ExchangeError(
+            f"{place} is virtual: its values are those of other files, which are not followed. "
+            "Import these files; of a physx dataset, give its folder to Dataset.merge."
+        )
+    if dataset.external:
+        raise ExchangeError(f"{place} stores its values in other files, which are not followed.")
+    if dataset.chunks is not None:
+        nbytes = math.prod(dataset.chunks) * dataset.dtype.itemsize
+        if nbytes > _LARGEST_CHUNK:
+            raise ExchangeError(
+                f"{place} is stored in chunks of {nbytes} bytes, more than {_LARGEST_CHUNK}: write "
+                "it again with smaller chunks (h5repack)."
+            )

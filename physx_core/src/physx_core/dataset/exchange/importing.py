@@ -1,8 +1,9 @@
-"""Imports rows of a NumPy archive or an ordinary HDF5 file into a dataset."""
+"""Imports rows of a NumPy archive, an ordinary HDF5 file, or a DeepPhysX dataset."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -10,17 +11,25 @@ from pathlib import Path
 
 from physx_core.config import MODES
 from physx_core.dataset.dataset import Dataset
-from physx_core.dataset.exchange import hdf5_format, npz_format
-from physx_core.dataset.exchange.table import BLOCK, Advance, Column, Notes
+from physx_core.dataset.exchange import deepphysx_format, hdf5_format, npz_format
+from physx_core.dataset.exchange.table import BLOCK, Advance, Column, Notes, check_size
 from physx_core.dataset.repair.recovery import holds_dataset
 from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.errors import ExchangeError, SampleError, listed
 from physx_core.fields import Field
 
-_READERS = {b"PK": npz_format.open_columns, b"\x89HDF\r\n\x1a\n": hdf5_format.open_columns}
+_READERS = {
+    b"PK": npz_format.open_columns,
+    b"\x89HDF\r\n\x1a\n": hdf5_format.open_columns,
+    b"SQLite f": deepphysx_format.open_columns,
+}
 """The first bytes of a file, regardless of its name, to the function that opens it."""
 
 _SESSION = "import"
+_ALWAYS = 2**28
+_RATIO = 100
+"""How many times larger than a file what it holds may be, beyond `_ALWAYS` bytes."""
+_LEAST_ROW = 8
 
 Columns = dict[str, Column]
 
@@ -31,6 +40,7 @@ def import_file(
     *,
     mode: str | None = None,
     fields: Sequence[str] = (),
+    max_bytes: int | None = None,
     advance: Advance = lambda nbytes: None,
 ) -> dict[str, int]:
     """Store the arrays of a file as fields of a dataset, block by block.
@@ -40,24 +50,30 @@ def import_file(
     files that physx wrote, become modes themselves.
 
     Args:
-        path: A NumPy archive (npz) or an HDF5 file, of any name.
+        path: A NumPy archive (npz), an HDF5 file or a DeepPhysX database, of any name; or the
+            folder of a DeepPhysX dataset or session.
         directory: The dataset's folder. The rows are added to an existing dataset.
         mode: Mode for the rows, regardless of the mode in the file; of a file with several modes,
             the one to import. None: the modes that the file names, or else ``training``.
         fields: Names of the arrays to import, as in the file; empty: all of them.
+        max_bytes: How many bytes the arrays may have, because a small file can unpack to any size;
+            None: 100 times the size of the file, and at least 0.27 GB.
         advance: Is called with the number of bytes stored.
 
     Returns:
         How many rows were added to each mode.
 
     Raises:
-        ExchangeError: If the file is missing or damaged, or does not hold arrays of one length.
+        ExchangeError: If the file is missing or damaged, does not hold arrays of one length, or
+            holds more than `max_bytes`.
         SampleError: If a value is NaN or infinite.
         DatasetError: If the dataset has other fields, or cannot be written.
     """
     path, directory = Path(path), Path(directory)
-    with _reader(path)(path) as (columns, notes):
+    limit = max(_ALWAYS, _RATIO * _size_of(path)) if max_bytes is None else max_bytes
+    with _reader(path)(path, limit) as (columns, notes):
         chosen = _choose(path, columns, fields)
+        check_size(path, sum(map(_size_of_column, chosen.values())), limit)
         modes = _arrange(path, chosen, notes, mode)
         tables = {name: _make_fields(path, name, found, notes) for name, found in modes.items()}
         with _open_target(directory) as dataset:
@@ -69,8 +85,29 @@ def import_file(
             }
 
 
-def _reader(path: Path) -> Callable[[Path], AbstractContextManager[tuple[Columns, Notes]]]:
+def _size_of(path: Path) -> int:
+    """Return the bytes of a file, or of those in a folder."""
+    try:
+        files = [path, *(path.iterdir() if path.is_dir() else ())]
+        return sum(file.lstat().st_size for file in files)
+    except OSError:  # the reader reports it
+        return 0
+
+
+def _size_of_column(column: Column) -> int:
+    rows, *shape = column.shape
+    return rows * max(_LEAST_ROW, math.prod(shape) * column.dtype.itemsize)
+
+
+def _reader(path: Path) -> Callable[[Path, int], AbstractContextManager[tuple[Columns, Notes]]]:
     """Return the function that opens a file of this kind."""
+    if path.is_dir():
+        if deepphysx_format.find_folder(path) is None:
+            raise ExchangeError(
+                f"{path} is a folder without partitions of DeepPhysX. Give a file; rows of another "
+                "physx dataset are added with Dataset.merge."
+            )
+        return deepphysx_format.open_columns
     if not path.is_file():
         raise ExchangeError(f"There is no file {path}.")
     try:
@@ -81,7 +118,9 @@ def _reader(path: Path) -> Callable[[Path], AbstractContextManager[tuple[Columns
     for signature, reader in _READERS.items():
         if begin.startswith(signature):
             return reader
-    raise ExchangeError(f"{path} is neither a NumPy archive (npz) nor an HDF5 file.")
+    raise ExchangeError(
+        f"{path} is neither a NumPy archive (npz) nor an HDF5 file nor a DeepPhysX database."
+    )
 
 
 @contextlib.contextmanager
@@ -112,6 +151,8 @@ def _choose(path: Path, columns: Columns, names: Sequence[str]) -> Columns:
         raise ExchangeError(f"{path} has {wanted}. It has: {listed(columns)}.")
     chosen = {name: columns[name] for name in names} if names else columns
     for name, column in chosen.items():
+        if column.problem:
+            raise ExchangeError(column.problem)
         if column.dtype.kind not in "biufc" or not column.shape:
             what = "no rows" if not column.shape else str(column.dtype)
             raise ExchangeError(

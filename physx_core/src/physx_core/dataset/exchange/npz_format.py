@@ -6,7 +6,9 @@ The archive's comment holds units, roles and modes; `numpy.load` ignores it.
 from __future__ import annotations
 
 import contextlib
+import io
 import math
+import sys
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
@@ -16,12 +18,21 @@ from typing import IO
 import numpy as np
 from numpy.lib import format as npy
 
-from physx_core.dataset.exchange.table import Column, ExportOptions, Notes, Table, encode_notes
+from physx_core.dataset.exchange.table import (
+    Column,
+    ExportOptions,
+    Notes,
+    Table,
+    check_size,
+    encode_notes,
+)
 from physx_core.errors import ExchangeError
 from physx_core.typing import Array
 
 COMPRESSIONS = {"none": zipfile.ZIP_STORED, "deflate": zipfile.ZIP_DEFLATED}
 _COMMENT = 2**16 - 1
+_MOST_LISTED = 2**22
+"""Bytes of an archive's list of contents."""
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 
 
@@ -53,6 +64,7 @@ class NpzColumn:
     """An array of an archive, read from its beginning to its end; see `Column`."""
 
     unit = ""
+    problem = ""
 
     def __init__(self, path: Path, name: str, file: IO[bytes], size: int) -> None:
         """Read the array's header.
@@ -97,13 +109,33 @@ class NpzColumn:
         return content
 
 
+class _ArchiveFile(io.FileIO):
+    """The file of an archive; nothing longer than `longest` bytes is read from it at once."""
+
+    longest = _MOST_LISTED
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return the next bytes."""
+        if size is not None and size > self.longest:
+            raise zipfile.BadZipFile(f"its list of contents has {size} bytes")
+        return super().read(size) or b""
+
+
 @contextlib.contextmanager
-def open_columns(path: Path) -> Iterator[tuple[dict[str, Column], Notes]]:
-    """Open an archive; yield its arrays by name, and the notes in its comment."""
+def open_columns(path: Path, limit: int) -> Iterator[tuple[dict[str, Column], Notes]]:
+    """Open an archive; yield its arrays by name, and the notes in its comment.
+
+    Args:
+        path: The archive.
+        limit: How many bytes it may unpack to.
+    """
     columns: dict[str, Column] = {}
     with contextlib.ExitStack() as files:
         try:
-            archive = files.enter_context(zipfile.ZipFile(path))
+            source = files.enter_context(_ArchiveFile(path))
+            archive = files.enter_context(zipfile.ZipFile(source))
+            source.longest = sys.maxsize
+            check_size(path, sum(item.file_size for item in archive.infolist()), limit)
             damaged = archive.testzip()  # before anything of it is stored
             if damaged is not None:
                 raise zipfile.BadZipFile(f"{damaged} does not match its checksum")

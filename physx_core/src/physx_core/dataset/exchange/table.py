@@ -6,14 +6,16 @@ import importlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from physx_core.dataset.read.views import ModeView
 from physx_core.dataset.store.partition.segment import rows_per_block
-from physx_core.errors import ConfigError, MissingLibraryError
+from physx_core.errors import ConfigError, ExchangeError, MissingLibraryError
 from physx_core.fields import RESERVED, Field, Role
+from physx_core.parsing import parse_json
 from physx_core.typing import Array, Batch
 
 FORMAT = "physx export"
@@ -97,15 +99,26 @@ class Column(Protocol):
         shape: (rows, *field shape).
         dtype: Type of the values.
         unit: Their unit according to the file.
+        problem: Why it cannot be imported; empty if it can.
     """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     unit: str
+    problem: str
 
     def read(self, start: int, count: int) -> Array:
         """Return the next rows, those from `start` on."""
         ...
+
+
+def check_size(path: Path, nbytes: int, limit: int) -> None:
+    """Check that a file does not hold more than it may, before anything of it is read."""
+    if nbytes > limit:
+        raise ExchangeError(
+            f"{path} says that it holds {nbytes / 1e9:.3g} GB, far more than its own size. If that "
+            f"is right, import it with max_bytes={nbytes} (--max-bytes {nbytes})."
+        )
 
 
 def encode_notes(tables: Sequence[Table], limit: int | None = None) -> str:
@@ -140,7 +153,7 @@ class Notes:
     def parse(cls, text: str | bytes) -> Notes:
         """Return what `encode_notes` wrote; nothing from any other text."""
         try:
-            plain = json.loads(text)
+            plain = parse_json(text)
             if plain["format"] != FORMAT:
                 return cls()
             modes = {

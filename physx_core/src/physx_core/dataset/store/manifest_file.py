@@ -19,12 +19,13 @@ from physx_core.dataset.store.manifest import Manifest, Partition
 from physx_core.dataset.store.manifest_parsing import parse_manifest
 from physx_core.dataset.store.validation import whole
 from physx_core.errors import ConfigError, DatasetError
+from physx_core.parsing import parse_json
 
 FILE = "dataset.json"
 FORMAT = "physx dataset"
 VERSION = 1
 
-_LARGEST = 2**28
+_LARGEST = 2**27
 _END = re.compile(rb',\n "crc32": "([0-9a-f]{8})"\n\}\s*$')
 _END_NBYTES = 64
 _INVALID = (
@@ -68,7 +69,7 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
     except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error.strerror}.") from error
     try:
-        plain = json.loads(content)
+        plain = parse_json(content)
         if not isinstance(plain, dict) or plain.get("format") != FORMAT:
             raise ValueError("it does not claim to be one")
         version = whole(plain["format_version"], "the format's version")

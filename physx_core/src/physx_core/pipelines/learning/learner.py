@@ -13,10 +13,18 @@ from physx_core.components.network import Network
 from physx_core.components.optimization import Optimization
 from physx_core.components.transformation import Transformation
 from physx_core.config import NetworkConfig
-from physx_core.errors import ConfigError, MissingFieldError, UsageError, listed
+from physx_core.errors import (
+    CheckpointError,
+    ConfigError,
+    MissingFieldError,
+    PhysxError,
+    UsageError,
+    listed,
+)
 from physx_core.fields import Field
 from physx_core.plugins import import_component, resolve
 from physx_core.plugins.networks import resolve_network
+from physx_core.plugins.references import check_recorded, is_recorded_as
 from physx_core.statistics import Normalization
 from physx_core.typing import Array, Batch, Tensors
 
@@ -291,33 +299,87 @@ class Learner:
             optimization.load_state(found.path / optimization.state_file)
 
 
-def load_learner(folder: str | Path, config: NetworkConfig | None = None) -> Learner:
+def load_learner(
+    folder: str | Path, config: NetworkConfig | None = None, *, trust: bool = False
+) -> Learner:
     """Return the trained network of a session, ready to predict.
+
+    A checkpoint may only name components of installed plugins. Any other network, such as a class
+    of your own, is named in `config`; if it is the one of the checkpoint, and no arguments are
+    given, it gets those of the checkpoint.
 
     Args:
         folder: The session's folder, that of its checkpoints, or that of one checkpoint.
         config: The checkpoint to load, and options that replace its own; None: the last one.
+        trust: Whether to import whatever the checkpoint names. That can be any code.
 
     Raises:
         CheckpointError: If there is no checkpoint, or it is damaged or of another network.
+        UntrustedReferenceError: If it names other code, which is neither trusted nor named in
+            `config`.
         FieldsMismatchError: If the network reads other fields.
     """
     config = config or NetworkConfig()
     place = Path(config.network_dir or folder)
     found = checkpoint.find(place, config.network_name, config.which_network)
-    kept = dict(found.network)
-    if config.network is not None:
-        kept |= {"network": config.network, "network_kwargs": config.network_kwargs}
-    if config.transformation is not None:
-        kept |= {
-            "transformation": config.transformation,
-            "transformation_kwargs": config.transformation_kwargs,
-        }
-    learner = Learner(dataclasses.replace(config, **kept), trains=False)
+    chosen = {"data_type": found.network.get("data_type", config.data_type)}
+    for kind in ("network", "transformation"):
+        chosen |= _choose(kind, found, config, trust)
+    learner = _create_learner(dataclasses.replace(config, **chosen), found, config.network is None)
+    used, recorded = learner.config.transformation, found.network.get("transformation")
+    if config.transformation is None and recorded and not is_recorded_as(used, recorded):
+        _check("transformation", found, recorded, {}, trust)
     learner.bind(found.fields, found.normalization)
     learner.load_parameters(found)
     learner.network.set_eval()
     return learner
+
+
+def _create_learner(config: NetworkConfig, found: checkpoint.Checkpoint, recorded: bool) -> Learner:
+    """Create the components of a checkpoint.
+
+    Args:
+        config: The components and their arguments.
+        found: The checkpoint.
+        recorded: Whether the network is the checkpoint's choice, not the user's.
+    """
+    if not recorded:
+        return Learner(config, trains=False)
+    try:
+        make, arguments = resolve_network(config.network, config.network_kwargs)
+        if isinstance(make, type) and issubclass(make, Network):
+            make.check_arguments(arguments, found.path / make.parameters_file)
+        return Learner(config, trains=False)
+    except PhysxError:
+        raise
+    except Exception as error:  # whatever a component raises for arguments of a damaged file
+        raise CheckpointError(
+            f'{found.path / checkpoint.DESCRIPTION} describes no "{config.network}" that can be '
+            f"created: {error}."
+        ) from error
+
+
+def _choose(
+    kind: str, found: checkpoint.Checkpoint, config: NetworkConfig, trust: bool
+) -> dict[str, Any]:
+    """Return reference and arguments of a component: the user's, or else the checkpoint's."""
+    given, own = getattr(config, kind), getattr(config, f"{kind}_kwargs")
+    reference = found.network.get(kind)
+    arguments = found.network.get(f"{kind}_kwargs", {})
+    if given is not None and (own or not is_recorded_as(given, reference)):
+        return {kind: given, f"{kind}_kwargs": own}
+    if kind == "transformation" and not trust and ":" in str(reference):
+        reference = None  # it may be the network's default
+    _check(kind, found, reference if given is None else None, arguments, trust)
+    return {kind: given or reference, f"{kind}_kwargs": arguments}
+
+
+def _check(
+    kind: str, found: checkpoint.Checkpoint, reference: Any, arguments: Any, trust: bool
+) -> None:
+    advice = f"--network.{kind} REFERENCE (in Python NetworkConfig({kind}=...)), with its arguments"
+    file = found.path / checkpoint.DESCRIPTION
+    check_recorded(kind, file, reference, arguments, advice, trust=trust)
 
 
 def _create(
