@@ -23,6 +23,7 @@ from physx_core.plugins import hookimpl
 from physx_core.typing import Array, Batch, Tensors
 
 _LONGEST_HEADER = 2**14
+_WIDEST = 16
 
 
 class Spring(Environment):
@@ -192,7 +193,7 @@ class Linear(Network):
         try:
             with zipfile.ZipFile(path) as stored, stored.open("weights.npy") as file:
                 nbytes = stored.getinfo("weights.npy").file_size
-                if nbytes > self.weights.nbytes + _LONGEST_HEADER:
+                if nbytes > self.weights.size * _WIDEST + _LONGEST_HEADER:
                     raise ValueError(f"{nbytes} bytes are too many")
                 weights = np.lib.format.read_array(file, allow_pickle=False)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:

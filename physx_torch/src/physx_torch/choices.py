@@ -64,7 +64,8 @@ def make(
         kwargs: Its keyword arguments.
     """
     if isinstance(factory, type) and not issubclass(factory, base):
-        raise ConfigError(f"The {what} {factory.__name__} is not derived from {base.__name__}.")
+        wanted = ".".join([*base.__module__.split(".")[:2], base.__name__])
+        raise ConfigError(f"The {what} {factory.__name__} is a class, but not a {wanted}.")
     try:
         return factory(*args, **kwargs)
     except (TypeError, ValueError) as error:

@@ -32,6 +32,7 @@ from physx_core.errors import (
     FieldShapeError,
     FieldTypeError,
     MissingFieldError,
+    ReferenceFormError,
     SampleError,
     UnknownFieldError,
     UsageError,
@@ -287,9 +288,10 @@ def test_what_an_environment_must_have_is_named(method):
 
 
 def test_a_class_that_is_no_environment_is_refused():
-    with pytest.raises(UsageError, match="which is not an Environment"):
-        DataGeneration(
-            EnvironmentConfig("collections:Counter", as_tcp_ip_client=False),
-            batch_nb=1,
-            batch_size=1,
-        ).execute()
+    for reference, message in {
+        "collections:Counter": "standard library",
+        "physx_core.toy:Linear": "not derived from Environment",
+    }.items():
+        config = EnvironmentConfig(reference, as_tcp_ip_client=False)
+        with pytest.raises(ReferenceFormError, match=message):
+            DataGeneration(config, batch_nb=1, batch_size=1).execute()

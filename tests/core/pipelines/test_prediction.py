@@ -258,7 +258,7 @@ def test_replay_sends_each_sample_once_through_the_environment_that_made_it():
             seen.extend(self.batch["seen"][:, 2].tolist())
 
     data = DatasetConfig(existing_dir="sessions/run")
-    Mine(data).execute()
+    Mine(data, trust=True).execute()
     assert seen == list(range(11))
     del seen[:]
     several = environment(num_clients=4)
@@ -315,7 +315,7 @@ def test_the_command_replays_the_rejected_samples(capsys):
     config = environment("Refusing", record_wrong_samples=True)
     DataGeneration(config, session_name="refused", batch_nb=1, batch_size=4).execute()
     words = ["sessions/refused", "--environment.no-as-tcp-ip-client"]
-    words += ["--environment.visualizer", f"{__file__}:Watch"]
+    words += ["--environment.visualizer", f"{__file__}:Watch", "--trust"]
     assert main(["replay", *words, "--mode", "wrong"]) == 0
     assert "3 steps of" in capsys.readouterr().err
     assert main(["replay", *words, "--mode", "validation"]) == 1
@@ -336,7 +336,7 @@ def test_the_command_takes_the_only_visualizer_plugin(installed, monkeypatch, ca
     monkeypatch.setattr(plugins, "available", lambda: dict.fromkeys([*installed, "more", "broken"]))
     monkeypatch.setattr(plugins, "load", load)
     monkeypatch.setattr("physx_core.plugins.references.load", load)
-    words = ["replay", "sessions/few", "--environment.no-as-tcp-ip-client"]
+    words = ["replay", "sessions/few", "--environment.no-as-tcp-ip-client", "--trust"]
     assert main(words) == (len(installed) != 1)
     if len(installed) == 1:
         assert Path("sessions/replay/drawn.txt").exists()

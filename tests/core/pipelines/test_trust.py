@@ -65,7 +65,7 @@ def executed(evil):
 
 def session(network="toy/linear", **kwargs):
     """Train a network for an epoch in the session "training"."""
-    config = NetworkConfig(network, {**FIELDS, **kwargs}, loss="mse", require_training_stuff=False)
+    config = NetworkConfig(network, {**FIELDS, **kwargs})
     Training(config, None, SPRING, epoch_nb=1, batch_nb=2, batch_size=4).execute()
 
 
@@ -226,7 +226,7 @@ def test_the_script_that_trained_predicts(tmp_path):
         "class Net(Linear): pass\n"
         'if __name__ == "__main__":\n'
         '    spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)\n'
-        f"    network = NetworkConfig(Net, {FIELDS}, loss='mse', require_training_stuff=False)\n"
+        f"    network = NetworkConfig(Net, {FIELDS})\n"
         "    Training(network, None, spring, epoch_nb=1, batch_nb=2, batch_size=4).execute()\n"
         "    Prediction(network, spring, step_nb=1).execute()\n"
         "    Prediction(NetworkConfig(Net), spring, step_nb=1).execute()\n"

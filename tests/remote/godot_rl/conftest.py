@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from physx_core.plugins import resolve
+from physx_core.plugins import find
 from physx_remote import Worlds
 from physx_remote.godot_rl.protocol import GodotRL
 
@@ -75,7 +75,7 @@ class Trainer:
 
 @pytest.fixture
 def cart():
-    return resolve("environment", f"{Path(__file__).with_name('envs.py')}:Cart")
+    return find("environment", f"{Path(__file__).with_name('envs.py')}:Cart")
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from physx_core.errors import (
     RemoteTimeoutError,
     UsageError,
 )
-from physx_core.plugins import resolve
+from physx_core.plugins import find
 from physx_remote import connect, connect_vector, open_worlds, serve
 from physx_remote.godot_rl.protocol import GodotRL
 
@@ -93,7 +93,7 @@ def test_agents_are_a_vector_environment(served):
 
 def test_one_agent_is_an_environment_with_every_kind_of_space(served):
     env = connect(served(CART, 1, {"length": 3}), "godot-rl")
-    cart = resolve("environment", CART)(length=3)
+    cart = find("environment", CART)(length=3)
     for seed in (4, 5):
         first, info = env.reset(seed=seed)
         assert env.observation_space.contains(first)

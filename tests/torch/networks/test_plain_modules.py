@@ -11,7 +11,12 @@ import pytest
 import torch
 
 from physx_core import Dataset, DatasetConfig, NetworkConfig, Training, checkpoint
-from physx_core.errors import ComponentNotFoundError, ConfigError
+from physx_core.errors import (
+    ComponentNotFoundError,
+    ConfigError,
+    ReferenceFormError,
+    UntrustedReferenceError,
+)
 from physx_core.pipelines import Learner, load_learner
 from physx_core.plugins.networks import resolve_network
 from physx_torch import FC, ModuleNetwork
@@ -71,8 +76,7 @@ def test_a_class_of_torch(reference):
 def test_networks_of_physx_stay_what_they_are():
     for reference, expected in ((FC, FC), ("physx_torch:FC", FC), ("torch/fc", FC)):
         assert resolve_network(reference, {"layers": [2, 1]}) == (expected, {"layers": [2, 1]})
-    assert resolve_network(dict, {"a": 1}) == (dict, {"a": 1})
-    with pytest.raises(ConfigError, match="which is not a physx network"):
+    with pytest.raises(ReferenceFormError, match="dict.* not derived from Network"):
         Learner(config(dict, {"a": 1}), trains=False)
 
 
@@ -129,7 +133,10 @@ def test_the_checkpoint_of_a_scripts_class_is_restored_in_a_new_process(tmp_path
     subprocess.run([sys.executable, "script.py"], check=True, timeout=120)
     path = checkpoint.find(Path("sessions/training"), "network", -1).path
     assert "script.py:Mixture" in (path / checkpoint.DESCRIPTION).read_text()
-    learner = load_learner(path)
+    with pytest.raises(UntrustedReferenceError, match=r"script\.py:Mixture"):
+        load_learner(path)
+    load_learner(path, trust=True)
+    learner = load_learner(path, NetworkConfig("script.py:Mixture"))
     assert learner.network.module.first.out_features == 6
     answer = learner.predict({"a": np.ones((1, 2)), "b": np.ones((1, 1))})["c"]
     np.testing.assert_allclose(answer, np.load("answer.npy"), rtol=1e-6)

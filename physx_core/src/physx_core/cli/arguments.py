@@ -31,7 +31,7 @@ def argument_registry() -> ConstructorRegistry:
         return PrimitiveConstructorSpec(
             nargs=1,
             metavar="REFERENCE",
-            instance_from_str=lambda words: words[0],
+            instance_from_str=lambda words: None if words[0] == "None" else words[0],
             is_instance=lambda value: True,
             str_from_instance=lambda value: [str(value)],
         )

@@ -26,7 +26,7 @@ from physx_core.errors import (
     UntrustedReferenceError,
 )
 from physx_core.plugins.hookspecs import KINDS
-from physx_core.plugins.registry import load
+from physx_core.plugins.registry import available, load
 
 if TYPE_CHECKING:
     from physx_core.components import (
@@ -203,6 +203,8 @@ def check_recorded(
                 f"file, even if you trust it. Name it yourself: {advice}."
             )
         return
+    if _is_of_plugin(kind, reference):
+        reference = None
     for where, text in _texts((kind, reference), (f"{kind}_kwargs", arguments)):
         if ":" in text:
             raise UntrustedReferenceError(
@@ -211,6 +213,17 @@ def check_recorded(
                 f"it yourself: {advice}. If you trust everything that the file names: --trust (in "
                 "Python trust=True)."
             )
+
+
+def _is_of_plugin(kind: str, reference: Any) -> bool:
+    """Return whether a reference names the class of an installed plugin's component."""
+    package = str(reference).partition(":")[0].partition(".")[0]
+    for name, info in available().items():
+        if info.module.partition(".")[0] == package:
+            components = load(name).components.get(kind, {}).values()
+            if reference in map(_place_of, components):
+                return True
+    return False
 
 
 def _texts(*values: tuple[str, Any]) -> Iterator[tuple[str, str]]:

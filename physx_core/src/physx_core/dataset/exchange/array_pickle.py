@@ -112,7 +112,7 @@ class _Type:
         if not isinstance(self._kind, str) or not _KIND.fullmatch(self._kind):
             raise ArrayPickleError(f"it holds {self._kind!r:.40}, not plain numbers")
         order = self._order if self._order in ("<", ">") else "="
-        return np.dtype(self._kind).newbyteorder(order)
+        return np.dtype(f"{order}{self._kind}")
 
 
 class _Array:
@@ -152,8 +152,10 @@ class _Array:
             raise ArrayPickleError("it has an impossible shape")
         if math.prod(shape) * dtype.itemsize != len(self._content):
             raise ArrayPickleError(f"it has {len(self._content)} bytes for the shape {shape}")
-        order = "F" if self._is_columnwise is True else "C"
-        return np.frombuffer(self._content, dtype).reshape(shape, order=order)
+        flat: Array = np.frombuffer(self._content, dtype)
+        if self._is_columnwise is True:
+            return flat.reshape(shape[::-1]).T
+        return flat.reshape(shape)
 
 
 def _encode(text: Any, encoding: Any = None) -> bytes:

@@ -59,7 +59,7 @@ class _Part:
 
     place: str
     rows: int
-    read: Callable[[int, int], Sequence[Any]]
+    read: Callable[[int, int], Sequence[Any] | Array]
 
 
 class PartsColumn:
