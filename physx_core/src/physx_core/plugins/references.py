@@ -203,7 +203,7 @@ def check_recorded(
                 f"file, even if you trust it. Name it yourself: {advice}."
             )
         return
-    if _is_of_plugin(kind, reference):
+    if is_of_plugin(kind, reference):
         reference = None
     for where, text in _texts((kind, reference), (f"{kind}_kwargs", arguments)):
         if ":" in text:
@@ -215,7 +215,7 @@ def check_recorded(
             )
 
 
-def _is_of_plugin(kind: str, reference: Any) -> bool:
+def is_of_plugin(kind: str, reference: Any) -> bool:
     """Return whether a reference names the class of an installed plugin's component."""
     package = str(reference).partition(":")[0].partition(".")[0]
     for name, info in available().items():

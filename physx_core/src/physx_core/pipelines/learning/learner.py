@@ -24,7 +24,7 @@ from physx_core.errors import (
 from physx_core.fields import Field
 from physx_core.plugins import import_component, resolve
 from physx_core.plugins.networks import resolve_network
-from physx_core.plugins.references import check_recorded, is_recorded_as
+from physx_core.plugins.references import check_recorded, is_of_plugin, is_recorded_as
 from physx_core.statistics import Normalization
 from physx_core.typing import Array, Batch, Tensors
 
@@ -368,7 +368,8 @@ def _choose(
     arguments = found.network.get(f"{kind}_kwargs", {})
     if given is not None and (own or not is_recorded_as(given, reference)):
         return {kind: given, f"{kind}_kwargs": own}
-    if kind == "transformation" and not trust and ":" in str(reference):
+    is_code = ":" in str(reference) and not is_of_plugin(kind, reference)
+    if kind == "transformation" and is_code and not trust:
         reference = None  # it may be the network's default
     _check(kind, found, reference if given is None else None, arguments, trust)
     return {kind: given or reference, f"{kind}_kwargs": arguments}
