@@ -194,7 +194,7 @@ class Beam(Environment):
         self.factory.add_scalars("error", ["relative error"])
 
     def apply_prediction(self, prediction) -> None:
-        if self.factory is None:
+        if not self.factory:  # the positions are for drawing only
             return
         rest, exact = self.solver.rest, self.solver.displacement
         guess = prediction["displacement"] / 1e3

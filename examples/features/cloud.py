@@ -42,11 +42,10 @@ class Cloud(Environment):
         self.set_training_data(input=self.points, ground_truth=self.mean)
 
     def apply_prediction(self, prediction) -> None:
-        if self.factory is not None:
-            self.factory.update_points("cloud", positions=self.points)
-            self.factory.update_points("mean", positions=[self.mean])
-            self.factory.update_points("guess", positions=[prediction["prediction"]])
-            self.update_visualization()
+        self.factory.update_points("cloud", positions=self.points)
+        self.factory.update_points("mean", positions=[self.mean])
+        self.factory.update_points("guess", positions=[prediction["prediction"]])
+        self.update_visualization()
 
     @staticmethod
     def distance(guess: np.ndarray, mean: np.ndarray) -> float:

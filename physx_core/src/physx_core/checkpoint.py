@@ -15,7 +15,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import errno
 import re
+import tempfile
 import warnings
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
@@ -51,6 +53,7 @@ _END = '\n[checksum]\ncrc32 = "{:08x}"\n'
 _END_PATTERN = re.compile(rb'\n\[checksum\]\ncrc32 = "([0-9a-f]{8})"\n')
 _EDITED = "edited"
 _NUMBER = "(0|[1-9][0-9]*)"
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _ADVICE = "Restore it from a copy, or use another checkpoint."
 _INVALID = (
     ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, MemoryError,
@@ -211,6 +214,43 @@ def _write(
     _write_description(partial / DESCRIPTION, {**description, "files": described})
     for file in (*described, DESCRIPTION):
         files.sync_file(partial / file)
+
+
+def rehearse(place: Path, network: Network, optimization: Optimization) -> None:
+    """Check that a network and its optimization can be saved, in a folder that is then removed.
+
+    Args:
+        place: Folder to make that folder in.
+        network: The network.
+        optimization: The optimization, after its first step.
+
+    Raises:
+        CheckpointError: If they cannot.
+    """
+    writers: list[tuple[Any, str, str]] = [(network, "save_parameters", network.parameters_file)]
+    if optimization.state_file:
+        writers.append((optimization, "save_state", optimization.state_file))
+    with tempfile.TemporaryDirectory(prefix=".rehearsal-", dir=place) as name:
+        for owner, write, file in writers:
+            method = f"{type(owner).__name__}.{write}()"
+            try:
+                getattr(owner, write)(Path(name, file))
+            except Exception as error:
+                cause = error if isinstance(error, OSError) else error.__cause__
+                if isinstance(cause, OSError) and cause.errno in _FULL:
+                    return  # there may be space when it is needed
+                if isinstance(error, PhysxError):
+                    raise
+                raise CheckpointError(
+                    f"{method} fails, so the network could not be saved after the training: "
+                    f"{type(error).__name__}: {error}."
+                ) from error
+            if not Path(name, file).is_file():
+                others = listed(path.name for path in Path(name).iterdir())
+                raise CheckpointError(
+                    f"{method} does not write the file whose path it is given, {file}, so the "
+                    f"network could not be saved after the training. It writes: {others}."
+                )
 
 
 def check_session(network_dir: Path) -> None:

@@ -85,10 +85,22 @@ def _validate(instance: Any, cls: Any) -> None:
         try:
             typeguard.check_type(value, hints[option.name])
         except typeguard.TypeCheckError as error:
-            raise ConfigError(f"{where} is {value!r}, of the wrong type: {error}.") from None
+            raise ConfigError(_misfit(where, value, hints[option.name], error)) from None
         if value is None:
             continue
         _check_range(where, value, option.metadata)
+
+
+def _misfit(where: str, value: Any, hint: Any, error: Exception) -> str:
+    """Return why an option cannot have a value."""
+    name = type(value).__name__
+    if dataclasses.is_dataclass(value):
+        wanted = _configuration_in(hint)
+        return f"{where} is {name}(...)" + (f", not {wanted.__name__}(...)." if wanted else ".")
+    accepts_class = any(typing.get_origin(part) is type for part in typing.get_args(hint))
+    if accepts_class and type(value).__module__ != "builtins":
+        return f"{where} is an instance of {name}: give the class, {name}, not an instance."
+    return f"{where} is {value!r}, of the wrong type: {error}."
 
 
 def _check_range(where: str, value: Any, metadata: Mapping[Any, Any]) -> None:

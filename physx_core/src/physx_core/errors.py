@@ -12,8 +12,9 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """Return `` Did you mean "x"?`` for the known name closest to `name`, or an empty string."""
     import difflib
 
-    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f' Did you mean "{matches[0]}"?' if matches else ""
+    lowered = {other.lower(): other for other in known}
+    matches = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
+    return f' Did you mean "{lowered[matches[0]]}"?' if matches else ""
 
 
 def listed(names: Iterable[str]) -> str:
@@ -145,6 +146,12 @@ class SampleError(PhysxError):
         elif field:
             message = message[:1].upper() + message[1:]
         super().__init__(message)
+
+    def at(self, instance_id: int, step: int) -> SampleError:
+        """Return this error with the instance and the step that it is about."""
+        text = str(self)
+        text = text[:1].lower() + text[1:]
+        return type(self)(text, field=self.field, instance_id=instance_id, step=step)
 
 
 class MissingFieldError(SampleError):
@@ -278,6 +285,25 @@ class FieldsMismatchError(DatasetError):
 
 class CheckpointError(PhysxError):
     """A checkpoint is missing, damaged, or of another network."""
+
+
+class DivergedError(PhysxError):
+    """A training met a loss, gradient or parameter that is not finite.
+
+    Attributes:
+        epoch: The epoch, counted from 1; 0 if it is not about an epoch.
+        batch: The batch in the epoch, counted from 1; 0 if it is not about a batch.
+    """
+
+    def __init__(self, message: str, *, epoch: int = 0, batch: int = 0) -> None:
+        self.epoch, self.batch = epoch, batch
+        if epoch:
+            message = (
+                f"Epoch {epoch}, batch {batch}: {message}"
+                if batch
+                else (f"Epoch {epoch}: {message}")
+            )
+        super().__init__(message)
 
 
 # Simulations and viewers --------------------------------------------------------------------

@@ -15,7 +15,6 @@ import numpy as np
 from physx_core.components.environment import Environment
 from physx_core.components.network import Network
 from physx_core.components.optimization import Optimization
-from physx_core.components.scene import Factory
 from physx_core.components.transformation import Transformation
 from physx_core.errors import CheckpointError, ConfigError, FieldsMismatchError
 from physx_core.fields import Field
@@ -72,11 +71,10 @@ class Spring(Environment):
 
     def init_visualization(self) -> None:
         """Draw the mass and the spring."""
-        if self.factory is not None:
-            title = f"spring {self.instance_id}"
-            self.factory.set_view(title, eye=[-1.5, -6, 1.5], target=[-1.5, 0, 0])
-            self.factory.add_sphere("mass", 0.2, color="orange")
-            self.factory.add_lines("spring", [[-3, 0, 0], [0, 0, 0]], color="gray", size=0.02)
+        title = f"spring {self.instance_id}"
+        self.factory.set_view(title, eye=[-1.5, -6, 1.5], target=[-1.5, 0, 0])
+        self.factory.add_sphere("mass", 0.2, color="orange")
+        self.factory.add_lines("spring", [[-3, 0, 0], [0, 0, 0]], color="gray", size=0.02)
 
     def step(self) -> None:
         """Move the mass by one period."""
@@ -90,28 +88,27 @@ class Spring(Environment):
         following = np.array([position + self.period * velocity, velocity])
         self.set_training_data(state=self.state, force=force, next_state=following)
         self.state = following
-        if self.factory is not None:
-            self._draw(self.factory, following[0])
+        if self.factory:
+            self._draw(following[0])
 
     def apply_prediction(self, prediction: Batch) -> None:
         """Draw the predicted mass, translucent, with the next step."""
-        if self.factory is not None:
+        if self.factory:
             if self.predicted is None:
                 self.factory.add_sphere("prediction", 0.2, color="blue", alpha=0.4)
             self.predicted = next(iter(prediction.values()))
 
-    def _draw(self, factory: Factory, position: float) -> None:
-        factory.update_sphere("mass", position=[position, 0, 0])
+    def _draw(self, position: float) -> None:
+        self.factory.update_sphere("mass", position=[position, 0, 0])
         if self.predicted is not None:
-            factory.update_sphere("prediction", position=[self.predicted[0], 0, 0])
-        factory.update_lines("spring", positions=[[-3, 0, 0], [position, 0, 0]])
+            self.factory.update_sphere("prediction", position=[self.predicted[0], 0, 0])
+        self.factory.update_lines("spring", positions=[[-3, 0, 0], [position, 0, 0]])
         self.update_visualization()
 
 
 class Linear(Network):
     """Predicts a field as a linear function of others; arrays are its tensors."""
 
-    parameters_file = "parameters.npz"
     default_optimization = "toy/least-squares"
     default_transformation = "toy/identity"
 
@@ -161,17 +158,6 @@ class Linear(Network):
         flat = self.rows(dict(zip(self.net_fields, inputs, strict=True))) @ self.weights
         return flat.reshape(len(flat), *self._shape)
 
-    def set_train(self) -> None:
-        """Training and prediction do not differ."""
-
-    def set_eval(self) -> None:
-        """Training and prediction do not differ."""
-
-    def set_device(self, device: str) -> None:
-        """Accept the processor only."""
-        if device not in ("auto", "cpu"):
-            raise ConfigError(f'toy/linear computes on "cpu", not on "{device}".')
-
     def set_data_type(self, data_type: str) -> None:
         """Set the type to compute in."""
         self._dtype = data_type
@@ -179,14 +165,6 @@ class Linear(Network):
     def get_parameters(self) -> dict[str, Any]:
         """Return the weights, shape (inputs + 1, outputs)."""
         return {"weights": self.weights}
-
-    def nb_parameters(self) -> int:
-        """Return the number of weights."""
-        return int(self.weights.size)
-
-    def save_parameters(self, path: Path) -> None:
-        """Write the weights as an npz file."""
-        np.savez(path, weights=self.weights)
 
     def load_parameters(self, path: Path) -> None:
         """Read the weights from an npz file."""
@@ -205,14 +183,6 @@ class Linear(Network):
                 f"{path} contains weights {weights.shape}, not {self.weights.shape}."
             )
         self.weights = weights
-
-    def numpy_to_tensor(self, batch: Batch) -> Tensors:
-        """Return the arrays themselves."""
-        return dict(batch)
-
-    def tensor_to_numpy(self, tensors: Tensors) -> Batch:
-        """Return the arrays themselves."""
-        return dict(tensors)
 
 
 class LeastSquares(Optimization):

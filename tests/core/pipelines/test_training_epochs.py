@@ -200,7 +200,7 @@ def test_patience_counts_validations(validated):
 
 
 def test_a_loss_that_is_not_a_number_is_no_improvement(data):
-    assert finished_epochs([math.nan] * 9, patience=2) == 2
+    assert finished_epochs([math.nan] * 9, patience=2, on_nan="continue") == 2
 
 
 def test_a_training_that_reaches_its_last_epoch_did_not_stop(data):

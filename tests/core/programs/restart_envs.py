@@ -66,7 +66,7 @@ class Wanderer(Environment):
                 predicted = self.get_prediction(x=self.position + predicted)["y"]
             if self.step_index == self.at:
                 self.reach("prediction")
-        if self.factory is not None:
+        if self.factory:
             x, y = self.position
             self.factory.update_points("walker", positions=np.array([[x, y, 0.0]]))
             self.update_visualization()

@@ -133,11 +133,12 @@ class Everything(Environment):
         self.factory.add_points("cloud", np.zeros((self.size, 3)), color="red")
 
     async def step(self):
+        assert self.sample is None or self.sample["state"].shape == (self.size,)
         self.state = self.state + self.rng.normal(size=self.size)
         if not self.compute_training_data:
             self.sub_steps += 1
             return
-        if self.factory is not None:
+        if self.factory:
             self.factory.update_points("cloud", positions=np.outer(self.state, [1, 0, 0]))
             self.update_visualization()
         answer = self.get_prediction(x=self.state)["y"]

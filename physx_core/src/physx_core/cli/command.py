@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Sequence
@@ -27,10 +28,14 @@ _ORDER = (
     *("export", "import", "export-network", "client", "plugins"),
 )
 """Order of the core's commands in the overview; others follow by name."""
+_TERMINATED = 128 + signal.SIGTERM
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit status: 0, 1 after an error, 130 after Ctrl-C."""
+    """Run the command and return its exit status.
+
+    It is 0, 1 after an error, 130 after Ctrl-C, and 143 after SIGTERM.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
@@ -75,7 +80,10 @@ def _run(name: str, words: list[str]) -> int:
         raise PluginError(name, text) from error
     try:
         run(words)
-    except SystemExit as end:  # raised by the parser after --help or an invalid option
+    except SystemExit as end:  # raised by the parser, or after SIGTERM
+        if end.code == _TERMINATED:
+            print("physx: terminated; committed samples are kept", file=sys.stderr)
+            return _TERMINATED
         return 1 if end.code else 0
     return 0
 

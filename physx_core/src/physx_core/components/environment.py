@@ -8,10 +8,62 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from physx_core.components.scene import Event, Factory
-from physx_core.errors import ConfigError, UnknownFieldError, UnknownOptionError, UsageError
-from physx_core.fields import Field, FieldLike, as_fields
-from physx_core.typing import Sample
+from physx_core.components.scene import Event, Factory, NullFactory
+from physx_core.errors import (
+    ConfigError,
+    MissingFieldError,
+    NotFiniteError,
+    SampleError,
+    UnknownFieldError,
+    UnknownOptionError,
+    UsageError,
+    listed,
+    nearest,
+)
+from physx_core.fields import NO_ARRAY, Field, FieldLike, as_fields, is_finite
+from physx_core.rows import infer_shapes
+from physx_core.typing import Array, Sample
+
+_OTHER_NAMES = {
+    "sample_training": "sample",
+    "sample_additional": "sample",
+    "set_additional_dataset": "set_additional_data()",
+    "define_training_data": "define_training_fields()",
+    "define_additional_data": "define_additional_fields()",
+    "get_database_handler": "set_training_data()",
+    "update_line": "set_training_data()",
+    "add_markers": "add_points()",
+    "update_markers": "update_points()",
+    "add_symbols": "add_points() or add_arrows()",
+    "update_symbols": "update_points() or update_arrows()",
+    "render": "Environment.update_visualization()",
+}
+"""Attributes of other systems' environments and factories, and what is here in their place."""
+
+
+class PredictedFields(dict[str, Array]):
+    """A network's prediction for one sample: arrays by the names in `Network.pred_fields`.
+
+    A field that is the only one is also found under the name ``prediction``.
+    """
+
+    def __missing__(self, name: str) -> Array:
+        if name == "prediction" and len(self) == 1:
+            return next(iter(self.values()))
+        raise MissingFieldError(
+            f'the network does not predict "{name}".{nearest(name, self)} It predicts: '
+            f"{listed(self)}.",
+            field=name,
+        )
+
+
+def not_finite_prediction(name: str) -> NotFiniteError:
+    """Return the error for a prediction that holds NaN or infinity."""
+    return NotFiniteError(
+        f'the network\'s prediction "{name}" holds NaN or an infinite number, for inputs that are '
+        "finite. Train the network again, with normalized data or a smaller learning rate.",
+        field=name,
+    )
 
 
 class Services(Protocol):
@@ -45,12 +97,12 @@ class Environment:
         instance_id: Number of this instance among all instances of the run, from 1.
         instance_nb: Number of instances in the run.
         rng: Random number generator of this instance, with its own stream.
-        factory: Draws the environment; None without a visualizer.
+        factory: Draws the environment. Without a visualizer it accepts everything and does nothing,
+            and is false: ``if self.factory:`` saves what only the drawing needs.
         compute_training_data: False in sub-steps whose data are not used.
         step_index: Number of finished steps.
         episode_index: Index of the current trajectory, from 0.
         sample_episode: Index of the trajectory of the last training data.
-        sample: The stored row to replay, or None.
     """
 
     def __init__(
@@ -78,12 +130,14 @@ class Environment:
         self.instance_nb = instance_nb
         stream = np.random.SeedSequence(seed, spawn_key=(instance_id - 1,))
         self.rng = np.random.default_rng(stream)
-        self.factory: Factory | None = None
+        self.factory: Factory = NullFactory()
         self.compute_training_data = True
         self.step_index = 0
         self.episode_index = 0
         self.sample_episode = 0
-        self.sample: Sample | None = None
+        self._has_seed = seed is not None
+        self._has_read_sample = False
+        self._sample: Sample | None = None
         self._fields: dict[str, Field] = {}
         self._training: dict[str, Any] | None = None
         self._additional: dict[str, Any] | None = None
@@ -93,21 +147,21 @@ class Environment:
 
     def create(self) -> None:
         """Create the simulation."""
-        raise UsageError(f"{type(self).__name__} does not implement create().")
+        raise self._lacks("create")
 
     def init(self) -> None:
         """Initialize the simulation once it is created."""
 
     def init_database(self) -> None:
         """Define the fields with `define_training_fields` and `define_additional_fields`."""
-        raise UsageError(f"{type(self).__name__} does not implement init_database().")
+        raise self._lacks("init_database")
 
     def init_visualization(self) -> None:
         """Add objects to `factory`."""
 
     def step(self) -> Any:
         """Simulate one step and set its data with `set_training_data`; may be a coroutine."""
-        raise UsageError(f"{type(self).__name__} does not implement step().")
+        raise self._lacks("step")
 
     def check_sample(self) -> bool:
         """Return whether to keep the step's sample."""
@@ -120,6 +174,16 @@ class Environment:
         """Free the resources that `create` acquired."""
 
     # What a subclass calls ------------------------------------------------------------------
+
+    @property
+    def sample(self) -> Sample | None:
+        """The stored row to replay, field name to array, or None."""
+        self._has_read_sample = True
+        return self._sample
+
+    @sample.setter
+    def sample(self, stored: Sample | None) -> None:
+        self._sample = stored
 
     @property
     def fields(self) -> list[Field]:
@@ -168,10 +232,31 @@ class Environment:
 
         Raises:
             UsageError: If the run has no network, or there are no training data yet.
+            SampleError: If a field does not fit the network, or one of its inputs or predictions
+                holds NaN or infinity.
         """
         if not fields and self._training is None:
             raise UsageError("get_prediction() without fields needs set_training_data() before it.")
-        return self._run().predict(fields or dict(self._training or {}))
+        self._infer_shapes()
+        inputs = fields or dict(self._training or {})
+        try:
+            for name, value in inputs.items():
+                if not _is_finite(value):
+                    text = f'get_prediction() got the field "{name}" with NaN or an infinite number'
+                    raise NotFiniteError(f"{text}.", field=name)
+            prediction = PredictedFields(self._run().predict(inputs))
+            for name, value in prediction.items():
+                if not _is_finite(value):
+                    raise not_finite_prediction(name)
+        except SampleError as error:
+            raise error.at(self.instance_id, self.step_index) from None
+        return prediction
+
+    def _infer_shapes(self) -> None:
+        """Take open shapes of fields from this step's data."""
+        if any(field.shape is None for field in self._fields.values()):
+            given = {**(self._training or {}), **(self._additional or {})}
+            self._fields = {field.name: field for field in infer_shapes(self.fields, given)}
 
     def save_parameters(self, **values: Any) -> None:
         """Save numbers, texts, lists, dictionaries and arrays of this instance with the dataset."""
@@ -183,8 +268,14 @@ class Environment:
 
     def update_visualization(self) -> None:
         """Send the drawing events that `factory` collected since the last call to the viewers."""
-        if self.factory is not None:
+        if self.factory:
             self._run().show(self.instance_id, self.step_index, self.factory.take_events())
+
+    def _lacks(self, method: str) -> UsageError:
+        own = [name for name in dir(type(self)) if not hasattr(Environment, name)]
+        return UsageError(
+            f"{type(self).__name__} does not implement {method}().{nearest(method, own)}"
+        )
 
     def _define(self, fields: list[Field]) -> None:
         for field in fields:
@@ -212,6 +303,26 @@ class Environment:
             )
         self._training = self._additional = None
         return sample if additional is None else {**sample, **additional}
+
+
+def _is_finite(value: Any) -> bool:
+    try:
+        return is_finite(np.asarray(value))
+    except NO_ARRAY:  # the network says what it is
+        return True
+
+
+def explain_missing_attribute(error: AttributeError) -> str:
+    """Return what the user may have meant that an environment or its factory does not have."""
+    owner, name = error.obj, str(error.name)
+    if not isinstance(owner, (Environment, Factory)):
+        return ""
+    if isinstance(owner, Environment) and "_has_seed" not in vars(owner):
+        return f" {type(owner).__name__}.__init__() must first call super().__init__(**kwargs)."
+    if name in _OTHER_NAMES:
+        return f" In its place: {_OTHER_NAMES[name]}."
+    own = dir(type(owner)) if isinstance(owner, Factory) else [*dir(type(owner)), *vars(owner)]
+    return nearest(name, (known for known in own if not known.startswith("_")))
 
 
 def options_of(cls: type[Any]) -> list[str]:

@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import os
+import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+
 from physx_core.components.group import Group
-from physx_core.errors import ConfigError, FieldsMismatchError, UsageError, listed
-from physx_core.fields import Field
+from physx_core.errors import (
+    CheckpointError,
+    ConfigError,
+    FieldsMismatchError,
+    UsageError,
+    listed,
+)
+from physx_core.fields import Field, is_finite
 from physx_core.typing import Batch, Tensors
 
 
@@ -18,7 +27,8 @@ class Network(ABC):
     """Base of all networks; a plugin's base class implements it for one library.
 
     Tensors are of the library's own type. In every dictionary of tensors the first axis is that of
-    the samples.
+    the samples. Unless the methods are implemented for a library, arrays are the tensors, and a
+    network in NumPy needs only `predict` and `get_parameters`: see `physx_core.toy`.
 
     Attributes:
         net_fields: Input fields of the network.
@@ -26,7 +36,8 @@ class Network(ABC):
         pred_fields: Fields that the network predicts; the i-th has shape, unit and normalization
             of the i-th of `opt_fields`.
         parameters_file: Name of the file that `save_parameters` writes into a checkpoint.
-        default_optimization: Reference of the optimization used if none is configured.
+        default_optimization: Reference of the optimization used if none is configured; empty: one
+            must be configured for a training.
         default_transformation: Reference of the transformation used if none is configured.
         export_forms: File formats that the network can be exported in.
         exporter: Function that exports, as ``"package.module:function"``. It is called with the
@@ -34,9 +45,9 @@ class Network(ABC):
             tensors of `pred_fields` in physical units, and the fields by name.
     """
 
-    parameters_file: ClassVar[str]
-    default_optimization: ClassVar[str]
-    default_transformation: ClassVar[str]
+    parameters_file: ClassVar[str] = "parameters.npz"
+    default_optimization: ClassVar[str] = ""
+    default_transformation: ClassVar[str] = "physx/identity"
     export_forms: ClassVar[Sequence[str]] = ()
     exporter: ClassVar[str] = ""
 
@@ -114,54 +125,80 @@ class Network(ABC):
         """
         raise UsageError(f"{type(self).__name__} does not implement forward().")
 
-    @abstractmethod
-    def set_train(self) -> None:
+    def set_train(self) -> None:  # noqa: B027
         """Switch to training mode."""
 
-    @abstractmethod
-    def set_eval(self) -> None:
+    def set_eval(self) -> None:  # noqa: B027
         """Switch to evaluation mode: no gradients are recorded."""
 
-    @abstractmethod
     def set_device(self, device: str) -> None:
         """Move to a device; ``"auto"`` is the fastest available one.
 
         Raises:
             ConfigError: If the device does not exist on this machine.
         """
+        if device not in ("auto", "cpu"):
+            raise ConfigError(f'{type(self).__name__} computes on "cpu", not on "{device}".')
 
-    @abstractmethod
-    def set_data_type(self, data_type: str) -> None:
+    def set_data_type(self, data_type: str) -> None:  # noqa: B027
         """Compute in ``"float32"`` or ``"float64"``."""
 
     @abstractmethod
     def get_parameters(self) -> dict[str, Any]:
-        """Return the parameters by name."""
+        """Return the network's own parameters by name, no copies."""
 
     def get_gradients(self) -> dict[str, Any]:
         """Return the gradients of the last step by parameter; empty if there are none."""
         return {}
 
-    @abstractmethod
     def nb_parameters(self) -> int:
         """Return the number of real numbers in all parameters."""
+        return sum(int(np.size(array)) for array in self._arrays().values())
 
-    @abstractmethod
+    def find_not_finite(self) -> str:
+        """Return the name of a parameter that holds NaN or infinity; empty if there is none."""
+        for name, array in self._arrays().items():
+            if not is_finite(array):
+                return name
+        return ""
+
     def save_parameters(self, path: Path) -> None:
         """Write the parameters to a file that can be read without running code."""
+        arrays: dict[str, Any] = self._arrays()
+        with path.open("wb") as file:
+            np.savez(file, **arrays)
 
-    @abstractmethod
     def load_parameters(self, path: Path) -> None:
-        """Read parameters that `save_parameters` wrote.
+        """Read parameters that `save_parameters` wrote, into those of `get_parameters`.
 
         Raises:
             CheckpointError: If the file is missing, damaged or of another architecture.
         """
+        own = self.get_parameters()
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                read = {name: stored[name] for name in stored.files}
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise CheckpointError(f"{path} does not contain parameters: {error}.") from error
+        shapes, found = (
+            {name: np.shape(array) for name, array in arrays.items()} for arrays in (own, read)
+        )
+        if shapes != found:
+            raise CheckpointError(
+                f"{path} contains parameters of the shapes {found}, but {type(self).__name__} has "
+                f"{shapes}."
+            )
+        for name, array in own.items():
+            array[...] = read[name]
 
-    @abstractmethod
     def numpy_to_tensor(self, batch: Batch) -> Tensors:
         """Return arrays as tensors of the network's type and device, sharing memory if possible."""
+        return dict(batch)
 
-    @abstractmethod
     def tensor_to_numpy(self, tensors: Tensors) -> Batch:
         """Return tensors as NumPy arrays."""
+        return dict(tensors)
+
+    def _arrays(self) -> Batch:
+        arrays = self.tensor_to_numpy(self.get_parameters())
+        return {name: np.asarray(array) for name, array in arrays.items()}

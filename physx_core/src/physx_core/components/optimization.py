@@ -20,24 +20,33 @@ class Optimization(ABC):
         extra_fields: Fields of the batch that the loss reads beside those of the network.
         state_file: Name of the file that `save_state` writes into a checkpoint; empty if the
             optimization has no state.
+        network: The network to train; known after `set_optimizer`.
+        stops_at_nan: Whether a loss or gradient that is not finite ends the training; set by the
+            training.
     """
 
     state_file: ClassVar[str] = ""
     extra_fields: Sequence[str] = ()
+    network: Network
+    stops_at_nan: bool = True
 
-    @abstractmethod
     def set_loss(self, loss: str | type[Any] | None) -> None:
         """Choose the loss function, by class or by its name in the network's library.
+
+        Unless this is implemented, the optimization has its own loss.
 
         Raises:
             ConfigError: If there is no such loss, or one is needed and none was given.
         """
+        if loss is not None:
+            raise ConfigError(f"{type(self).__name__} has its own loss: leave out loss.")
 
-    @abstractmethod
     def set_optimizer(
         self, optimizer: str | type[Any] | None, network: Network, **kwargs: Any
     ) -> None:
         """Choose the optimizer of the network's parameters, by class or by its name.
+
+        Unless this is implemented, the optimization is its own optimizer, without arguments.
 
         Args:
             optimizer: Class or name.
@@ -47,6 +56,12 @@ class Optimization(ABC):
         Raises:
             ConfigError: If there is no such optimizer, or it rejects the arguments.
         """
+        if optimizer is not None or kwargs:
+            raise ConfigError(
+                f"{type(self).__name__} is its own optimizer: leave out optimizer, "
+                "optimizer_kwargs and lr."
+            )
+        self.network = network
 
     def set_scheduler(self, scheduler: str | type[Any], **kwargs: Any) -> None:
         """Choose the scheduler of the learning rate, by class or by its name.
@@ -84,7 +99,13 @@ class Optimization(ABC):
 
     @abstractmethod
     def optimize(self, loss: Any) -> None:
-        """Update the parameters along the gradient of the loss."""
+        """Update the parameters along the gradient of the loss.
+
+        Raises:
+            DivergedError: If loss or gradient are not finite; the parameters are not changed then.
+                Not raised if `stops_at_nan` is off, nor by optimizations that do not look: the
+                training looks at the loss itself.
+        """
 
     def learning_rate(self) -> float | None:
         """Return the current learning rate; None if there is none."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from physx_core.errors import ConfigError, UnknownOptionError, listed
+from physx_core.fields import NO_ARRAY
 from physx_core.typing import Array
 
 
@@ -77,6 +78,10 @@ class Factory:
     def __init__(self) -> None:
         self._kinds: dict[str, str] = {}
         self._events: list[Event] = []
+
+    def __bool__(self) -> bool:
+        """Return whether what is drawn can be seen."""
+        return True
 
     def take_events(self) -> list[Event]:
         """Return and clear the events since the last call."""
@@ -215,7 +220,7 @@ class Factory:
         if unknown:
             raise UnknownOptionError(f"add_{kind}", unknown, (*needed, *optional))
         self._kinds[name] = kind
-        self._events.append(Event("add", kind, name, _to_plain(values)))
+        self._events.append(Event("add", kind, name, _to_plain(name, values)))
         return name
 
     def _update(self, kind: str, name: str, changes: Mapping[str, Any]) -> None:
@@ -229,21 +234,41 @@ class Factory:
         unknown = changes.keys() - set(allowed)
         if unknown:
             raise UnknownOptionError(f"update_{kind}", unknown, allowed)
-        self._events.append(Event("update", kind, name, _to_plain(changes)))
+        self._events.append(Event("update", kind, name, _to_plain(name, changes)))
 
 
-def _to_plain(values: Mapping[str, Any]) -> dict[str, Any]:
+class NullFactory(Factory):
+    """The factory of an environment that nobody looks at: it accepts everything and is false."""
+
+    def __bool__(self) -> bool:
+        """Return False."""
+        return False
+
+    def _add(self, kind: str, name: str, **values: Any) -> str:
+        return name
+
+    def _update(self, kind: str, name: str, changes: Mapping[str, Any]) -> None:
+        pass
+
+
+def _to_plain(owner: str, values: Mapping[str, Any]) -> dict[str, Any]:
     plain: dict[str, Any] = {}
     for name, value in values.items():
         if name not in ARRAYS:
             plain[name] = value
             continue
         shape, dtype = ARRAYS[name]
-        array: Array = np.array(value, dtype=dtype)
+        try:
+            array: Array = np.array(value, dtype=dtype)
+        except NO_ARRAY as error:
+            raise ConfigError(f'Object "{owner}": {name} is not an array: {error}.') from error
         fits = array.ndim == len(shape) and all(
             want in (None, have) for want, have in zip(shape, array.shape, strict=True)
         )
         if not fits:
-            raise ConfigError(f"{name} has shape {array.shape}, expected {shape} (None: any).")
+            wanted = str(shape).replace("None", "n")
+            raise ConfigError(
+                f'Object "{owner}": {name} has shape {array.shape}, expected {wanted}.'
+            )
         plain[name] = array
     return plain

@@ -50,6 +50,7 @@ class DataGeneration(NewSessionPipeline):
     source: Source = field(init=False, repr=False)
     batch: Batch = field(init=False, repr=False)
     batch_id: int = field(init=False, repr=False, default=0)
+    _seed: int = field(init=False, repr=False, default=0)
 
     def execute(self) -> None:
         """Generate all batches.
@@ -89,6 +90,9 @@ class DataGeneration(NewSessionPipeline):
             self.batch = self.source.batch(self.batch_size)
             if self.batch_id == 0:
                 self.dataset.define_fields(self._mode, self.source.fields)
+                self.dataset.update_info(
+                    **describe_environment(self.environment_config, self._seed)
+                )
             self.dataset.append(self._mode, self.batch, checked=True)
 
     def batch_count(self) -> None:
@@ -129,7 +133,7 @@ class DataGeneration(NewSessionPipeline):
         self.session = self._create_session()
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
         offset = self.dataset.num_samples(self._mode) if self._mode in self.dataset.modes else 0
-        self.dataset.update_info(**describe_environment(config, seed))
+        self._seed = seed
         self._record_config(seed)
         self._observe(resources, config)
         self.source = self._open_source(

@@ -1,35 +1,95 @@
-"""Defers Ctrl-C until the current step is finished."""
+"""Ends runs in order after Ctrl-C and SIGTERM."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
+from typing import Any
+
+
+class Terminated(SystemExit):
+    """SIGTERM ended the run; the process exits with status 143."""
+
+    def __init__(self) -> None:
+        super().__init__(128 + signal.SIGTERM)
+
+
+class Interrupt:
+    """Whether, and by which signal, a run was asked to end.
+
+    Attributes:
+        number: The first signal; 0 before it came.
+    """
+
+    def __init__(self) -> None:
+        self.number = 0
+
+    def __bool__(self) -> bool:
+        """Return whether the run is to end."""
+        return self.number != 0
+
+    def take(self, number: int, frame: FrameType | None) -> None:
+        """Note the first signal, and raise the exception of a second one."""
+        if self.number:
+            _raise(number, frame)
+        self.number = number
+
+    def end(self) -> None:
+        """Raise the exception that the signal ends a run with.
+
+        Raises:
+            KeyboardInterrupt: For Ctrl-C.
+            Terminated: For SIGTERM.
+        """
+        _raise(self.number, None)
 
 
 @contextlib.contextmanager
-def deferred_interrupt() -> Iterator[Callable[[], bool]]:
-    """Defer the first Ctrl-C, and yield a function that tells whether it was pressed.
+def deferred_interrupt() -> Iterator[Interrupt]:
+    """Defer the first Ctrl-C or SIGTERM, and yield what tells whether it came.
 
-    A second one interrupts at once. Outside the main thread, and where Ctrl-C is already handled,
-    nothing changes.
+    A second one ends the run at once. Outside the main thread, and for a signal that is already
+    handled, nothing changes.
     """
-    pressed = False
+    interrupt = Interrupt()
+    usual: dict[int, tuple[Any, ...]] = {
+        signal.SIGINT: (signal.default_int_handler,),
+        signal.SIGTERM: (signal.SIG_DFL, _raise),
+    }
+    with _handled(interrupt.take, usual):
+        yield interrupt
 
-    def handle(number: int, frame: FrameType | None) -> None:
-        nonlocal pressed
-        if pressed:
-            raise KeyboardInterrupt
-        pressed = True
 
-    in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        yield lambda: False
-        return
-    signal.signal(signal.SIGINT, handle)
+@contextlib.contextmanager
+def raised_at_sigterm() -> Iterator[None]:
+    """Raise `Terminated` at SIGTERM, so that everything is closed before the process exits.
+
+    Outside the main thread, and if SIGTERM is already handled, nothing changes.
+    """
+    with _handled(_raise, {signal.SIGTERM: (signal.SIG_DFL,)}):
+        yield
+
+
+def _raise(number: int, frame: FrameType | None) -> None:
+    raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def _handled(
+    handler: Callable[[int, FrameType | None], None], usual: Mapping[int, tuple[Any, ...]]
+) -> Iterator[None]:
+    """Handle signals, those that have one of their usual handlers."""
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        current = {number: signal.getsignal(number) for number in usual}
+        before = {number: kept for number, kept in current.items() if kept in usual[number]}
+    for number in before:
+        signal.signal(number, handler)
     try:
-        yield lambda: pressed
+        yield
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, kept in before.items():
+            signal.signal(number, kept)

@@ -19,6 +19,7 @@ from physx_core.components.visualizer import Observer
 from physx_core.config import EnvironmentConfig, to_plain
 from physx_core.errors import UsageError
 from physx_core.observers import Observers, ProgressBar, ScalarsFile
+from physx_core.pipelines.interrupt import Terminated, raised_at_sigterm
 from physx_core.pipelines.services import Predict, RunServices
 from physx_core.pipelines.storage import remove_unused
 from physx_core.plugins import resolve
@@ -105,6 +106,7 @@ class Pipeline(ABC):
         try:
             with contextlib.ExitStack() as resources:
                 self._began = time.monotonic()
+                resources.enter_context(raised_at_sigterm())
                 self._open(resources)
                 self._describe_components()
                 self._resources = resources.pop_all()
@@ -163,7 +165,7 @@ class Pipeline(ABC):
 
     def _note_end(self, error: BaseException | None) -> None:
         how = "finished"
-        if isinstance(error, KeyboardInterrupt):
+        if isinstance(error, (KeyboardInterrupt, Terminated)):
             how = "interrupted"
         elif error is not None:
             how = f"ended by {type(error).__name__}"

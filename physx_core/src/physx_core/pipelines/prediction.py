@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import shlex
+import signal
 from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from typing import ClassVar
 
+from physx_core.components.environment import not_finite_prediction
 from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, at_least, options
 from physx_core.dataset import Dataset
-from physx_core.fields import Field
+from physx_core.fields import Field, first_not_finite
 from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.learning.learner import Learner, load_learner
 from physx_core.pipelines.pipeline import Pipeline, choose_seed, derive_seed
@@ -82,22 +84,24 @@ class Prediction(Pipeline):
     _stored: StoredRows | None = field(init=False, repr=False, default=None)
 
     def execute(self) -> None:
-        """Run all steps. Ctrl-C ends the run in an orderly way after the current step.
+        """Run all steps. Ctrl-C and SIGTERM end the run in an orderly way after the current step.
 
         Raises:
             PhysxError: If there is no network, or the environment fails.
-            KeyboardInterrupt: After Ctrl-C before ``step_nb`` steps; a second one ends the run at
-                once.
+            KeyboardInterrupt: After Ctrl-C before ``step_nb`` steps; a second signal ends the run
+                at once.
+            SystemExit: After SIGTERM, with status 143.
         """
-        with self._running(), deferred_interrupt() as interrupted:
+        with self._running(), deferred_interrupt() as interrupt:
             self.prediction_begin()
-            while self.prediction_condition() and not interrupted():
+            while self.prediction_condition() and not interrupt:
                 self.sample_begin()
                 self.predict()
                 self.sample_end()
             self.prediction_end()
-            if self.step_nb >= 0 and self.prediction_condition():
-                raise KeyboardInterrupt
+            unfinished = self.step_nb >= 0 and self.prediction_condition()
+            if interrupt.number == signal.SIGTERM or (interrupt and unfinished):
+                interrupt.end()
 
     def prediction_begin(self) -> None:
         """Called before the first step."""
@@ -118,9 +122,18 @@ class Prediction(Pipeline):
             stored = None if self._stored is None else self._stored.take_cyclic(count)
             self.batch = self.source.batch(count, stored)
             self.prediction = self.learner.predict(self.batch)
+            self._check(self.prediction)
             self.source.apply(self.prediction)
             if self.dataset is not None:
                 self._store(self.dataset)
+
+    def _check(self, prediction: Batch) -> None:
+        """Check that the prediction is finite."""
+        for name, values in prediction.items():
+            row = first_not_finite(values)
+            if row is not None:
+                instance_id, step = (int(self.batch[key][row]) for key in ("env_id", "step"))
+                raise not_finite_prediction(name).at(instance_id, step)
 
     def sample_end(self) -> None:
         """Count the step."""
@@ -169,7 +182,7 @@ class Prediction(Pipeline):
             resources,
             environment,
             derive_seed(seed, "prediction", 0),
-            predict=self.learner.predict,
+            predict=self.learner.answer,
             in_process=environment.num_clients == 1,
             replayed=replayed,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import signal
 from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar
@@ -64,18 +65,21 @@ class Replay(NewSessionPipeline):
     _stored: StoredRows = field(init=False, repr=False)
 
     def execute(self) -> None:
-        """Replay. Ctrl-C ends the run in an orderly way after the current step.
+        """Replay. Ctrl-C and SIGTERM end the run in an orderly way after the current step.
 
         Raises:
             PhysxError: If there are no such samples, or the environment fails.
+            SystemExit: After SIGTERM, with status 143; a second signal ends the run at once.
         """
-        with self._running(), deferred_interrupt() as interrupted:
+        with self._running(), deferred_interrupt() as interrupt:
             self.replay_begin()
-            while self.replay_condition() and not interrupted():
+            while self.replay_condition() and not interrupt:
                 self.sample_begin()
                 self.replay()
                 self.sample_end()
             self.replay_end()
+            if interrupt.number == signal.SIGTERM:
+                interrupt.end()
 
     def replay_begin(self) -> None:
         """Called before the first step."""

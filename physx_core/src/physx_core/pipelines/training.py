@@ -24,8 +24,9 @@ from physx_core.config import (
     to_plain,
 )
 from physx_core.dataset import Dataset
+from physx_core.errors import DivergedError, UsageError
 from physx_core.observers import statistics_observers
-from physx_core.pipelines.interrupt import deferred_interrupt
+from physx_core.pipelines.interrupt import Interrupt, Terminated, deferred_interrupt
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.resuming import (
     can_resume,
@@ -49,6 +50,10 @@ from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 
+_ADVICE = (
+    "Lower the learning rate, normalize the data (DatasetConfig.normalize) or limit the gradients; "
+    'on_nan="continue" ignores this.'
+)
 _SESSION_INTERVAL = 1.0
 """Time in s between checks that the session's folder is still there."""
 
@@ -81,7 +86,7 @@ class Training(NewSessionPipeline):
         batch: The current batch, in physical units.
         epoch_id: Number of finished epochs.
         batch_id: Number of finished batches of the current epoch.
-        losses: The result of `Optimization.transform_loss` for the current batch.
+        losses: The result of `Optimization.transform_loss` for the current batch, as numbers.
         training_loss: Mean loss over the batches of the last epoch; NaN before its end.
         validation_loss: Mean loss over the validation samples; NaN before the first validation.
         best: The epoch with the smallest loss, whose network is the checkpoint "best".
@@ -108,6 +113,9 @@ class Training(NewSessionPipeline):
     the loss after which to stop; None: never. The last network is kept, beside "best"."""
     min_improvement: float = at_least(0, 0.0)
     """Least decrease below the best loss that counts as an improvement."""
+    on_nan: str = field(default="stop", metadata={"choices": ("stop", "continue")})
+    """What to do if a loss, gradient or parameter is NaN or infinite: "stop" with an error and the
+    checkpoint of before, or "continue" as if nothing had happened."""
     statistics: Sequence[str | type[Any]] = ()
     """Observers of numbers beside stats/scalars.csv, for example "torch/tensorboard" or "rerun"."""
     statistics_kwargs: dict[str, Any] = field(default_factory=dict)
@@ -124,36 +132,49 @@ class Training(NewSessionPipeline):
     batch: Batch = field(init=False, repr=False)
     epoch_id: int = field(init=False, repr=False, default=0)
     batch_id: int = field(init=False, repr=False, default=0)
-    losses: dict[str, Any] = field(init=False, repr=False, default_factory=dict)
+    losses: dict[str, float] = field(init=False, repr=False, default_factory=dict)
     training_loss: float = field(init=False, repr=False, default=float("nan"))
     validation_loss: float = field(init=False, repr=False, default=float("nan"))
     best: BestEpoch = field(init=False, repr=False)
     checkpoint_path: Path | None = field(init=False, repr=False, default=None)
     _checked: float = field(init=False, repr=False, default=0.0)
+    _epoch_batches: int | None = field(init=False, repr=False, default=None)
+    _is_savable: bool = field(init=False, repr=False, default=False)
+    _met_nan: bool = field(init=False, repr=False, default=False)
 
     def execute(self) -> None:
-        """Train. Ctrl-C ends the training after the current batch, with a checkpoint to resume.
+        """Train. However the training ends, the network trained so far is a checkpoint to resume.
+
+        Ctrl-C and SIGTERM end it after the current batch; a second signal ends it at once, without
+        a checkpoint. An error ends it, too, and has a note that names the checkpoint.
 
         Raises:
-            PhysxError: If data, network or environments do not fit the training.
-            KeyboardInterrupt: After Ctrl-C; a second one ends the training at once.
+            DivergedError: If a loss, gradient or parameter is not finite, with ``on_nan="stop"``.
+            PhysxError: If data, network or environments do not fit the training, or fail.
+            KeyboardInterrupt: After Ctrl-C.
+            SystemExit: After SIGTERM, with status 143.
         """
-        with self._running(), deferred_interrupt() as interrupted:
+        with self._running(), deferred_interrupt() as interrupt:
             self.train_begin()
-            while self.epoch_condition():
-                self.epoch_begin()
-                while self.batch_condition():
-                    self.batch_begin()
-                    self.batch_produce()
-                    self.optimize()
-                    self.batch_count()
-                    self.batch_end()
-                    if self.group.any(interrupted()) and self.batch_condition():
-                        self._end_early()
-                self.epoch_count()
-                self.epoch_end()
-                if self.group.any(interrupted()):
-                    self._end_early()
+            try:
+                while self.epoch_condition():
+                    self.epoch_begin()
+                    while self.batch_condition():
+                        self.batch_begin()
+                        self.batch_produce()
+                        self.optimize()
+                        self.batch_count()
+                        self.batch_end()
+                        if self.group.any(bool(interrupt)) and self.batch_condition():
+                            self._end_early(interrupt)
+                    self.epoch_count()
+                    self.epoch_end()
+                    if self.group.any(bool(interrupt)):
+                        self._end_early(interrupt)
+            except (Exception, SystemExit) as error:
+                if not isinstance(error, Terminated):
+                    self._save_after(error)
+                raise
             self.train_end()
 
     def train_begin(self) -> None:
@@ -165,7 +186,7 @@ class Training(NewSessionPipeline):
         return self.epoch_id < self.epoch_nb and not self.stopped
 
     def epoch_begin(self) -> None:
-        """Called before each epoch."""
+        """Called before each epoch; decides how many batches it has."""
         begins = self.epoch_id == self._resumed.epoch
         self.batch_id = self._resumed.batch if begins else 0
         self._epoch_batches = self.data.begin_epoch(self.epoch_id, self.learner.batch_fields)
@@ -178,6 +199,10 @@ class Training(NewSessionPipeline):
 
     def batch_condition(self) -> bool:
         """Return whether there are batches left in the current epoch."""
+        if self._epoch_batches is None:
+            raise UsageError(
+                f"{type(self).__name__}.epoch_begin() must call super().epoch_begin()."
+            )
         return self.batch_id < self._epoch_batches
 
     def batch_begin(self) -> None:
@@ -191,14 +216,26 @@ class Training(NewSessionPipeline):
             self.learner.network.set_train()
 
     def optimize(self) -> None:
-        """Train the network on the batch."""
-        self.losses = self.learner.optimize(self.batch)
+        """Train the network on the batch; after the first one, check that it can be saved.
+
+        Raises:
+            DivergedError: If the loss or a gradient is not finite, with ``on_nan="stop"``.
+        """
+        try:
+            self.losses = self.learner.optimize(self.batch)
+        except DivergedError as error:
+            raise self._diverged(f"{error}", self.batch_id + 1) from None
+        if self.on_nan == "continue" and not math.isfinite(self.losses["loss"]):
+            self._continue_after_nan()
+        if self._leads and not self._is_savable:
+            self.learner.rehearse(self.session.path)
+            self._is_savable = True
 
     def batch_count(self) -> None:
         """Count the batch and record its losses."""
         self.batch_id += 1
         values = self._record.add(self.losses)
-        number = self.epoch_id * self._epoch_batches + self.batch_id
+        number = self.epoch_id * (self._epoch_batches or 0) + self.batch_id
         self.observers.scalars(values, number, "batch")
         self.observers.advance(1)
         if self._leads and time.monotonic() > self._checked + _SESSION_INTERVAL:
@@ -231,7 +268,10 @@ class Training(NewSessionPipeline):
             wanted = self.network_config.save_best
             if wanted or (wanted is None and (validates or self.patience is not None)):
                 self._write(best=True)
-        self.learner.epoch_end(judged)
+        try:
+            self.learner.epoch_end(judged)
+        except DivergedError as error:
+            raise self._diverged(f"{error}", 0) from None
         if self.network_config.save_each_epoch and self.epoch_id < self.epoch_nb:
             self.save_checkpoint()
 
@@ -239,6 +279,8 @@ class Training(NewSessionPipeline):
         losses = self.validate()
         values |= {f"{name}/validation": value for name, value in losses.items()}
         self.validation_loss = losses["loss"]
+        if self.on_nan == "stop" and not math.isfinite(self.validation_loss):
+            raise self._diverged(f"the validation loss is {self.validation_loss}", 0)
         return self.validation_loss
 
     def train_end(self) -> None:
@@ -265,30 +307,77 @@ class Training(NewSessionPipeline):
         """Write the network into the session and return the checkpoint's folder.
 
         If nothing was trained since the last checkpoint, no new one is written.
+
+        Raises:
+            DivergedError: If a parameter is not finite, with ``on_nan="stop"``; nothing is written.
+            CheckpointError: If it cannot be stored.
         """
         now = (self.epoch_id, self.batch_id)
         if self.checkpoint_path is None or self._saved != now:
-            self._saved: tuple[int, int] = now
             self.checkpoint_path = self._write()
+            self._saved: tuple[int, int] = now
         return self.checkpoint_path
 
     def _write(self, *, best: bool = False) -> Path:
-        written = None
-        if self._leads:
-            progress = Progress(
-                self.epoch_id,
-                self.batch_id,
-                self.data.batches_read,
-                self._resumed.seed,
-                self.best.state,
-                self._record.state,
-            )
-            written = str(self.learner.save(self.session.network_dir, progress, best=best))
+        self._check_parameters()
+        written = str(self._write_own(best=best)) if self._leads else None
         return Path(self.group.tell(written))
 
-    def _end_early(self) -> None:
+    def _write_own(self, *, best: bool = False) -> Path:
+        progress = Progress(
+            self.epoch_id,
+            self.batch_id,
+            self.data.batches_read,
+            self._resumed.seed,
+            self.best.state,
+            self._record.state,
+        )
+        return self.learner.save(self.session.network_dir, progress, best=best)
+
+    def _end_early(self, interrupt: Interrupt) -> None:
         self.save_checkpoint()
-        raise KeyboardInterrupt
+        interrupt.end()
+
+    def _save_after(self, error: BaseException) -> None:
+        """Save the network trained so far, and note in the error where it is.
+
+        Other processes of the group may have failed, so nothing is exchanged with them.
+        """
+        now = (self.epoch_id, self.batch_id)
+        if not self._leads or now == (self._resumed.epoch, self._resumed.batch):
+            return
+        try:
+            if self._saved != now:
+                self._check_parameters()
+                self.checkpoint_path, self._saved = self._write_own(), now
+        except Exception as failure:
+            last = self.checkpoint_path or "none; save_each_epoch=True writes one after each epoch"
+            error.add_note(f"The network could not be saved: {failure} Last checkpoint: {last}.")
+        else:
+            error.add_note(
+                f"The network trained so far is {self.checkpoint_path}, from which resume=True "
+                "(physx train --resume) continues."
+            )
+
+    def _check_parameters(self) -> None:
+        name = self.learner.network.find_not_finite() if self.on_nan == "stop" else ""
+        if name:
+            raise self._diverged(f'the parameter "{name}" holds NaN or infinity', self.batch_id)
+
+    def _diverged(self, what: str, batch: int) -> DivergedError:
+        epoch = self.epoch_id + (batch > 0)
+        return DivergedError(f"{what}. {_ADVICE}", epoch=epoch, batch=batch)
+
+    def _continue_after_nan(self) -> None:
+        """Say once that the training goes on although a loss is not finite."""
+        if self._leads and not self._met_nan:
+            text = (
+                f"Epoch {self.epoch_id + 1}, batch {self.batch_id + 1}: the loss is "
+                f'{self.losses["loss"]}; the training continues (on_nan="continue").'
+            )
+            self.observers.note(text)
+            self.session.note(text)
+        self._met_nan = True
 
     # Opening --------------------------------------------------------------------------------
 
@@ -306,7 +395,7 @@ class Training(NewSessionPipeline):
             config, environment = without_copied_dataset(session, config), None
         self._start_from(last)
         self._network_class.set_seed(self._resumed.seed)
-        self.learner = Learner(self.network_config, trains=True)
+        self.learner = Learner(self.network_config, trains=True, stops_at_nan=self.on_nan == "stop")
         if config.existing_dir is not None:  # a missing dataset leaves no session behind
             Dataset.open(config.existing_dir).close()
         self.session = session or self._open_session()
@@ -427,5 +516,14 @@ class Training(NewSessionPipeline):
             resources,
             config,
             derive_seed(seed, "training", stored),
-            predict=self.learner.predict_in_training,
+            predict=self._predict,
         )
+
+    def _predict(self, batch: Batch) -> Batch:
+        """Answer `Environment.get_prediction`; before the first batch with the step's shapes."""
+        learner, data = self.learner, getattr(self, "data", None)
+        if not learner.fields and data is not None:
+            known = [name for name, field in data.fields.items() if field.shape is not None]
+            if all(name in known for name in learner.batch_fields):
+                learner.bind(data.fields, data.normalization())
+        return learner.predict_in_training(batch)

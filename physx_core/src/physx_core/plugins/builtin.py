@@ -12,3 +12,9 @@ def physx_launchers() -> Components:
         "subprocess": "physx_core.workers.processes.launchers:SubprocessLauncher",
         "manual": "physx_core.workers.processes.launchers:ManualLauncher",
     }
+
+
+@hookimpl
+def physx_transformations() -> Components:
+    """Return the transformation of networks that name none."""
+    return {"identity": "physx_core.components.transformation:Transformation"}

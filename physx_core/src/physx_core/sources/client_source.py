@@ -62,7 +62,6 @@ class ClientSource(Source):
             accept_all: Whether samples that `check_sample` rejects count like the others.
         """
         self.instance_nb = config.num_clients
-        self.fields = []
         self._group = ClientGroup(config, services, seed, accept_all=accept_all)
         self._rejections = 0
         if config.record_wrong_samples:
@@ -72,10 +71,19 @@ class ClientSource(Source):
         self._asked = 0
         self._taken = [0] * self.instance_nb
         self._first = 0
+        self._opened: list[Field] = []
         self._table: list[Field] = []
         self._out: Batch = {}
         self._capacity = 0
         self._failed = self._closed = False
+
+    @property
+    def fields(self) -> list[Field]:
+        """The fields of the rows: see `Source.fields`."""
+        if self._table or not self._opened:
+            return self._table
+        told = (peer.row_fields for peer in self._group.server.peers.values() if peer.row_fields)
+        return next(told, self._opened)
 
     def open(self) -> None:
         """Start the clients: see `Source.open`."""
@@ -87,7 +95,7 @@ class ClientSource(Source):
         except BaseException:
             self._failed = True
             raise
-        self.fields = [*first, *ROW_FIELDS]
+        self._opened = [*first, *ROW_FIELDS]
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:
         """Return the next rows: see `Source.batch`.
@@ -97,7 +105,7 @@ class ClientSource(Source):
         """
         if size < 1:
             raise UsageError(f"A batch must have at least one row, not {size}.")
-        if not self.fields or self._closed:
+        if not self._opened or self._closed:
             raise UsageError("This source is not open: use it in a with statement.")
         if stored is not None:
             check_stored(stored, size)
@@ -227,7 +235,7 @@ class ClientSource(Source):
         """Return the first instance until its fields are known; it generates the first row."""
         peer = self._group.peer(1)
         if peer.row_fields:
-            self._table = self.fields = peer.row_fields
+            self._table = peer.row_fields
             return []
         if peer.failure is not None:
             raise peer.failure

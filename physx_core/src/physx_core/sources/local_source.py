@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from physx_core.components.environment import Services
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import UsageError
+from physx_core.fields import Field
 from physx_core.rows import ROW_FIELDS, RowBuffer, concatenate, copy_row, infer_shapes
 from physx_core.sources.source import Source, check_stored
 from physx_core.typing import Batch
@@ -34,7 +35,6 @@ class LocalSource(Source):
             accept_all: Whether samples that `check_sample` rejects count like the others.
         """
         self.instance_nb = config.num_clients
-        self.fields = []
         self._services = services
         self._config = config
         self._instances = [
@@ -45,11 +45,18 @@ class LocalSource(Source):
         self._next = 0
         self._last = range(0)
 
+    @property
+    def fields(self) -> list[Field]:
+        """The fields of the rows: see `Source.fields`."""
+        if self._buffer is not None:
+            return self._buffer.fields
+        known = self._instances[0].fields
+        return [*known, *ROW_FIELDS] if known else []
+
     def open(self) -> None:
         """Create the instances' environments: see `Source.open`."""
         for instance in self._instances:
             instance.open(self._services, draw=self._config.visualizer is not None)
-        self.fields = [*self._instances[0].fields, *ROW_FIELDS]
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:
         """Return the next rows: see `Source.batch`."""
@@ -69,7 +76,6 @@ class LocalSource(Source):
             sample = instance.step(None if stored is None else copy_row(stored, row))
             if buffer is None:
                 buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
-                self.fields = buffer.fields
             buffer.put(sample, instance.instance_id, instance.last_episode, instance.last_step)
             self._next += 1
         if buffer is None:

@@ -21,12 +21,18 @@ class Source(ABC):
 
     Attributes:
         instance_nb: Number of instances.
-        fields: The environment's fields, and those that physx adds to each row; shapes that the
-            environment does not define are None until the first batch.
     """
 
     instance_nb: int
-    fields: list[Field]
+
+    @property
+    @abstractmethod
+    def fields(self) -> list[Field]:
+        """The environment's fields, and those that physx adds to each row.
+
+        Shapes that the environment does not define are None until it has set the data of a step
+        and asks for a prediction, or until the first batch. Empty before `open`.
+        """
 
     @abstractmethod
     def open(self) -> None:

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
 import traceback
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from physx_core.components.environment import Environment, Services
+from physx_core.components.environment import (
+    Environment,
+    PredictedFields,
+    Services,
+    explain_missing_attribute,
+    options_of,
+)
 from physx_core.components.scene import Factory
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import EnvironmentFailedError, PhysxError, UsageError, WrongSamplesError
+from physx_core.errors import (
+    EnvironmentFailedError,
+    PhysxError,
+    UnknownOptionError,
+    UsageError,
+    WrongSamplesError,
+)
 from physx_core.fields import Field
 from physx_core.plugins import resolve
 from physx_core.rows import RejectedSamples
@@ -40,7 +54,6 @@ class Instance:
     Attributes:
         instance_id: Number of the instance, counted from 1.
         environment: The environment; None before `open` and after `close`.
-        fields: The environment's fields; shapes that it leaves open are None.
         last_step: Number of the step that made the last sample, counted from 0.
         last_episode: Number of the trajectory that the last sample belongs to, counted from 0.
         rejected: The samples that `check_sample` rejected, if they are recorded; else None.
@@ -74,7 +87,6 @@ class Instance:
         """
         self.instance_id = instance_id
         self.environment: Environment | None = None
-        self.fields: list[Field] = []
         self.last_step = -1
         self.last_episode = 0
         self.rejected = RejectedSamples() if record_wrong else None
@@ -90,6 +102,11 @@ class Instance:
         self._accepts_all = accept_all
         self._runner: Any = None
 
+    @property
+    def fields(self) -> list[Field]:
+        """The environment's fields; shapes that it leaves open are None. Empty if it is closed."""
+        return self.environment.fields if self.environment is not None else []
+
     def open(self, services: Services, draw: bool) -> None:
         """Create the environment: `create`, `init`, `init_database`, `init_visualization`.
 
@@ -99,16 +116,12 @@ class Instance:
 
         Raises:
             EnvironmentFailedError: If the environment cannot be imported or a method of it raises.
+            UsageError: If the environment's constructor does not pass on what it is given.
             PhysxError: If the environment raises such an error; it is passed on.
         """
-        make = self._call("import", resolve, "environment", self._reference)
-        environment = self._call("__init__", make, **self._arguments)
-        if not isinstance(environment, Environment):
-            raise UsageError(
-                f"{self._reference!r} made {environment!r}, which is not an Environment."
-            )
-        self.environment = environment
+        environment = self.environment = self._create()
         environment._services = services
+        _warn_of_misspelt_methods(type(environment))
         self._call("create", environment.create)
         self._call("init", environment.init)
         self._call("init_database", environment.init_database)
@@ -117,11 +130,30 @@ class Instance:
                 f"{type(environment).__name__}.init_database() defined no training fields: "
                 "call define_training_fields()."
             )
-        self.fields = environment.fields
         if draw:
             environment.factory = Factory()
             self._call("init_visualization", environment.init_visualization)
             environment.update_visualization()
+
+    def _create(self) -> Environment:
+        """Return the environment, after checking that its constructor has done its part."""
+        make = self._call("import", resolve, "environment", self._reference)
+        name = getattr(make, "__name__", repr(make))
+        _check_constructor(name, make, self._arguments)
+        environment = self._call("__init__", make, **self._arguments)
+        if not isinstance(environment, Environment):
+            raise UsageError(
+                f"{self._reference!r} made {environment!r}, which is not an Environment."
+            )
+        if "_has_seed" not in vars(environment):
+            raise UsageError(f"{name}.__init__() must call super().__init__(**kwargs).")
+        given = (environment.instance_id, environment.instance_nb, environment._has_seed)
+        if given != (self._arguments["instance_id"], self._arguments["instance_nb"], True):
+            raise UsageError(
+                f"{name}.__init__() must hand instance_id, instance_nb and seed to "
+                "super().__init__(): take **kwargs and call super().__init__(**kwargs)."
+            )
+        return environment
 
     def step(self, stored: Sample | None = None) -> dict[str, Any]:
         """Simulate until `check_sample` accepts a sample; return it without further checks.
@@ -131,6 +163,7 @@ class Instance:
                 sub-steps, and after a sample that is rejected.
 
         Raises:
+            UsageError: If the environment never looks at the stored row.
             WrongSamplesError: If `check_sample` rejects too many consecutive samples.
             UnknownFieldError: If the step sets no data.
             EnvironmentFailedError: If the environment raises.
@@ -140,6 +173,12 @@ class Instance:
         wrong = 0
         while True:
             sample, accepted = self._simulate(environment)
+            if stored is not None and not environment._has_read_sample:
+                raise UsageError(
+                    f"{type(environment).__name__} never reads Environment.sample, so its samples "
+                    "are new ones in place of the stored ones. In step(), take the state from "
+                    "self.sample (field name to array) if it is not None."
+                )
             self.last_step = environment.step_index
             self.last_episode = environment.sample_episode
             environment.step_index += 1
@@ -163,7 +202,7 @@ class Instance:
             EnvironmentFailedError: If the environment raises.
         """
         environment = self._alive()
-        self._call("apply_prediction", environment.apply_prediction, prediction)
+        self._call("apply_prediction", environment.apply_prediction, PredictedFields(prediction))
 
     def close(self) -> None:
         """Close the environment; further calls do nothing.
@@ -194,7 +233,10 @@ class Instance:
                 self._finish(result)
             sample = environment.take_sample()
             method = "check_sample"
-            return sample, environment.check_sample()
+            accepted: Any = environment.check_sample()
+            if accepted is None:
+                raise UsageError("check_sample() returned None but must return True or False.")
+            return sample, bool(accepted)
         except Exception as error:
             raise self._failure(method, error) from error
 
@@ -223,6 +265,8 @@ class Instance:
                 error.add_note(f"in {method}() of instance {self.instance_id}")
             return error
         summary = "".join(traceback.format_exception_only(error)).strip()
+        if isinstance(error, AttributeError):
+            summary += explain_missing_attribute(error)
         text = "".join(traceback.format_exception(error))
         return EnvironmentFailedError(self.instance_id, method, step, summary, text)
 
@@ -230,3 +274,42 @@ class Instance:
         if self.environment is None:
             raise UsageError(f"Instance {self.instance_id} is not open.")
         return self.environment
+
+
+def _warn_of_misspelt_methods(cls: type[Environment]) -> None:
+    """Warn of methods that nobody calls, but whose names are nearly those of optional ones."""
+    own = [name for name in dir(cls) if not name.startswith("_") and not hasattr(Environment, name)]
+    for method in ("init_visualization", "check_sample", "apply_prediction"):
+        if getattr(cls, method) is getattr(Environment, method):
+            for name in difflib.get_close_matches(method, own, n=1, cutoff=0.85):
+                warnings.warn(
+                    f"physx does not call {cls.__name__}.{name}(). Did you mean {method}()?",
+                    stacklevel=2,
+                )
+
+
+def _check_constructor(name: str, make: Any, arguments: Mapping[str, Any]) -> None:
+    """Check that an environment can be created with the arguments.
+
+    Raises:
+        UsageError: If it does not take those that every environment gets.
+        UnknownOptionError: If it does not take one of the user's.
+    """
+    try:
+        parameters = inspect.signature(make).parameters.values()
+    except (TypeError, ValueError):  # not known, for example of a class in C
+        return
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+        return
+    named = (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    known = {parameter.name for parameter in parameters if parameter.kind in named}
+    missing = [option for option in ("instance_id", "instance_nb", "seed") if option not in known]
+    if missing:
+        raise UsageError(
+            f"{name}.__init__() does not take {', '.join(missing)}: it must take **kwargs and hand "
+            "them to super().__init__(**kwargs)."
+        )
+    unknown = arguments.keys() - known
+    if unknown:
+        options = options_of(make) if isinstance(make, type) else known
+        raise UnknownOptionError(name, unknown, options)

@@ -162,7 +162,7 @@ class ArmEnvironment(Environment):
         else:
             self._track()
         self._steps += 1
-        if self.factory is not None and self._steps % self.draw_every == 0:
+        if self.factory and self._steps % self.draw_every == 0:
             self._draw_robots()
             self.update_visualization()
 
@@ -282,8 +282,6 @@ class ArmEnvironment(Environment):
     def init_visualization(self) -> None:
         """Add the arm; in the task ``"track"`` also its translucent reference and the error."""
         factory = self.factory
-        if factory is None:
-            return
         bodies = self.simulation.layout.bodies
         urdf, packages = str(self._robot.urdf), {k: str(v) for k, v in _package_dirs().items()}
         poses = self.simulation.body_poses()
@@ -298,8 +296,6 @@ class ArmEnvironment(Environment):
 
     def _draw_robots(self) -> None:
         factory = self.factory
-        if factory is None:
-            return
         factory.update_robot("arm", poses=self.simulation.body_poses())
         if self.task == "track":
             poses = self.simulation.body_poses(positions=self._reference)

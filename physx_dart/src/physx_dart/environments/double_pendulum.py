@@ -71,9 +71,8 @@ class DoublePendulumEnvironment(Environment):
 
     def init_visualization(self) -> None:
         """Add the pendulum."""
-        if self.factory is not None:
-            bodies, poses = self.simulation.layout.bodies, self.simulation.body_poses()
-            self.factory.add_robot("pendulum", str(URDF), bodies, poses=poses)
+        bodies, poses = self.simulation.layout.bodies, self.simulation.body_poses()
+        self.factory.add_robot("pendulum", str(URDF), bodies, poses=poses)
 
     def step(self) -> None:
         """Simulate the physics steps of a sample, or replay a stored sample."""
@@ -83,7 +82,7 @@ class DoublePendulumEnvironment(Environment):
             self.set_training_data(**{name: self.sample[name] for name in names})
         else:
             self._simulate()
-        if self.factory is not None:
+        if self.factory:
             self.factory.update_robot("pendulum", poses=self.simulation.body_poses())
             self.update_visualization()
 

@@ -237,6 +237,19 @@ class TorchNetwork(torch.nn.Module, Network):
         """Return the number of real numbers in the parameters; a complex one counts as two."""
         return sum(p.numel() * (2 if p.is_complex() else 1) for p in self.parameters())
 
+    def find_not_finite(self) -> str:
+        """Return the name of a parameter or buffer that is not finite; empty if there is none.
+
+        Buffers may hold infinity, as masks do.
+        """
+        for name, parameter in self.named_parameters():
+            if not torch.isfinite(parameter).all():
+                return name
+        for name, buffer in self.named_buffers():
+            if torch.isnan(buffer).any():
+                return name
+        return ""
+
     def save_parameters(self, path: Path) -> None:
         """Write parameters and buffers to a safetensors file.
 

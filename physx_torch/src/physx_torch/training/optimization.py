@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,6 +16,7 @@ from physx_core.components import Group
 from physx_core.errors import (
     CheckpointError,
     ConfigError,
+    DivergedError,
     FieldsMismatchError,
     UsageError,
     listed,
@@ -32,6 +33,7 @@ from physx_torch.training.training_forward import (
     run_in_precision,
 )
 
+_LEAST_SCALE = 1e-9
 Loss = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
@@ -101,6 +103,7 @@ class TorchOptimization(Optimization):
         self._network: TorchNetwork | None = None
         self._scaler: torch.amp.GradScaler | None = None
         self._is_shared = False
+        self._known: tuple[torch.Tensor | None, float] = (None, 0.0)  # the loss that was read
 
     def set_loss(self, loss: str | type[Any] | Loss | None) -> None:
         """Choose the loss function.
@@ -228,40 +231,102 @@ class TorchOptimization(Optimization):
 
     def transform_loss(self, loss: torch.Tensor, data: Tensors) -> dict[str, Any]:
         """Return ``{"loss": <number>}``."""
+        if loss is self._known[0]:  # read already: on a GPU reading it again waits for the step
+            number = self._known[1]
+            self._known = (None, 0.0)
+            return {"loss": number}
         return {"loss": loss.item()}
 
     def optimize(self, loss: torch.Tensor) -> None:
         """Update the parameters along the gradient of the loss, or of the mean of several batches.
 
+        With `stops_at_nan` the loss of each batch and the gradients of each step are looked at
+        before the step, which costs one norm of all gradients. Gradients that overflow in float16
+        are left to the scaler, which leaves out the step.
+
         Raises:
             UsageError: If there is no optimizer yet.
+            ConfigError: If the loss is not a single number.
+            DivergedError: If the loss or a gradient is not finite; the parameters are not changed.
         """
         optimizer, network = self._prepared("optimize")
+        if loss.numel() != 1:
+            raise ConfigError(
+                f"The loss has shape {tuple(loss.shape)} but must be a single number: use one that "
+                'reduces, for example with loss_kwargs={"reduction": "mean"}.'
+            )
         if self._accumulated == 0:
             _clear_gradients(optimizer)
-        if self._accumulate > 1:
-            loss = loss / self._accumulate
+        scaled = loss / self._accumulate if self._accumulate > 1 else loss
         if self._scaler is not None:
-            loss = self._scaler.scale(loss)
-        loss.backward()
+            scaled = self._scaler.scale(scaled)
+        scaled.backward()
         if self._is_shared:
             average_gradients(network)
         self._accumulated += 1
-        if self._accumulated >= self._accumulate:
+        is_due = self._accumulated >= self._accumulate
+        norms: Sequence[torch.Tensor] = ()
+        if is_due:
             self._accumulated = 0
-            self._step(optimizer, network)
+            norms = self._limit_gradients(optimizer, network)
+        if self.stops_at_nan:
+            self._check_finite(loss, norms, network)
+        if is_due:
+            self._step(optimizer)
+
+    def _limit_gradients(
+        self, optimizer: torch.optim.Optimizer, network: TorchNetwork
+    ) -> Sequence[torch.Tensor]:
+        """Scale large gradients down, and return norms that are finite if all gradients are."""
+        if self._gradient_clip is not None:
+            if self._scaler is not None:
+                self._scaler.unscale_(optimizer)
+            norm = torch.nn.utils.clip_grad_norm_(network.parameters(), self._gradient_clip)
+            return [norm] if self._scaler is None else ()
+        if self._scaler is not None or not self.stops_at_nan:
+            return ()
+        gradients = [
+            parameter.grad._values() if parameter.grad.is_sparse else parameter.grad
+            for group in optimizer.param_groups
+            for parameter in group["params"]
+            if parameter.grad is not None
+        ]
+        return torch._foreach_norm(gradients) if gradients else ()
+
+    def _check_finite(
+        self, loss: torch.Tensor, norms: Sequence[torch.Tensor], network: TorchNetwork
+    ) -> None:
+        """Raise if loss or gradients are not finite.
+
+        In a group of processes only the gradients are looked at, which all of them have in common.
+        """
+        values = [*norms] if self._is_shared else [loss.detach(), *norms]
+        if loss.is_cuda and values:  # waits for the GPU once
+            alike = [value.to(loss.device, torch.float32) for value in values]
+            numbers = torch.stack(alike).tolist()
+        else:
+            numbers = [value.item() for value in values]
+        if not self._is_shared:
+            self._known = loss, numbers[0]
+        if all(map(math.isfinite, numbers)):
+            return
+        what = "" if self._is_shared or math.isfinite(numbers[0]) else f"the loss is {numbers[0]}"
+        for name, gradient in network.get_gradients().items():
+            if what:
+                break
+            if not torch.isfinite(gradient).all():
+                what = f'the gradient of the parameter "{name}" holds NaN or infinity'
+        if what:  # else only the norm was too large for its type
+            self._accumulated, self._known = 0, (None, 0.0)
+            raise DivergedError(what)
 
     def _prepared(self, method: str) -> tuple[torch.optim.Optimizer, TorchNetwork]:
         if self.optimizer is None or self._network is None:
             raise UsageError(f"{method}() needs set_optimizer() before it.")
         return self.optimizer, self._network
 
-    def _step(self, optimizer: torch.optim.Optimizer, network: TorchNetwork) -> None:
+    def _step(self, optimizer: torch.optim.Optimizer) -> None:
         """Update the parameters along their gradients."""
-        if self._gradient_clip is not None:
-            if self._scaler is not None:
-                self._scaler.unscale_(optimizer)
-            torch.nn.utils.clip_grad_norm_(network.parameters(), self._gradient_clip)
         if self._scaler is None:
             optimizer.step()
         else:
@@ -290,7 +355,16 @@ class TorchOptimization(Optimization):
         return float(self.optimizer.param_groups[0]["lr"])
 
     def epoch_end(self, loss: float) -> None:
-        """Step the scheduler; see `Optimization.epoch_end`."""
+        """Step the scheduler; see `Optimization.epoch_end`.
+
+        Raises:
+            DivergedError: If gradients stayed infinite in float16 however little they were scaled.
+        """
+        if self.stops_at_nan and self._scaler and self._scaler.get_scale() < _LEAST_SCALE:
+            raise DivergedError(
+                "the gradients are not finite in float16, however little they are scaled; "
+                'mixed_precision="bfloat16" has a wider range'
+            )
         if isinstance(self.scheduler, ReduceLROnPlateau):
             if not math.isnan(loss):
                 self.scheduler.step(loss)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from physx_core import checkpoint
 from physx_core.components.group import Group
@@ -16,17 +19,29 @@ from physx_core.config import NetworkConfig
 from physx_core.errors import (
     CheckpointError,
     ConfigError,
+    DivergedError,
+    FieldShapeError,
+    FieldTypeError,
     MissingFieldError,
     PhysxError,
     UsageError,
     listed,
 )
-from physx_core.fields import Field
-from physx_core.plugins import import_component, resolve
+from physx_core.fields import NUMBERS, Field, is_finite
+from physx_core.pipelines.learning.components import create, create_network
+from physx_core.plugins import import_component
 from physx_core.plugins.networks import resolve_network
 from physx_core.plugins.references import check_recorded, is_of_plugin, is_recorded_as
 from physx_core.statistics import Normalization
 from physx_core.typing import Array, Batch, Tensors
+
+
+class _Step(NamedTuple):
+    """A batch on its way through the network, as tensors."""
+
+    data: Tensors
+    prediction: Tensors
+    loss: Any
 
 
 class Learner:
@@ -41,12 +56,13 @@ class Learner:
         group: The processes that train the network together.
     """
 
-    def __init__(self, config: NetworkConfig, *, trains: bool) -> None:
+    def __init__(self, config: NetworkConfig, *, trains: bool, stops_at_nan: bool = True) -> None:
         """Create the components.
 
         Args:
             config: The components and their arguments.
             trains: Whether an optimization is created too.
+            stops_at_nan: Whether `optimize` raises for a loss or gradient that is not finite.
 
         Raises:
             ConfigError: If no network is configured, or a component rejects its arguments.
@@ -56,12 +72,10 @@ class Learner:
             raise ConfigError(
                 'NetworkConfig.network is missing: name a network, for example "torch/fc".'
             )
-        make, arguments = resolve_network(config.network, config.network_kwargs)
-        self.network: Network = _create("network", config.network, make, arguments, Network)
+        self.network: Network = create_network(config)
         reference = config.transformation or self.network.default_transformation
-        make = resolve("transformation", reference)
-        self.transformation: Transformation = _create(
-            "transformation", reference, make, config.transformation_kwargs, Transformation
+        self.transformation: Transformation = create(
+            "transformation", reference, config.transformation_kwargs, Transformation
         )
         self.config = dataclasses.replace(config, transformation=reference)
         self.network.set_data_type(config.data_type)
@@ -72,12 +86,17 @@ class Learner:
         self._is_between_steps = False
         if trains:
             self.optimization = self._create_optimization(config)
+            self.optimization.stops_at_nan = stops_at_nan
 
     def _create_optimization(self, config: NetworkConfig) -> Optimization:
         reference = config.optimization or self.network.default_optimization
-        make = resolve("optimization", reference)
-        optimization: Optimization = _create(
-            "optimization", reference, make, config.optimization_kwargs, Optimization
+        if not reference:
+            raise ConfigError(
+                f"{type(self.network).__name__} names no default_optimization: choose what trains "
+                "it in NetworkConfig.optimization."
+            )
+        optimization: Optimization = create(
+            "optimization", reference, config.optimization_kwargs, Optimization
         )
         arguments = dict(config.optimizer_kwargs)
         if config.lr is not None:
@@ -115,43 +134,62 @@ class Learner:
         names = (*self.network.net_fields, *self.network.opt_fields, *extra)
         return list(dict.fromkeys(names))
 
-    def _compute_loss(self, optimization: Optimization, batch: Batch) -> tuple[Any, dict[str, Any]]:
-        """Return the loss of a batch in physical units, and the batch as tensors."""
+    def _compute_loss(self, optimization: Optimization, batch: Batch) -> _Step:
+        """Return the loss of a batch in physical units, and what it was computed from."""
         network, transformation = self.network, self.transformation
         data = network.numpy_to_tensor(batch)
         inputs = {name: data[name] for name in network.net_fields}
         targets = {name: data[name] for name in network.opt_fields}
-        prediction = network.predict(transformation.transform_before_prediction(inputs))
-        prediction, targets = transformation.transform_before_loss(prediction, targets)
-        return optimization.compute_loss(prediction, targets, data), data
+        predicted = network.predict(transformation.transform_before_prediction(inputs))
+        prediction, targets = transformation.transform_before_loss(predicted, targets)
+        return _Step(data, predicted, optimization.compute_loss(prediction, targets, data))
 
     def _trainer(self) -> Optimization:
         if self.optimization is None:
             raise UsageError("This network was created for prediction and cannot be trained.")
         return self.optimization
 
-    def optimize(self, batch: Batch) -> dict[str, Any]:
+    def optimize(self, batch: Batch) -> dict[str, float]:
         """Train on a batch and return the statistics of the step, ``loss`` first.
 
         In a group of processes each trains on its share; the statistics are those of the batch.
 
         Raises:
+            DivergedError: If the loss or a gradient is not finite, unless
+                `Optimization.stops_at_nan` is off.
             UsageError: If there is no optimization.
         """
         if self._is_between_steps:
             self._is_between_steps = False
             self.network.set_train()
         optimization, group = self._trainer(), self.group
-        if group.size == 1:
-            loss, data = self._compute_loss(optimization, batch)
-            optimization.optimize(loss)
-            return optimization.transform_loss(loss, data)
-        share, weight = group.share_of(batch)
-        loss, data = self._compute_loss(optimization, share)
-        optimization.optimize(loss * (weight * group.size))  # their mean is that of the batch
-        losses = optimization.transform_loss(loss, data)
-        totals = group.total([float(value) * weight for value in losses.values()])
-        return dict(zip(losses, totals, strict=True))
+        share, weight = (batch, 1.0) if group.size == 1 else group.share_of(batch)
+        step = self._compute_loss(optimization, share)
+        loss, stops = step.loss, optimization.stops_at_nan
+        if stops and isinstance(loss, (float, np.floating)) and not math.isfinite(loss):
+            raise DivergedError(self._explain(f"the loss is {loss}", step))
+        try:  # the mean of the weighted losses of a group is that of the batch
+            optimization.optimize(loss if group.size == 1 else loss * (weight * group.size))
+        except DivergedError as error:
+            raise DivergedError(self._explain(str(error), step)) from None
+        losses = _numbers(optimization, loss, step.data)
+        if group.size > 1:
+            totals = group.total([value * weight for value in losses.values()])
+            losses = dict(zip(losses, totals, strict=True))
+        if stops and not math.isfinite(losses["loss"]):
+            raise DivergedError(self._explain(f"the loss is {losses['loss']}", step))
+        return losses
+
+    def _explain(self, found: str, step: _Step) -> str:
+        """Return what is not finite, and the first place on the way to it that is not either."""
+        for what, tensors in (
+            ("the field", step.data),
+            ("the network's prediction", step.prediction),
+        ):
+            for name, array in self.network.tensor_to_numpy(tensors).items():
+                if not is_finite(array):
+                    return f'{found}, as {what} "{name}" holds NaN or infinity'
+        return f"{found}, though the batch and the network's prediction are finite"
 
     def mean_losses(self, batches: Iterable[Batch]) -> dict[str, float]:
         """Return the mean statistics over all samples of some batches, ``loss`` first.
@@ -167,9 +205,9 @@ class Learner:
             if self.group.size > 1:
                 share, weight = self.group.share_of(batch)
                 size *= weight
-            losses = optimization.transform_loss(*self._compute_loss(optimization, share))
-            for name, value in losses.items():
-                sums[name] = sums.get(name, 0.0) + float(value) * size
+            step = self._compute_loss(optimization, share)
+            for name, value in _numbers(optimization, step.loss, step.data).items():
+                sums[name] = sums.get(name, 0.0) + value * size
             count += size
         self.network.set_train()
         *totals, total = self.group.total([*sums.values(), count])
@@ -214,17 +252,19 @@ class Learner:
         if not self.fields:
             raise UsageError(
                 "get_prediction() before the first batch is made needs the shapes of the network's "
-                'fields: define them with Field("name", shape=...).'
+                "fields: set the step's training and additional data before it, or define the "
+                'fields with Field("name", shape=...).'
             )
         self._is_between_steps = True
         self.network.set_eval()
-        return self.predict(batch)
+        return self.answer(batch)
 
     def predict(self, batch: Batch) -> Batch:
         """Return the prediction for a batch, both in physical units.
 
         Raises:
             MissingFieldError: If the batch lacks a field that the network reads.
+            FieldShapeError: If the network fails because a field has another shape.
         """
         network = self.network
         try:
@@ -235,7 +275,38 @@ class Learner:
                 f"Given: {', '.join(batch) or 'none'}.",
                 field=str(error.args[0]),
             ) from None
-        return network.tensor_to_numpy(self._predict_tensors(network.numpy_to_tensor(read)))
+        try:
+            return network.tensor_to_numpy(self._predict_tensors(network.numpy_to_tensor(read)))
+        except PhysxError:
+            raise
+        except Exception:  # a library's own; shapes that networks accept beside those are fine
+            self._check_shapes(read)
+            raise
+
+    def answer(self, request: Batch) -> Batch:
+        """Return the prediction for inputs that an environment made, after checking them.
+
+        Raises:
+            MissingFieldError: If a field is missing that the network reads.
+            FieldShapeError: If a field has another shape than the network was trained with.
+            FieldTypeError: If a value is not an array of numbers.
+        """
+        self._check_shapes(request)
+        return self.predict(request)
+
+    def _check_shapes(self, inputs: Batch) -> None:
+        for name in self.network.net_fields:
+            values, field = inputs.get(name), self.fields.get(name)
+            if values is None or field is None:
+                continue
+            if values.dtype.kind not in NUMBERS:
+                raise FieldTypeError(f'field "{name}" does not consist of numbers.', field=name)
+            if field.shape is not None and values.shape[1:] != field.shape:
+                raise FieldShapeError(
+                    f'field "{name}" has shape {values.shape[1:]}, but the network takes '
+                    f"{field.shape}.",
+                    field=name,
+                )
 
     def _predict_tensors(self, inputs: Tensors) -> Tensors:
         """Return the prediction for the network's inputs, both in physical units."""
@@ -254,6 +325,14 @@ class Learner:
             progress,
             best=best,
         )
+
+    def rehearse(self, place: Path) -> None:
+        """Check that the network can be saved; writes into a folder of `place` and removes it.
+
+        Raises:
+            CheckpointError: If it cannot.
+        """
+        checkpoint.rehearse(place, self.network, self._trainer())
 
     def export(self, path: str | Path, form: str) -> None:
         """Write network and transformation into one file that other programs run.
@@ -383,17 +462,19 @@ def _check(
     check_recorded(kind, file, reference, arguments, advice, trust=trust)
 
 
-def _create(
-    kind: str, reference: Any, make: Any, arguments: dict[str, Any], base: type[Any]
-) -> Any:
-    try:
-        component = make(**arguments)
-    except TypeError as error:
-        raise ConfigError(f"The {kind} {reference!r} rejects its arguments: {error}.") from error
-    if not isinstance(component, base):
-        raise ConfigError(
-            f"{reference!r} returned a {type(component).__name__}, which is not a physx {kind}. "
-            "Use a function that returns a component of another library through its plugin, for "
-            'example network="torch/module", network_kwargs={"module": "package.module:function"}.'
-        )
-    return component
+def _numbers(optimization: Optimization, loss: Any, data: Tensors) -> dict[str, float]:
+    """Return the result of `Optimization.transform_loss` as numbers, without any graph."""
+    losses = optimization.transform_loss(loss, data)
+    method = f"{type(optimization).__name__}.transform_loss()"
+    if not isinstance(losses, Mapping) or "loss" not in losses:
+        given = listed(map(str, losses)) if isinstance(losses, Mapping) else type(losses).__name__
+        raise UsageError(f'{method} must return a dictionary with "loss", not {given}.')
+    numbers = {}
+    for name, value in losses.items():
+        try:
+            numbers[name] = float(value.item() if hasattr(value, "item") else value)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise UsageError(
+                f'{method} returned "{name}", which is not a number: {error}.'
+            ) from error
+    return numbers

@@ -87,6 +87,13 @@ class Producer:
         if self.failure is not None:
             raise RunEnded
 
+    def announce_early(self) -> None:
+        """Send the fields of the rows before the first row is done, if all shapes are known."""
+        fields, steps = self._instance.fields, self._credit > 0
+        if steps and self._buffer is None and all(field.shape is not None for field in fields):
+            self._buffer = RowBuffer(fields)
+            self._announce(self._buffer)
+
     def _make_row(self) -> None:
         instance = self._instance
         sample = instance.step(self._stored.popleft() if self._stored else None)

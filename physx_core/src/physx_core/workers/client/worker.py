@@ -100,7 +100,7 @@ class _Client:
         self.is_forsaken = False
         self._link, self._instance = link, instance
         self._producer = Producer(link, instance, skip["rows"], skip["rejected"])
-        self._services = RemoteServices(link, self._producer.flush, skip["shown"])
+        self._services = RemoteServices(link, self._producer, skip["shown"])
 
     def live(self, draw: bool) -> None:
         """Open the environment and make rows until the run ends or the environment fails."""
@@ -132,18 +132,19 @@ class _Client:
 class RemoteServices:
     """Services of the run, requested over the connection."""
 
-    def __init__(self, link: WorkerLink, flush: Callable[[], None], shown: int = 0) -> None:
+    def __init__(self, link: WorkerLink, producer: Producer, shown: int = 0) -> None:
         """Keep the connection.
 
         Args:
             link: Connection to the server.
-            flush: Sends what waits; called before each wait for an answer.
+            producer: Makes the rows; those that wait are sent before each wait for an answer.
             shown: How many messages with drawing events a predecessor sent.
         """
-        self._link, self._flush, self._to_skip = link, flush, shown
+        self._link, self._producer, self._to_skip = link, producer, shown
 
     def predict(self, fields: Sample) -> Sample:
         """Return the network's prediction: see `Services.predict`."""
+        self._producer.announce_early()
         prediction: Sample = self._ask(Kind.PREDICT, fields, "get_prediction()")
         return prediction
 
@@ -165,5 +166,5 @@ class RemoteServices:
         self._link.send(pack(Kind.SHOW, encode(plain, "update_visualization()"), step))
 
     def _ask(self, kind: Kind, value: Any, what: str) -> Any:
-        self._flush()
+        self._producer.flush()
         return self._link.ask(kind, value, what)
