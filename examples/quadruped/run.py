@@ -4,7 +4,7 @@
 above a limit of torques, 200 times a second, and an attitude filter that sees the inertial sensor
 alone. This script only says, 50 times a second, where the joints shall be.
 
-    pip install "physx-dart[robots]"
+    pip install "./physx_dart[robots]"
     python examples/quadruped/run.py                        # 20 s of walking
     python examples/quadruped/run.py --small                # 4 s
     python examples/quadruped/run.py --render quadruped.rrd # the same, and a recording for Rerun

@@ -51,13 +51,16 @@ def empty(tmp_path, run, wheels, root):
     return install
 
 
-def test_the_core_alone_generates_and_trains_and_torch_adds_its_network(empty, run):
+def test_the_core_alone_generates_and_trains_and_torch_adds_its_network(empty, run, wheels):
     python = empty("physx_core")
     listed = json.loads(run("-m", "pip", "list", "--format", "json", python=python).stdout)
     foreign = {"gymnasium", "torch", "dartpy", "pin", "rerun-sdk"}
     assert not foreign & {package["name"] for package in listed}
     generate = (*PHYSX, "generate", "toy/spring", "--batch-nb", 2, "--batch-size", 10)
     assert "20 samples" in run(*generate, python=python).stderr
+
+    def pip(name):
+        return f"pip install {next(wheels.glob(f'{name}-*.whl'))}"
 
     def train(network, *options, ok=True):
         words = (*PHYSX, "train", "sessions/data_generation", "--epoch-nb", 1, "--batch-size", 5)
@@ -71,11 +74,11 @@ def test_the_core_alone_generates_and_trains_and_torch_adds_its_network(empty, r
         "--network.loss", "MSELoss", "--network.optimizer", "Adam",
     )  # fmt: skip
     missing = train(*fc, ok=False)
-    assert missing.returncode == 1 and "pip install physx-torch" in missing.stderr
+    assert missing.returncode == 1 and pip("physx_torch") in missing.stderr
     missing = run(*PHYSX, "generate", "dart/arm", *generate[4:], python=python, ok=False)
-    assert missing.returncode == 1 and "pip install physx-dart" in missing.stderr
+    assert missing.returncode == 1 and pip("physx_dart") in missing.stderr
     missing = run(*PHYSX, "serve", python=python, ok=False)
-    assert missing.returncode == 1 and "pip install physx-remote" in missing.stderr
+    assert missing.returncode == 1 and pip("physx_remote") in missing.stderr
     empty("physx_torch")
     assert "training loss" in train(*fc).stderr
 

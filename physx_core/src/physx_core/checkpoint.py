@@ -32,6 +32,7 @@ from physx_core.components.optimization import Optimization
 from physx_core.config import NetworkConfig, to_plain
 from physx_core.errors import CheckpointError, PhysxError, SessionError, listed
 from physx_core.fields import Field
+from physx_core.origin import install_hint
 from physx_core.parsing import parse_toml
 from physx_core.statistics import Normalization
 
@@ -515,7 +516,7 @@ def _parse(content: bytes) -> dict[str, Any]:
 def _later(version: int) -> _UnreadableError:
     return _UnreadableError(
         f"it has version {version} of the format, but this physx reads up to {FORMAT_VERSION}",
-        "Update it: pip install --upgrade physx-core.",
+        install_hint("physx-core", update=True),
     )
 
 

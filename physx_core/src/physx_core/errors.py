@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from physx_core.origin import install_hint
+
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return `` Did you mean "x"?`` for the known name closest to `name`, or an empty string."""
@@ -30,6 +32,16 @@ def _listed_near(name: str, known: Sequence[str]) -> str:
         return listed(known)
     near = difflib.get_close_matches(name, known, n=8, cutoff=0.0)
     return f"{listed(near)} and {len(known) - len(near)} others (physx plugins)"
+
+
+def printable(text: object) -> str:
+    """Return text that cannot control a terminal: other characters than these are escaped.
+
+    Names in files and in packages' metadata come from strangers. Lines and tabs are kept.
+    """
+    return "".join(
+        each if each.isprintable() or each in "\n\t" else ascii(each)[1:-1] for each in str(text)
+    )
 
 
 class PhysxError(Exception):
@@ -92,11 +104,11 @@ class PluginNotFoundError(PhysxError):
         installed: Entry-point names of the installed plugins.
     """
 
-    def __init__(self, name: str, installed: Sequence[str], pip: str) -> None:
+    def __init__(self, name: str, installed: Sequence[str], hint: str) -> None:
         self.name, self.installed = name, list(installed)
         super().__init__(
             f'No plugin "{name}" is installed. Installed: {listed(installed)}.'
-            f"{nearest(name, installed)} To install it: {pip}"
+            f"{nearest(name, installed)} {hint}"
         )
 
 
@@ -266,7 +278,7 @@ class MissingLibraryError(PhysxError):
         self.library, self.extra = library, extra
         super().__init__(
             f'{purpose} needs the package "{library}", which is not installed. '
-            f'To install it: pip install "{distribution}[{extra}]"'
+            f"{install_hint(distribution, extra)}"
         )
 
 

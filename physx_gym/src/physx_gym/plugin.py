@@ -6,11 +6,15 @@ import functools
 
 import gymnasium
 
-from physx_core.plugins import Components, hookimpl
+from physx_core.plugins import Components, hookimpl, is_component_name
 from physx_gym.bridge.gym_environment import GymEnvironment
 
 
 @hookimpl
 def physx_environments() -> Components:
     """Return all environments that are registered with Gymnasium."""
-    return {id: functools.partial(GymEnvironment, id=id) for id in gymnasium.registry}
+    return {
+        id: functools.partial(GymEnvironment, id=id)
+        for id in gymnasium.registry
+        if is_component_name(id)
+    }

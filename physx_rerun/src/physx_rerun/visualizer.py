@@ -142,7 +142,7 @@ class RerunVisualizer(Visualizer):
                 f'"connect" with address="127.0.0.1:{self.port}"; otherwise leave port=0.'
             )
         options = ("--memory-limit", self.memory_limit, "--expect-data-soon")
-        self.viewer = Viewer(self.port, options, outlives=True)
+        self.viewer = Viewer(self.port, options, lives_on=True)
         self.viewer.wait_until_ready()
         self.viewer.check(wait=1.0)  # it listens before its window opens
         self._address = self.viewer.address

@@ -49,7 +49,7 @@ def test_a_file_gives_options_and_words_replace_them(capsys, tmp_path):
         ([*GENERATE, "--environment.num-client", "2"], "num-clients"),
         ([*GENERATE, "--environment.num-clients", "0"], "must be at least 1"),
         (["generate", "toy/sprin", *GENERATE[2:]], 'Did you mean "spring"'),
-        (["generate", "tooy/spring", *GENERATE[2:]], "pip install"),
+        (["generate", "tooy/spring", *GENERATE[2:]], "install the package"),
         (["generate", *GENERATE[2:]], "environment"),
         ([*GENERATE, "--environment.env-kwargs", "masss=1"], 'Did you mean "mass"'),
         ([*GENERATE, "--config", "none.toml"], "no configuration file"),

@@ -3,6 +3,7 @@ import pytest
 
 from physx_core import Dataset, Field
 from physx_core.cli import main
+from physx_core.origin import install_hint
 
 WIDTH = 100
 
@@ -173,4 +174,4 @@ def test_mistakes_end_with_one_clear_error(session, run, words, message):
 def test_a_missing_library_is_an_error_with_advice(session, run, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "zarr", None)
     status, _, err = run("export", session, "out", "--to", "zarr")
-    assert status == 1 and 'pip install "physx-core[zarr]"' in err
+    assert status == 1 and install_hint("physx-core", "zarr") in err

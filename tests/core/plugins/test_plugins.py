@@ -1,12 +1,20 @@
 import os
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
 from physx_core import Environment, plugins
 from physx_core.cli import command, main
-from physx_core.errors import ComponentNotFoundError, PluginNotFoundError, ReferenceFormError
+from physx_core.errors import (
+    ComponentNotFoundError,
+    PluginError,
+    PluginNotFoundError,
+    ReferenceFormError,
+)
+from physx_core.origin import install_hint
 from physx_core.plugins import registry
 from physx_core.plugins.references import locate
 
@@ -76,6 +84,152 @@ def test_broken_plugins_are_reported_and_the_rest_works(tmp_path):
     assert run.returncode == 1 and "claimed by" in run.stderr and "Traceback" not in run.stderr
 
 
+ENDS = {
+    "exits": (
+        "import sys; sys.exit(3)",
+        "fails to import plugin_of_exits_dist: it calls sys.exit(3)",
+    ),
+    "interrupts": (
+        "raise KeyboardInterrupt",
+        "fails to import plugin_of_interrupts_dist: Keyboard",
+    ),
+    "generator": ("raise GeneratorExit", "fails to import plugin_of_generator_dist: GeneratorExit"),
+    "hook-exits": (
+        GOOD.replace("return", "raise SystemExit #"),
+        "fails in a hook: it calls sys.exit",
+    ),
+}
+
+
+def test_plugins_that_end_the_process_break_only_themselves(tmp_path):
+    for name, (code, _) in ENDS.items():
+        add_plugin(tmp_path, name, code)
+    add_plugin(tmp_path, "zebra", GOOD)
+    listing = physx(tmp_path, "plugins")
+    assert listing.returncode == 0, listing.stderr
+    for name, (_, said) in ENDS.items():
+        assert f'broken: Plugin "{name}" ({name}-dist 1.0) {said}' in listing.stdout
+    assert "environment: zebra/spring" in listing.stdout
+    code = 'import sys\nif __name__ != "__main__": sys.exit(3)\n'
+    add_plugin(tmp_path, "leave", code, group="physx.commands")
+    run = physx(tmp_path, "leave")
+    assert run.returncode == 1 and "physx leave (leave-dist 1.0) fails to import" in run.stderr
+
+
+def test_components_that_end_the_process_break_only_themselves(tmp_path, monkeypatch):
+    add_plugin(tmp_path, "lazy", GOOD.replace("Spring}", '"ends_at_import:Spring"}'))
+    (tmp_path / "ends_at_import.py").write_text("raise SystemExit")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(
+        PluginError, match='"lazy" fails to import its environment "spring": it calls'
+    ):
+        plugins.resolve("environment", "lazy/spring")
+
+
+HANG = "import time\ntime.sleep(600)\n"
+STUBBORN = "import time\nfor _ in range(2):\n  try: time.sleep(600)\n  except BaseException: pass\n"
+
+
+@pytest.mark.parametrize("code", [HANG, STUBBORN, "while True: pass"])
+def test_a_plugin_that_never_ends_to_import_is_named_and_given_up(tmp_path, monkeypatch, code):
+    monkeypatch.setenv("PHYSX_IMPORT_TIMEOUT", "0.5")
+    add_plugin(tmp_path, "hang", code)
+    add_plugin(tmp_path, "zebra", GOOD)
+    listing = physx(tmp_path, "plugins")
+    assert listing.returncode == 0, listing.stderr
+    assert 'physx: Plugin "hang" (hang-dist 1.0) is still loading' in listing.stderr
+    assert "broken: " in listing.stdout and "environment: zebra/spring" in listing.stdout
+    if code is not STUBBORN:
+        assert 'Plugin "hang" (hang-dist 1.0) fails to import' in listing.stdout
+        assert "it takes longer than 0.5 s (PHYSX_IMPORT_TIMEOUT" in listing.stdout
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_during_an_import_ends_the_command_all_the_same(tmp_path, number, status):
+    add_plugin(tmp_path, "hang", f"open('begun', 'w').close()\n{HANG}")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "physx_core", "plugins"],
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+    )
+    with process:
+        deadline = time.monotonic() + 60
+        while not (tmp_path / "begun").exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        process.send_signal(number)
+        out, error = process.communicate(timeout=60)
+    assert process.returncode == status
+    assert "Traceback" not in error and out.rstrip().endswith("(hang-dist 1.0)")
+
+
+def test_a_plugin_that_crashes_the_interpreter_can_be_told(tmp_path):
+    add_plugin(tmp_path, "crash", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    listing = physx(tmp_path, "plugins")
+    assert listing.returncode == -signal.SIGSEGV
+    assert listing.stdout.rstrip().endswith("crash  (crash-dist 1.0)")
+    assert "plugin_of_crash_dist.py" in listing.stderr
+
+
+GARBAGE = {
+    "no-value": b"[physx]\nnonsense\n",
+    "not-text": b"[physx]\n\xff\xfe = \x00\n",
+    "no-section": b"a = b\n= =\nc\n",
+    "lone-bracket": b"[physx\nx\n",
+}
+
+
+def test_garbage_in_the_metadata_of_a_package_is_told_and_breaks_nothing_else(tmp_path):
+    for name, content in GARBAGE.items():
+        info = tmp_path / f"{name.replace('-', '_')}-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_bytes(content)
+    (tmp_path / "empty-1.0.dist-info").mkdir()
+    add_plugin(tmp_path, "zebra", GOOD)
+    (tmp_path / "zebra_dist-1.0.dist-info" / "METADATA").write_bytes(b"\x1b]0;owned\x07")
+    listing = physx(tmp_path, "plugins")
+    assert listing.returncode == 0, listing.stderr
+    assert "environment: zebra/spring" in listing.stdout
+    for name in GARBAGE:
+        assert f"The entry points of the package {name} cannot be read: " in listing.stdout
+    assert "\x1b" not in listing.stdout + listing.stderr
+    run = physx(tmp_path, "generate", "zebra/spring", "--batch-nb", "1", "--batch-size", "2")
+    assert run.returncode == 0, run.stderr
+    run = physx(tmp_path, "generate", "nonsense/spring", "--batch-nb", "1", "--batch-size", "2")
+    assert run.returncode == 1 and "entry points of lone-bracket, no-section" in run.stderr
+
+
+@pytest.mark.parametrize(
+    "name", ["1: 2", "None", "'': 1", "'a//b'", "'/a'", "'a b'", "'a:b'", "'\\x1b[31mred'", "'-a'"]
+)
+def test_a_component_with_an_impossible_name_breaks_its_plugin(tmp_path, monkeypatch, name):
+    given = "{" + (name if ": " in name else f"{name}: 1").replace(": 2", ": Spring") + "}"
+    add_plugin(
+        tmp_path, "strange", GOOD.replace('{"spring": Spring}', given.replace(": 1", ": Spring"))
+    )
+    listing = physx(tmp_path, "plugins")
+    assert listing.returncode == 0 and "\x1b" not in listing.stdout
+    assert (
+        'Plugin "strange" (strange-dist 1.0) fails in a hook: physx_environments()'
+        in listing.stdout
+    )
+    assert "environment: toy/spring" in listing.stdout
+
+
+def test_a_plugin_with_an_impossible_name_is_broken_and_printed_harmlessly(tmp_path):
+    add_plugin(tmp_path, "\x1b[31mred", GOOD, "red-dist")
+    add_plugin(tmp_path, "a/b", GOOD, "slash-dist")
+    add_plugin(tmp_path, "\x1b[2J", GOOD, "command-dist", "physx.commands")
+    listing = physx(tmp_path, "plugins")
+    assert listing.returncode == 0 and "\x1b" not in listing.stdout
+    assert "\\x1b[31mred  (red-dist 1.0)" in listing.stdout
+    assert 'Plugin "a/b" (slash-dist 1.0) cannot have this name' in listing.stdout
+    assert "\x1b" not in physx(tmp_path, "--help").stdout
+
+
 def test_commands_of_other_packages(tmp_path):
     code = '"""``physx wave``: wave at the user."""\ndef run(words):\n    print("hello", *words)\n'
     for name, text, distribution in (
@@ -115,20 +269,20 @@ def test_commands_of_other_packages(tmp_path):
 def test_a_command_of_a_missing_package_names_it(name, package, monkeypatch, capsys):
     monkeypatch.setattr(command, "find_entries", lambda group: {})
     assert main([name]) == 1
-    assert f"pip install {package}" in capsys.readouterr().err
+    assert install_hint(package) in capsys.readouterr().err
 
 
-def test_unknown_plugins_say_what_is_there_and_the_pip_line():
-    with pytest.raises(PluginNotFoundError, match='Did you mean "toy".*pip install') as caught:
+def test_unknown_plugins_say_what_is_there_and_that_they_are_none_of_physx():
+    with pytest.raises(PluginNotFoundError, match='Did you mean "toy".*none of physx') as caught:
         plugins.resolve("environment", "tooy/spring")
     assert "toy" in caught.value.installed
 
 
 def test_a_missing_plugin_of_the_project_names_its_package(monkeypatch):
     monkeypatch.setattr(registry, "find_entries", lambda group: {})
-    with pytest.raises(PluginNotFoundError, match="pip install physx-dart"):
+    with pytest.raises(PluginNotFoundError, match="physx_dart$"):
         plugins.resolve("environment", "dart/arm")
-    with pytest.raises(PluginNotFoundError, match="pip install physx-gym"):
+    with pytest.raises(PluginNotFoundError, match="physx_gym$"):
         plugins.resolve("environment", "gym/env")
 
 

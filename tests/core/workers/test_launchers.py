@@ -13,7 +13,7 @@ import pytest
 
 from physx_core import ClientHandle, Environment, Launcher, plugins
 from physx_core.errors import ClientError, ComponentNotFoundError, ConfigError
-from physx_core.workers.processes.launchers import (
+from physx_core.workers.launchers import (
     ClientProcess,
     ManualLauncher,
     SubprocessLauncher,

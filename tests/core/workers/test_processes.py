@@ -16,7 +16,7 @@ import pytest
 
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.workers.client.worker import run_client
-from physx_core.workers.processes.launchers import ClientProcess, stop
+from physx_core.workers.launchers import ClientProcess, stop
 
 ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
 

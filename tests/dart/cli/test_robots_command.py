@@ -2,6 +2,7 @@ import pytest
 
 from physx_core import Backend, plugins
 from physx_core.cli import main
+from physx_core.origin import install_hint
 from physx_core.plugins import Plugin
 from physx_core.simulation import RobotInfo
 
@@ -42,7 +43,7 @@ def test_robots_of_all_backends_are_listed_once(only, capsys):
 def test_without_backends_it_names_the_package_to_install(only, capsys):
     only()
     assert main(["robots"]) == 0
-    assert "pip install physx-dart" in capsys.readouterr().out
+    assert install_hint("physx-dart") in capsys.readouterr().out
 
 
 def test_it_takes_no_options(capsys):

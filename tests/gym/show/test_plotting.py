@@ -115,7 +115,7 @@ def test_an_environment_plots_its_episode(tmp_path):
 
 def test_the_error_of_missing_matplotlib_names_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(MissingLibraryError, match=r'pip install "physx-gym\[plot\]"'):
+    with pytest.raises(MissingLibraryError, match=r'pip install .*physx.gym\[plot\]"'):
         plot(log_of("a"))
 
 

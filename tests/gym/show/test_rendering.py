@@ -117,7 +117,7 @@ def test_the_error_of_a_missing_viewer_names_the_remedy():
     env = RobotEnv("cartpole", 0.02, render_mode="rgb_array")
     env.viewer_kwargs["visualizer"] = "rerunn"
     env.reset(seed=0)
-    with pytest.raises(PluginNotFoundError, match="pip install"):
+    with pytest.raises(PluginNotFoundError, match='Did you mean "rerun"'):
         env.render()
 
 

@@ -2,3 +2,4 @@
 
 from .arguments import argument_registry as argument_registry
 from .command import main as main
+from .output import show as show

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import faulthandler
 import importlib.util
+import io
 import os
 import signal
 import sys
@@ -11,7 +14,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from physx_core.errors import PhysxError, PluginError, UsageError, nearest
+from physx_core.errors import PhysxError, PluginError, UsageError, nearest, printable
+from physx_core.origin import install_hint
+from physx_core.pipelines.interrupt import Terminated, raised_at_sigterm
 from physx_core.plugins.entries import (
     COMMANDS,
     OFFICIAL,
@@ -19,6 +24,7 @@ from physx_core.plugins.entries import (
     find_entries,
     owner_of,
 )
+from physx_core.plugins.loading import loading
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -28,64 +34,78 @@ _ORDER = (
     *("export", "import", "export-network", "client", "plugins"),
 )
 """Order of the core's commands in the overview; others follow by name."""
-_TERMINATED = 128 + signal.SIGTERM
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status.
 
-    It is 0, 1 after an error, 130 after Ctrl-C, and 143 after SIGTERM.
+    Returns:
+        0; 1 after an error; 130 after Ctrl-C; 143 after SIGTERM, with which a command ends as
+        orderly as with Ctrl-C.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [word for word in words if word != "--debug"]
     try:
-        if not words or words[0] in ("-h", "--help"):
-            print(_overview())
-            return 0
-        if words[0] == "--version":
-            from physx_core import __version__
-
-            print(f"physx {__version__}")
-            return 0
-        return _run(words[0], words[1:])
+        _show_crashes()
+        with raised_at_sigterm():
+            return _dispatch(words)
     except PhysxError as error:
         if debug:
-            traceback.print_exception(error)
-        print(_message(error, debug), file=sys.stderr)
+            sys.stderr.write(printable("".join(traceback.format_exception(error))))
+        print(printable(_message(error, debug)), file=sys.stderr)
         return 1
     except BrokenPipeError:  # the reader has closed the pipe, as in  physx info DIR | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except KeyboardInterrupt:
-        print("physx: interrupted; committed samples are kept", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as error:
+        return _interrupted(error, "interrupted", signal.SIGINT)
+    except Terminated as error:
+        return _interrupted(error, "terminated", signal.SIGTERM)
+    except SystemExit as end:  # raised by the parser after --help or an invalid option
+        return 1 if end.code else 0
 
 
-def _run(name: str, words: list[str]) -> int:
+def _show_crashes() -> None:
+    """Show where an engine or a plugin crashes."""
+    if not faulthandler.is_enabled():
+        with contextlib.suppress(io.UnsupportedOperation, AttributeError):  # there is no stderr
+            faulthandler.enable()
+
+
+def _interrupted(error: BaseException, how: str, number: signal.Signals) -> int:
+    text = "; ".join([how, *getattr(error, "__notes__", [])])
+    print(f"physx: {printable(text)}", file=sys.stderr)
+    return 128 + number
+
+
+def _dispatch(words: list[str]) -> int:
+    if not words or words[0] in ("-h", "--help"):
+        print(_overview())
+        return 0
+    if words[0] == "--version":
+        from physx_core import __version__
+
+        print(f"physx {__version__}")
+        return 0
+    _run(words[0], words[1:])
+    return 0
+
+
+def _run(name: str, words: list[str]) -> None:
     commands = find_entries(COMMANDS)
     if name not in commands:
         package = OFFICIAL.get((COMMANDS, name))
         if package is not None:
-            raise UsageError(f"physx {name} is part of {package}: pip install {package}")
+            raise UsageError(f"physx {name} is part of {package}. {install_hint(package)}")
         guess = nearest(name, commands)
         raise UsageError(f'There is no command "{name}".{guess} See physx --help.')
     entry, *others = commands[name]
     if others:
         raise PluginError(name, describe_conflict("command", commands[name]))
-    try:
+    with loading(name, f"physx {name} ({owner_of(entry)})", f"fails to import {entry.value}"):
         run = entry.load().run
-    except Exception as error:  # a package's own import may fail in any way
-        text = f"physx {name} ({owner_of(entry)}) fails to import {entry.value}: {error}"
-        raise PluginError(name, text) from error
-    try:
-        run(words)
-    except SystemExit as end:  # raised by the parser, or after SIGTERM
-        if end.code == _TERMINATED:
-            print("physx: terminated; committed samples are kept", file=sys.stderr)
-            return _TERMINATED
-        return 1 if end.code else 0
-    return 0
+    run(words)
 
 
 def _overview() -> str:
@@ -93,7 +113,7 @@ def _overview() -> str:
     names = [name for name in _ORDER if name in commands]
     names += [name for name in commands if name not in _ORDER]
     width = max(map(len, names), default=0)
-    lines = "\n".join(f"  {name:{width}}  {_summary(commands[name])}" for name in names)
+    lines = printable("\n".join(f"  {name:{width}}  {_summary(commands[name])}" for name in names))
     return (
         "physx: connect physics engines with deep learning (not NVIDIA PhysX)\n\n"
         f"usage: physx COMMAND [OPTIONS]\n\n{lines}\n\n"

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from physx_core.cli.output import show
 from physx_core.dataset import Dataset
 from physx_core.dataset.read.episodes import episode_lengths
 from physx_core.errors import DatasetError
@@ -30,15 +31,15 @@ def print_dataset(place: Path, *, verify: bool) -> None:
     with Dataset.open(place) as dataset:
         rows = dataset.describe()
         total = sum(row["bytes"] for row in rows)
-        print(f"dataset {dataset.directory}: {size(total)}")
+        show(f"dataset {dataset.directory}: {size(total)}")
         for line in _origin(dataset):
-            print(line)
+            show(line)
         for mode in dict.fromkeys(row["mode"] for row in rows):
-            print()
+            show()
             _print_mode(dataset, mode, [row for row in rows if row["mode"] == mode])
         if not rows:
-            print("  no samples")
-        print()
+            show("  no samples")
+        show()
         _print_integrity(dataset, content=verify)
 
 
@@ -68,14 +69,14 @@ def _origin(dataset: Dataset) -> list[str]:
 def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> None:
     nbytes, partitions = sum(row["bytes"] for row in rows), rows[0]["partitions"]
     samples, files = count(rows[0]["samples"], "sample"), count(partitions, "partition")
-    print(f"{mode}: {samples}, {size(nbytes)} in {files}")
+    show(f"{mode}: {samples}, {size(nbytes)} in {files}")
     try:
         stored = dataset.num_samples(mode)
         if stored:
-            print(f"  reading strategy: {dataset.reading_strategy(mode)}")
+            show(f"  reading strategy: {dataset.reading_strategy(mode)}")
             _print_episodes(dataset, mode, stored)
     except DatasetError as error:
-        print(textwrap.fill(f"damaged: {error}", _WIDTH, initial_indent="  "))
+        show(textwrap.fill(f"damaged: {error}", _WIDTH, initial_indent="  "))
         stored = 0
     _print_table(
         ["field", "role", "type", "shape", "size", "unit"],
@@ -103,18 +104,18 @@ def _print_episodes(dataset: Dataset, mode: str, samples: int) -> None:
     least, most = lengths.min(), lengths.max()
     steps = f"{least:,}" if least == most else f"{least:,} to {most:,}"
     of = count(instances, "instance")
-    print(f"  trajectories: {len(lengths):,} of {of}, {steps} samples each")
+    show(f"  trajectories: {len(lengths):,} of {of}, {steps} samples each")
 
 
 def _print_normalization(dataset: Dataset, mode: str) -> None:
     try:
         found = dataset.normalization_of(mode)
     except DatasetError as error:
-        print(textwrap.fill(f"normalization: {error}", _WIDTH, initial_indent="  "))
+        show(textwrap.fill(f"normalization: {error}", _WIDTH, initial_indent="  "))
         return
     lines = [line for name, item in found.items() for line in _components(name, item)]
     if lines:
-        print()
+        show()
         _print_table(["normalization", "component", "mean", "std", "min", "max"], lines)
 
 
@@ -141,9 +142,9 @@ def _print_integrity(dataset: Dataset, *, content: bool) -> None:
     problems = dataset.verify(content=content)
     what = "every byte was checked" if content else "sizes and headers; --verify checks every byte"
     found = count(len(problems), "problem") if problems else "sound"
-    print(f"integrity: {found} ({what})")
+    show(f"integrity: {found} ({what})")
     for text in problems:
-        print(textwrap.fill(text, _WIDTH, initial_indent="  ", subsequent_indent="    "))
+        show(textwrap.fill(text, _WIDTH, initial_indent="  ", subsequent_indent="    "))
 
 
 def _print_table(names: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
@@ -156,4 +157,4 @@ def _print_table(names: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
         for number, part in enumerate(wrapped):
             shown = line[:-1] if number == 0 else [""] * (len(line) - 1)
             parts = [f"{cell:{width}}" for cell, width in zip(shown, widths, strict=False)]
-            print("  " + "  ".join([*parts, part]).rstrip())
+            show("  " + "  ".join([*parts, part]).rstrip())

@@ -3,6 +3,7 @@
 from .hookspecs import KINDS as KINDS
 from .hookspecs import Components as Components
 from .hookspecs import hookimpl as hookimpl
+from .hookspecs import is_component_name as is_component_name
 from .references import find as find
 from .references import import_component as import_component
 from .references import reference_of as reference_of

@@ -9,8 +9,8 @@ from physx_core.plugins.hookspecs import Components, hookimpl
 def physx_launchers() -> Components:
     """Return the launchers, which are imported when clients are started."""
     return {
-        "subprocess": "physx_core.workers.processes.launchers:SubprocessLauncher",
-        "manual": "physx_core.workers.processes.launchers:ManualLauncher",
+        "subprocess": "physx_core.workers.launchers:SubprocessLauncher",
+        "manual": "physx_core.workers.launchers:ManualLauncher",
     }
 
 

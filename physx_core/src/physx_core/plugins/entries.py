@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # it takes a third of a client's start, and few clients need it
-    from importlib.metadata import EntryPoint
+    from importlib.metadata import Distribution, EntryPoint
 
 PLUGINS = "physx"
 """Entry-point group of the plugins."""
@@ -31,7 +31,16 @@ OFFICIAL = {
 
 def find_entries(group: str) -> dict[str, list[EntryPoint]]:
     """Return the entry points of a group by name: more than one if several packages claim it."""
-    return _read_entries(tuple((entry, _last_change(entry)) for entry in sys.path))[group]
+    return _read_entries(_installed())[0][group]
+
+
+def find_unreadable() -> dict[str, str]:
+    """Return the packages whose entry points cannot be read, with what is wrong with them."""
+    return _read_entries(_installed())[1]
+
+
+def _installed() -> tuple[tuple[str, int], ...]:
+    return tuple((entry, _last_change(entry)) for entry in sys.path)
 
 
 def _last_change(folder: str) -> int:
@@ -45,12 +54,30 @@ def _last_change(folder: str) -> int:
 @functools.lru_cache(maxsize=1)
 def _read_entries(
     installed: tuple[tuple[str, int], ...],
-) -> dict[str, dict[str, list[EntryPoint]]]:
-    """Read the metadata of all packages, once for both groups; cached until one is installed."""
-    from importlib.metadata import entry_points
+) -> tuple[dict[str, dict[str, list[EntryPoint]]], dict[str, str]]:
+    """Read the metadata of all packages, once for both groups; cached until one is installed.
 
-    everything = entry_points()
-    return {group: _by_name(everything.select(group=group)) for group in (PLUGINS, COMMANDS)}
+    Returns:
+        Group to name to entry points, and the packages that cannot be read.
+    """
+    from importlib.metadata import distributions
+
+    found: list[EntryPoint] = []
+    unreadable: dict[str, str] = {}
+    seen: set[str] = set()
+    for package in distributions():
+        try:
+            # From the folder's name, as importlib.metadata does it; reading all names takes long.
+            name = getattr(package, "_normalized_name", None) or _name_of(package)
+            if name not in seen:  # Python imports from the first folder that contains it
+                found += package.entry_points
+            seen.add(name)
+        except Exception as error:  # it is another package's file and may hold anything
+            unreadable[_name_of(package)] = f"{type(error).__name__}: {error}"
+    groups = (PLUGINS, COMMANDS)
+    return {
+        group: _by_name(entry for entry in found if entry.group == group) for group in groups
+    }, unreadable
 
 
 def _by_name(entries: Iterable[EntryPoint]) -> dict[str, list[EntryPoint]]:
@@ -65,7 +92,21 @@ def _by_name(entries: Iterable[EntryPoint]) -> dict[str, list[EntryPoint]]:
 
 def owner_of(entry: EntryPoint) -> str:
     """Return name and version of the distribution that contains an entry point."""
-    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
+    if entry.dist is None:
+        return entry.value
+    try:
+        version = entry.dist.version
+    except Exception:  # its metadata are damaged
+        version = "without a version"
+    return f"{_name_of(entry.dist)} {version}"
+
+
+def _name_of(package: Distribution) -> str:
+    """Return the name of a package, or where it lies if its metadata do not say it."""
+    try:
+        return str(package.metadata["Name"] or package.locate_file(""))
+    except Exception:  # its metadata are damaged
+        return str(package.locate_file(""))
 
 
 def describe_conflict(kind: str, entries: list[EntryPoint]) -> str:

@@ -3,10 +3,15 @@
 Each returns a dictionary from a component's name to the component: a class, a function that takes
 the component's keyword arguments and returns it, or a reference ``"package.module:Name"`` that is
 imported when the component is first used.
+
+The name of a plugin, and that of a component, consists of letters, digits, "_", "-" and ".", and
+begins with none of the latter two. A component's name may have several such parts with "/" between
+them, as ids of Gymnasium have.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +20,8 @@ import pluggy
 from physx_core.plugins.entries import PLUGINS
 
 Components = dict[str, type[Any] | Callable[..., Any] | str]
+
+_NAME = r"\w[\w.-]*"
 
 hookspec = pluggy.HookspecMarker(PLUGINS)
 hookimpl = pluggy.HookimplMarker(PLUGINS)
@@ -29,6 +36,16 @@ KINDS = {
     "launcher": "physx_launchers",
 }
 """Kind of component to the hook that returns it."""
+
+
+def is_plugin_name(name: Any) -> bool:
+    """Return whether a plugin may have this name."""
+    return isinstance(name, str) and re.fullmatch(_NAME, name) is not None
+
+
+def is_component_name(name: Any) -> bool:
+    """Return whether a component may have this name."""
+    return isinstance(name, str) and re.fullmatch(f"{_NAME}(/{_NAME})*", name) is not None
 
 
 @hookspec

@@ -21,11 +21,11 @@ from physx_core.config import reference_of as reference_of
 from physx_core.errors import (
     ComponentNotFoundError,
     PhysxError,
-    PluginError,
     ReferenceFormError,
     UntrustedReferenceError,
 )
 from physx_core.plugins.hookspecs import KINDS
+from physx_core.plugins.loading import loading
 from physx_core.plugins.registry import available, load
 
 if TYPE_CHECKING:
@@ -287,12 +287,9 @@ def find(kind: str, reference: Any) -> Any:
     component = components[name]
     if not isinstance(component, str):
         return component
-    try:
+    with loading(plugin_name, f'Plugin "{plugin_name}"', f'fails to import its {kind} "{name}"'):
         place, _, attribute = component.rpartition(":")
         return getattr(importlib.import_module(place), attribute)
-    except Exception as error:  # a plugin's own import may fail in any way
-        text = f'Plugin "{plugin_name}" fails to import its {kind} "{name}": {error}'
-        raise PluginError(plugin_name, text) from error
 
 
 def _module(kind: str, place: str) -> ModuleType:

@@ -8,19 +8,24 @@ from typing import TYPE_CHECKING
 
 import pluggy
 
-from physx_core.errors import PluginError, PluginNotFoundError
+from physx_core.errors import PluginError, PluginNotFoundError, listed
+from physx_core.origin import install_hint
 from physx_core.plugins import hookspecs
 from physx_core.plugins.entries import (
     OFFICIAL,
     PLUGINS,
     describe_conflict,
     find_entries,
+    find_unreadable,
     owner_of,
 )
-from physx_core.plugins.hookspecs import KINDS, Components
+from physx_core.plugins.hookspecs import KINDS, Components, is_component_name, is_plugin_name
+from physx_core.plugins.loading import loading
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
+
+_NAMES = 'names consist of letters, digits, "_", "-" and "."'
 
 
 @dataclass(frozen=True)
@@ -71,8 +76,7 @@ def load(name: str) -> Plugin:
     """
     found = find_entries(PLUGINS)
     if name not in found:
-        package = OFFICIAL.get((PLUGINS, name), f"<the package that contains {name}>")
-        raise PluginNotFoundError(name, list(found), f"pip install {package}")
+        raise PluginNotFoundError(name, list(found), _hint(name))
     if len(found[name]) > 1:
         raise PluginError(name, describe_conflict("plugin", found[name]))
     return _load(found[name][0])
@@ -81,15 +85,11 @@ def load(name: str) -> Plugin:
 @functools.cache
 def _load(entry: EntryPoint) -> Plugin:
     info = PluginInfo(entry.name, (owner_of(entry),), entry.value)
-
-    def plugin_error(what: str, error: BaseException) -> PluginError:
-        text = f'Plugin "{entry.name}" ({info.distributions[0]}) {what}: {error}'
-        return PluginError(entry.name, text)
-
-    try:
+    who = f'Plugin "{entry.name}" ({info.distributions[0]})'
+    if not is_plugin_name(entry.name):
+        raise PluginError(entry.name, f"{who} cannot have this name: {_NAMES}.")
+    with loading(entry.name, who, f"fails to import {entry.value}"):
         module = entry.load()
-    except Exception as error:  # whatever a plugin raises on import breaks that plugin only
-        raise plugin_error(f"fails to import {entry.value}", error) from error
     manager = pluggy.PluginManager(PLUGINS)
     manager.add_hookspecs(hookspecs)
     try:
@@ -97,11 +97,10 @@ def _load(entry: EntryPoint) -> Plugin:
         manager.check_pending()
     except pluggy.PluginValidationError as error:
         known = ", ".join(KINDS.values())
-        raise plugin_error(f"has an unknown hook (known: {known})", error) from error
-    try:
+        text = f"{who} has an unknown hook (known: {known}): {error}"
+        raise PluginError(entry.name, text) from error
+    with loading(entry.name, who, "fails in a hook"):
         components = {kind: _call(manager, hook) for kind, hook in KINDS.items()}
-    except Exception as error:  # likewise for its hooks
-        raise plugin_error("fails in a hook", error) from error
     return Plugin(info, {kind: given for kind, given in components.items() if given})
 
 
@@ -110,5 +109,18 @@ def _call(manager: pluggy.PluginManager, hook: str) -> Components:
     for given in getattr(manager.hook, hook)():
         if not isinstance(given, dict):
             raise TypeError(f"{hook}() returned {type(given).__name__}, not a dictionary")
+        for name in given:
+            if not is_component_name(name):
+                raise ValueError(f"{hook}() names a component {name!r}: {_NAMES}")
         merged.update(given)
     return merged
+
+
+def _hint(name: str) -> str:
+    """Return what to do about a plugin that is not installed."""
+    if (PLUGINS, name) in OFFICIAL:
+        return install_hint(OFFICIAL[PLUGINS, name])
+    unreadable = find_unreadable()
+    if unreadable:
+        return f"The entry points of {listed(unreadable)} cannot be read: reinstall or remove it."
+    return "It is none of physx's own: install the package that contains it."

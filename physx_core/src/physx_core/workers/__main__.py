@@ -11,8 +11,8 @@ import sys
 
 from physx_core.errors import PhysxError
 from physx_core.net.handshake import TOKEN_VARIABLE
+from physx_core.processes import kill_descendants
 from physx_core.workers.client.worker import run_client
-from physx_core.workers.processes.descendants import kill_descendants
 
 
 def main() -> int:

@@ -9,7 +9,6 @@ import contextlib
 import os
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
 import weakref
@@ -19,6 +18,7 @@ import numpy as np
 
 from physx_core import Closeable
 from physx_core.errors import SimulationError
+from physx_core.processes import ChildProcess
 from physx_core.typing import Vector
 from physx_dart.batch.worker import (
     DONE,
@@ -120,24 +120,18 @@ class _Worker:
         """
         self._link, theirs = socket.socketpair()
         held.enter_context(self._link)
-        command = [sys.executable, "-P", "-m", "physx_dart.batch.worker", str(file)]
+        passed = [theirs.fileno(), file]
+        command = [sys.executable, "-P", "-m", "physx_dart.batch.worker", *map(str, passed)]
         # The processes share the cores: numerical libraries must not use all of them in each.
-        environment = {"OMP_NUM_THREADS": "1", **os.environ}
+        threads = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
         with theirs:
             try:
-                self._process = subprocess.Popen(
-                    command,
-                    stdin=theirs.fileno(),
-                    env=environment,
-                    pass_fds=[file],
-                    start_new_session=True,
-                )
+                self._process = ChildProcess(command, variables=threads, pass_fds=passed)
             except OSError as error:
                 raise SimulationError(
                     f"A process for batches cannot be started: {error}."
                 ) from error
-        held.callback(self._process.wait)
-        held.callback(self._process.kill)
+        held.callback(self._process.close, 0.0)
 
     def ask(self, message: bytes) -> None:
         """Send a message."""
@@ -154,9 +148,7 @@ class _Worker:
         raise self._lost()
 
     def _lost(self) -> SimulationError:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_PATIENCE)
-        status, how = self._process.returncode, "closed its connection"
+        status, how = self._process.wait(_PATIENCE), "closed its connection"
         if status is not None:
             how = f"ended with exit status {status}"
             if status < 0:

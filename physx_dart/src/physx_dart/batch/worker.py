@@ -108,4 +108,4 @@ def serve(link: socket.socket, file: int) -> None:
 
 if __name__ == "__main__":
     with contextlib.suppress(ConnectionError):  # the other process is gone
-        serve(socket.socket(fileno=0), int(sys.argv[1]))
+        serve(socket.socket(fileno=int(sys.argv[1])), int(sys.argv[2]))

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from physx_core import PhysxError, plugins
+from physx_core.cli import show
 from physx_core.errors import UsageError
+from physx_core.origin import install_hint
 from physx_core.simulation import RobotInfo
 
 _HELP = """usage: physx robots
@@ -24,7 +26,7 @@ def run(words: Sequence[str]) -> None:
         raise UsageError(f"physx robots takes no arguments but got {' '.join(words)}.")
     robots = {info.path: info for info in _robots()}
     if not robots:
-        print("No installed backend knows robots by name. To install one: pip install physx-dart")
+        print(f"No installed backend knows robots by name. {install_hint('physx-dart')}")
         return
     _print_table(list(robots.values()))
 
@@ -37,7 +39,7 @@ def _robots() -> Iterator[RobotInfo]:
             for key in backends:
                 yield from plugins.resolve("backend", f"{name}/{key}").robots()
         except PhysxError as error:
-            print(f"{name}  broken: {error}")
+            show(f"{name}  broken: {error}")
 
 
 def _print_table(robots: Sequence[RobotInfo]) -> None:
@@ -46,9 +48,9 @@ def _print_table(robots: Sequence[RobotInfo]) -> None:
     for info in robots:
         if info.error:
             reason = info.error.splitlines()[0].rstrip(":")
-            print(f"{info.name:{width}}  cannot be loaded: {reason}")
+            show(f"{info.name:{width}}  cannot be loaded: {reason}")
             continue
         line = f"{info.name:{width}}  {info.joints:3}  {info.mass:9.4g}  {info.collisions:10}"
-        print(f"{line}  {info.warning}".rstrip())
+        show(f"{line}  {info.warning}".rstrip())
     if any(info.warning for info in robots):
         print('slow: with Robot(collisions="boxes") or "capsules" each mesh is its bounding shape')

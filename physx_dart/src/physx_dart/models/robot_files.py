@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element
 
 from physx_core import simulation
 from physx_core.errors import MissingMeshesError, ModelError, nearest
+from physx_core.origin import install_hint
 
 EXAMPLE_DATA = "example-robot-data"
 """Distribution with many robots; also the package that their mesh names begin with."""
@@ -84,7 +85,7 @@ def example_robot(name: str) -> Path:
     if folder is None:
         raise ModelError(
             f'The robot "{name}" comes with the package {EXAMPLE_DATA}, which is not installed. '
-            'To install it: pip install "physx-dart[robots]"'
+            f"{install_hint('physx-dart', 'robots')}"
         )
     path = folder / "robots" / name
     if not path.is_file():

@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from physx_core.cli import show
 from physx_gym.telemetry.episode_log import TIME, Log
 from physx_gym.telemetry.log_file import read_log
 
@@ -38,12 +39,11 @@ def run(words: Sequence[str]) -> None:
         from physx_gym.show.plotting import plot
 
         plot(logs, path=options.plot, columns=options.columns or None, enable_block_states=True)
-        print(f"plot: {options.plot}")
+        show(f"plot: {options.plot}")
     if options.replay is not None:
         from physx_gym.show.replaying import replay
 
-        written = replay(logs, path=options.replay, backend=options.backend)
-        print(f"recording: {written}")
+        show(f"recording: {replay(logs, path=options.replay, backend=options.backend)}")
     if options.plot is None and options.replay is None:
         for log in logs:
             _print_table(log, options.columns)
@@ -54,13 +54,13 @@ def _print_table(log: Log, columns: tuple[str, ...]) -> None:
     rows = len(log.time)
     duration = log.time[-1] - log.time[0] if rows else 0.0
     environment, backend = (log.constants.get(name, "?") for name in ("environment", "backend"))
-    print(f"{log.path}: {environment} on {backend}, seed {log.constants.get('seed', '?')}")
-    print(f"{rows} rows of {len(log.variables)} columns, {duration:g} s\n")
+    show(f"{log.path}: {environment} on {backend}, seed {log.constants.get('seed', '?')}")
+    show(f"{rows} rows of {len(log.variables)} columns, {duration:g} s\n")
     chosen = [name for name in log.variables if name.startswith(columns or "") and name != TIME]
     width = max(map(len, chosen), default=4)
-    print(f"{'column':{width}}  {'min':>10}  {'max':>10}  {'mean':>10}  {'last':>10}  unit")
+    show(f"{'column':{width}}  {'min':>10}  {'max':>10}  {'mean':>10}  {'last':>10}  unit")
     for name in chosen:
         values = log.variables[name]
         figures = (values.min(), values.max(), np.mean(values), values[-1]) if rows else ()
         text = "  ".join(f"{figure:10.4g}" for figure in figures)
-        print(f"{name:{width}}  {text}  {log.units.get(name, '')}".rstrip())
+        show(f"{name:{width}}  {text}  {log.units.get(name, '')}".rstrip())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physx_core.components import Factory
+from physx_core.processes import TemporaryFolder
 from physx_core.rotations import rotate_rows
 from physx_core.simulation import (
     Backend,
@@ -63,7 +63,7 @@ class WorldDrawing:
         self._factory, self._world, self._layout, self._backend = factory, world, layout, backend
         floating = (robot.name for robot in world.robots if not robot.fixed_base)
         self._title, self._followed = title, next(floating, None) if follow else None
-        self._folder: TemporaryDirectory[str] | None = None
+        self._folder: TemporaryFolder | None = None
 
     def add(self, poses: Vector) -> None:
         """Add everything to the scene.
@@ -91,7 +91,7 @@ class WorldDrawing:
     def close(self) -> None:
         """Delete temporary files."""
         if self._folder is not None:
-            self._folder.cleanup()
+            self._folder.close()
             self._folder = None
 
     def _pose(self, each: WorldObject, poses: Vector) -> Vector:
@@ -136,8 +136,9 @@ class WorldDrawing:
     def _as_robot(self, each: Mesh) -> Path:
         """Return a URDF file of a mesh, as viewers load mesh files in this form."""
         if self._folder is None:
-            self._folder = TemporaryDirectory(prefix="physx-drawing-")
-        file = Path(self._folder.name) / f"{len(list(Path(self._folder.name).iterdir()))}.urdf"
+            self._folder = TemporaryFolder("drawing-")
+        folder = self._folder.path
+        file = folder / f"{len(list(folder.iterdir()))}.urdf"
         text = _ROBOT.format(quoteattr(str(Path(each.path).absolute())), scale=each.scale)
         file.write_text(text, encoding="utf-8")
         return file

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import collections
-import tempfile
 from pathlib import Path
 from typing import Any
+
+from physx_core.processes import TemporaryFolder
 
 KEPT = 32
 """Number of logs that are kept."""
@@ -15,7 +16,7 @@ class LogFolder:
     """A temporary folder that is created when it is first needed."""
 
     def __init__(self) -> None:
-        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._folder: TemporaryFolder | None = None
         self._paths: collections.deque[Path] = collections.deque()
         self._count = 0
 
@@ -34,16 +35,16 @@ class LogFolder:
             name: Prefix of its name.
         """
         if self._folder is None:
-            self._folder = tempfile.TemporaryDirectory(prefix="physx-logs-")
+            self._folder = TemporaryFolder("logs-")
         if len(self._paths) == KEPT:
             self._paths.popleft().unlink(missing_ok=True)
         self._count += 1
-        self._paths.append(Path(self._folder.name) / f"{name}_{self._count:06}.h5")
+        self._paths.append(self._folder.path / f"{name}_{self._count:06}.h5")
         return self._paths[-1]
 
     def close(self) -> None:
         """Delete the folder."""
         if self._folder is not None:
-            self._folder.cleanup()
+            self._folder.close()
         self._folder = None
         self._paths.clear()

@@ -6,8 +6,6 @@ import contextlib
 import logging
 import os
 import secrets
-import signal
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -66,8 +64,6 @@ def run(words: Sequence[str]) -> None:
         return
     with contextlib.ExitStack() as stack:
         stack.enter_context(_printed_log())
-        before = signal.signal(signal.SIGTERM, lambda *args: sys.exit(128 + signal.SIGTERM))
-        stack.callback(signal.signal, signal.SIGTERM, before)
         options = dict(chosen.options)
         if chosen.protocol == _WITH_TOKEN:
             options["token_file"] = stack.enter_context(_token_file(chosen.token_file))
@@ -86,7 +82,7 @@ def run(words: Sequence[str]) -> None:
             )
         )
         _print_address(chosen, service, options.get("token_file"))
-        while service.poll(None):  # Ctrl-C passes through and determines the exit status
+        while service.poll(None):  # Ctrl-C and SIGTERM pass through: physx knows what to do
             continue
 
 

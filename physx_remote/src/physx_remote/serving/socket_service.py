@@ -340,7 +340,7 @@ class SocketService(Service):
     def _failed(self, connection: RequestConnection, error: BaseException) -> None:
         """Drop the connection whose request could not be handled."""
         if not isinstance(error, Exception):
-            self.drop(connection, f"interrupted by {type(error).__name__}")
+            self.drop(connection, "the service ends")
             raise error
         self.log.error(connection.name, "A request of %s failed", connection.name, cause=error)
         self.drop(connection, f"{type(error).__name__}: {error}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from PIL import Image
 from rerun.experimental import ViewerClient
 
 from physx_core.errors import VisualizerError
+from physx_core.processes import TemporaryFolder
 from physx_rerun.viewer.viewer import Viewer
 
 T = TypeVar("T")
@@ -49,8 +49,8 @@ def render_picture(
     rrd_path, png_path = Path(rrd_path), Path(png_path)
     if not rrd_path.is_file():
         raise VisualizerError(f"There is no recording {rrd_path}.")
-    with tempfile.TemporaryDirectory(prefix="physx-rerun-") as folder:
-        viewer = start_viewer(size, Path(folder), str(rrd_path))
+    with TemporaryFolder("rerun-") as folder:
+        viewer = start_viewer(size, folder.path, str(rrd_path))
         try:
             viewer.wait_until_ready(timeout)
             camera = Camera(viewer, time.monotonic() + timeout)

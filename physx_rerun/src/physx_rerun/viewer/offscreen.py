@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import io
-import tempfile
 import time
-from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
 from physx_core.errors import VisualizerError
+from physx_core.processes import TemporaryFolder
 from physx_core.typing import Array
 from physx_rerun.viewer.headless import Camera, start_viewer
 
@@ -34,10 +33,10 @@ class OffscreenViewer:
             memory_limit: Memory of the viewer, beyond which it drops the oldest rows.
         """
         self._size = size
-        self._folder = tempfile.TemporaryDirectory(prefix="physx-rerun-")
+        self._folder = TemporaryFolder("rerun-")
         window = (size[0] + _MARGIN[0], size[1] + _MARGIN[1])
         limits = ("--memory-limit", memory_limit, "--server-memory-limit", "100MB")
-        self._viewer = start_viewer(window, Path(self._folder.name), *limits)
+        self._viewer = start_viewer(window, self._folder.path, *limits)
         self._camera: Camera | None = None
         self.address = self._viewer.address
         try:
@@ -78,7 +77,7 @@ class OffscreenViewer:
     def close(self) -> None:
         """End the viewer."""
         self._viewer.end()
-        self._folder.cleanup()
+        self._folder.close()
 
 
 def _crop(picture: Image.Image, size: tuple[int, int]) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import socket
 import subprocess
@@ -14,6 +13,7 @@ from pathlib import Path
 import rerun_cli
 
 from physx_core.errors import VisualizerError
+from physx_core.processes import ChildProcess
 
 NO_VULKAN_STATUS = 102
 """Exit status of a viewer without graphics driver."""
@@ -71,7 +71,7 @@ class Viewer:
         options: Sequence[str],
         *,
         environment: Mapping[str, str] | None = None,
-        outlives: bool = False,
+        lives_on: bool = False,
     ) -> None:
         """Start the process.
 
@@ -79,21 +79,20 @@ class Viewer:
             port: Port of the viewer; 0: any free one.
             options: Further command-line options.
             environment: Environment variables beside those of this process.
-            outlives: Whether the viewer outlives this process and its Ctrl-C.
+            lives_on: Whether the viewer outlives this process.
         """
         port = port or find_free_port()
         self.address = f"127.0.0.1:{port}"
-        self.process = subprocess.Popen(
+        self.process = ChildProcess(
             [
                 str(find_executable()),
                 *("--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"),
                 *options,
             ],
-            env={**os.environ, "RERUN_APP_ONLY": "true", **(environment or {})},
-            stdin=subprocess.DEVNULL,
+            variables={"RERUN_APP_ONLY": "true", **(environment or {})},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            start_new_session=outlives,
+            lives_on=lives_on,
         )
 
     def wait_until_ready(self, timeout: float = 30.0) -> None:
@@ -112,9 +111,7 @@ class Viewer:
         Args:
             wait: Time in s to wait for its end.
         """
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(wait)
-        status = self.process.returncode
+        status = self.process.wait(wait)
         if status == NO_VULKAN_STATUS:
             raise VisualizerError(NO_VULKAN)
         if status is not None:
@@ -122,9 +119,4 @@ class Viewer:
 
     def end(self) -> None:
         """End the process and wait for it."""
-        self.process.terminate()
-        try:
-            self.process.wait(3.0)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+        self.process.close()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import faulthandler
 import os
 import signal
 import sys
@@ -15,9 +14,9 @@ import tyro
 from physx_core.errors import ConfigError
 from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.net.tokens import find_token
+from physx_core.processes import kill_descendants
 from physx_core.workers.client.joining import PATIENCE
 from physx_core.workers.client.worker import run_client
-from physx_core.workers.processes.descendants import kill_descendants
 
 
 @dataclass
@@ -50,8 +49,6 @@ def run(words: Sequence[str]) -> None:
     if options.instance is not None and options.instance < 1:
         raise ConfigError(f"--instance is {options.instance}; instances are numbered from 1.")
     os.environ.pop(TOKEN_VARIABLE, None)  # not for the environment and its processes
-    signal.signal(signal.SIGTERM, lambda *args: sys.exit(128 + signal.SIGTERM))
-    faulthandler.enable()  # shows where an engine crashed
     try:
         status = run_client(
             options.connect, token, options.instance, patience=options.patience, say=_say

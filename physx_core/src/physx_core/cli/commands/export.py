@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from physx_core.cli.dataset_tables import count
+from physx_core.cli.output import show
 from physx_core.dataset import Dataset
 from physx_core.dataset.exchange import ExportOptions, export
 from physx_core.observers import ProgressBar
@@ -68,7 +69,7 @@ def run(words: Sequence[str]) -> None:
             bar.end()
         stored = {mode: dataset.num_samples(mode) for mode in written}
     for mode, rows in written.items():
-        print(f"{count(rows, f'{mode} sample')}: {options.out}")
+        show(f"{count(rows, f'{mode} sample')}: {options.out}")
         if rows < stored[mode]:
             left = stored[mode] - rows
-            print(f"left out: {left:,} samples that are a trajectory of their own")
+            show(f"left out: {left:,} samples that are a trajectory of their own")

@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from physx_core import checkpoint
+from physx_core.cli.output import show
 from physx_core.config import NetworkConfig
 from physx_core.pipelines.learning.learner import load_learner
 
@@ -47,4 +48,4 @@ def run(words: Sequence[str]) -> None:
     file = Path(options.output) if options.output else place / f"{path.name}.{options.to}"
     learner.export(file, options.to)
     network = learner.network
-    print(f"{', '.join(network.net_fields)} -> {', '.join(network.pred_fields)}: {file}")
+    show(f"{', '.join(network.net_fields)} -> {', '.join(network.pred_fields)}: {file}")

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from physx_core.cli.dataset_tables import count
+from physx_core.cli.output import show
 from physx_core.dataset.exchange import import_file
 from physx_core.observers import ProgressBar
 
@@ -53,4 +54,4 @@ def run(words: Sequence[str]) -> None:
     finally:
         bar.end()
     for mode, rows in stored.items():
-        print(f"{count(rows, f'{mode} sample')}: {options.directory}")
+        show(f"{count(rows, f'{mode} sample')}: {options.directory}")

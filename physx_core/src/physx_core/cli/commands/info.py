@@ -11,6 +11,7 @@ import tyro
 
 from physx_core import checkpoint
 from physx_core.cli.dataset_tables import print_dataset
+from physx_core.cli.output import show
 from physx_core.errors import CheckpointError, DatasetNotFoundError
 
 
@@ -40,9 +41,9 @@ def run(words: Sequence[str]) -> None:
             found = checkpoint.read(path, content=options.verify)
         except CheckpointError as error:
             problems += 1
-            print(f"checkpoint {path.name}: {error}")
+            show(f"checkpoint {path.name}: {error}")
             continue
-        print(
+        show(
             f"checkpoint {path.name}: {found.network['network']}, {found.progress.epoch} epochs, "
             f"fields {', '.join(found.fields)}"
         )

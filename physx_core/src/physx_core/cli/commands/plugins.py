@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from physx_core import plugins
-from physx_core.errors import PhysxError, UsageError
+from physx_core.cli.output import show
+from physx_core.errors import PhysxError, UsageError, printable
+from physx_core.plugins.entries import find_unreadable
 
 
 def run(words: Sequence[str]) -> None:
@@ -16,11 +18,14 @@ def run(words: Sequence[str]) -> None:
     if words:
         raise UsageError(f"physx plugins takes no options, not {' '.join(words)}.")
     for name, info in plugins.available().items():
-        print(f"{name}  ({', '.join(info.distributions)})")
+        # At once: if the plugin crashes or hangs for ever, this is what tells which one it was.
+        print(printable(f"{name}  ({', '.join(info.distributions)})"), flush=True)
         try:
             plugin = plugins.load(name)
         except PhysxError as error:
-            print(f"  broken: {error}")
+            show(f"  broken: {error}")
             continue
         for kind, components in plugin.components.items():
-            print(f"  {kind}: {', '.join(f'{name}/{key}' for key in components)}")
+            show(f"  {kind}: {', '.join(f'{name}/{key}' for key in components)}")
+    for package, problem in find_unreadable().items():
+        show(f"The entry points of the package {package} cannot be read: {problem}")

@@ -6,7 +6,6 @@ import importlib.util
 import itertools
 import math
 import statistics
-import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,8 +14,10 @@ from typing import Annotated
 
 import tyro
 
+from physx_core.cli.output import show
 from physx_core.errors import MissingLibraryError, SessionError
 from physx_core.observers import read_scalars
+from physx_core.processes import ChildProcess
 
 BARS = "▁▂▃▄▅▆▇█"
 
@@ -51,7 +52,7 @@ def run(words: Sequence[str]) -> None:
     for line, curve in zip(lines, curves, strict=True):
         columns = [f"{line[0]:{widths[0]}}", f"{line[1]:{widths[1]}}"]
         columns += [f"{text:>{width}}" for text, width in zip(line[2:], widths[2:], strict=True)]
-        print("  ".join([*columns, curve]).rstrip())
+        show("  ".join([*columns, curve]).rstrip())
 
 
 def _line(timeline: str, name: str, values: list[float]) -> tuple[str, ...]:
@@ -98,4 +99,5 @@ def _start_tensorboard(session: Path, port: int) -> None:
             "physx stats --tensorboard", "tensorboard", "tensorboard", "physx-torch"
         )
     place = ("--logdir", str(folder), "--host", "127.0.0.1", "--port", str(port))
-    subprocess.run([sys.executable, "-m", "tensorboard.main", *place], check=False)
+    with ChildProcess([sys.executable, "-m", "tensorboard.main", *place]) as process:
+        sys.exit(process.wait())

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from physx_core.cli.dataset_tables import count
+from physx_core.cli.output import show
 from physx_core.dataset import Dataset
 from physx_core.errors import DatasetError, DatasetNotFoundError
 
@@ -29,14 +30,14 @@ def run(words: Sequence[str]) -> None:
     options = tyro.cli(Verify, args=words, prog="physx verify")
     if options.repair:
         for text in Dataset.repair(options.directory):
-            print(f"repaired: {text}")
+            show(f"repaired: {text}")
     problems, checked = _problems(options.directory)
     for text in problems:
-        print(text)
+        show(text)
     if problems:
         advice = "" if options.repair else " physx verify DIR --repair repairs what it can."
         raise DatasetError(f"{options.directory} has {count(len(problems), 'problem')}.{advice}")
-    print(f"sound: {checked}")
+    show(f"sound: {checked}")
 
 
 def _problems(directory: str) -> tuple[list[str], str]:

@@ -19,6 +19,7 @@ from physx_core.dataset.store.manifest import Manifest, Partition
 from physx_core.dataset.store.manifest_parsing import parse_manifest
 from physx_core.dataset.store.validation import whole
 from physx_core.errors import ConfigError, DatasetError
+from physx_core.origin import install_hint
 from physx_core.parsing import parse_json
 
 FILE = "dataset.json"
@@ -76,7 +77,7 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
         if version != VERSION:
             raise DatasetError(
                 f"{path} has version {version} of the dataset's format, but this physx reads "
-                f"version {VERSION}. Update it: pip install --upgrade physx-core."
+                f"version {VERSION}. {install_hint('physx-core', update=True)}"
             )
         if not edited and not _is_whole(content):
             raise ValueError("it was cut or edited by hand: its checksum does not match")

@@ -17,7 +17,7 @@ from physx_core.net.liveness import poll_peer
 from physx_core.net.remote_errors import decode_error
 from physx_core.net.spin_wait import spin_until
 from physx_core.net.values import decode, pack_value
-from physx_core.workers.processes.descendants import kill_descendants
+from physx_core.processes import kill_descendants
 
 _SPIN_TIME = 2e-4
 _CLEANUP_TIME = 1.0

@@ -20,7 +20,7 @@ from physx_core.workers.client.joining import PATIENCE, join
 from physx_core.workers.client.link import RunEnded, ServerGone, WorkerLink
 from physx_core.workers.client.producer import Producer
 from physx_core.workers.instance import Instance
-from physx_core.workers.processes.launchers import CLIENT_VARIABLE
+from physx_core.workers.launchers import CLIENT_VARIABLE
 
 
 def run_client(

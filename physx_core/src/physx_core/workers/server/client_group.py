@@ -21,7 +21,7 @@ from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate
 from physx_core.workers.instance import instance_arguments
-from physx_core.workers.processes.launchers import stop
+from physx_core.workers.launchers import stop
 from physx_core.workers.server.client_errors import exit_error, timeout_error
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.server import Server

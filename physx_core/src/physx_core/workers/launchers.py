@@ -15,7 +15,7 @@ from typing import IO
 from physx_core.components.launcher import ClientHandle, Launcher
 from physx_core.errors import ClientError, ConfigError
 from physx_core.net.handshake import TOKEN_VARIABLE
-from physx_core.workers.processes.watchdog import Watchdog
+from physx_core.processes import ChildProcess
 
 CLIENT_VARIABLE = "PHYSX_CLIENT"
 """Environment variable that is set in every client process."""
@@ -41,7 +41,6 @@ class ClientProcess(ClientHandle):
         address: str,
         token: str,
         core: int | None = None,
-        watchdog: Watchdog | None = None,
     ) -> None:
         """Keep the arguments of the process.
 
@@ -50,35 +49,28 @@ class ClientProcess(ClientHandle):
             address: The server's ``HOST:PORT``.
             token: Token of the run.
             core: The only processor core that it may use; None: all that this process may use.
-            watchdog: Kills it if this process dies; None: one of its own.
         """
         self.instance_id = instance_id
-        self._core, self._watchdog = core, watchdog or Watchdog()
+        self._core = core
         self._command = [
             *(sys.executable, "-P", "-m", "physx_core.workers"),
             *("--connect", address, "--instance", str(instance_id)),
         ]
         self._variables = {TOKEN_VARIABLE: token, CLIENT_VARIABLE: "1"}
-        self._process: subprocess.Popen[bytes] | None = None
+        # Instances share the processor cores: a numerical library must not take all for each.
+        self._variables["OMP_NUM_THREADS"] = os.environ.get("OMP_NUM_THREADS", "1")
+        self._process: ChildProcess | None = None
         self._reader: threading.Thread | None = None
         self._tail = b""
 
     def start(self) -> None:
         """Start the process."""
-        # Instances share the processor cores: a numerical library must not take all for each.
-        environment = {"OMP_NUM_THREADS": "1", **os.environ, **self._variables}
         try:
-            self._process = subprocess.Popen(
-                self._command,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                bufsize=0,
-                start_new_session=True,
+            self._process = ChildProcess(
+                self._command, variables=self._variables, stderr=subprocess.PIPE
             )
         except OSError as error:
             raise ClientError(self.instance_id, f"could not be started: {error}.") from error
-        self._watchdog.add(self._process.pid)
         if self._core is not None:
             with contextlib.suppress(ProcessLookupError):  # it has ended already
                 os.sched_setaffinity(self._process.pid, {self._core})
@@ -94,14 +86,7 @@ class ClientProcess(ClientHandle):
 
     def exit_status(self) -> int | None:
         """Return the exit status, negative for a signal; None while the process runs."""
-        process = self._process
-        if process is None or process.returncode is not None:
-            return None if process is None else process.returncode
-        status = process.poll()
-        if status is not None:
-            self.kill()  # what the environment left running
-            self._watchdog.remove(process.pid)
-        return status
+        return self._process.exit_status() if self._process is not None else None
 
     def stderr(self) -> str:
         """Return the last lines that the process wrote to its standard error."""
@@ -112,20 +97,17 @@ class ClientProcess(ClientHandle):
 
     def terminate(self) -> None:
         """Ask the process and those that it started to exit."""
-        self._signal_group(signal.SIGTERM)
+        if self._process is not None:
+            self._process.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
         """Kill the process and those that it started."""
-        self._signal_group(signal.SIGKILL)
+        if self._process is not None:
+            self._process.send_signal(signal.SIGKILL)
 
     def wait(self, until: float) -> bool:
         """Wait for the end of the process: see `ClientHandle.wait`."""
         return self._process is None or super().wait(until)
-
-    def _signal_group(self, number: signal.Signals) -> None:
-        if self._process is not None:
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._process.pid, number)
 
     def _keep_tail(self, stream: IO[bytes]) -> None:
         with stream:
@@ -145,7 +127,6 @@ class SubprocessLauncher(Launcher):
                 environments use several threads.
         """
         self._cores: list[int] = []
-        self._watchdog = Watchdog()
         if affinity:
             if not hasattr(os, "sched_setaffinity"):
                 raise ConfigError(
@@ -159,7 +140,7 @@ class SubprocessLauncher(Launcher):
         try:
             for number in instances:
                 core = self._cores[(number - 1) % len(self._cores)] if self._cores else None
-                process = ClientProcess(number, address, token, core, self._watchdog)
+                process = ClientProcess(number, address, token, core)
                 started.append(process)
                 process.start()
         except BaseException:

@@ -7,6 +7,8 @@ import os
 import signal
 from pathlib import Path
 
+from physx_core.processes.watchdog import WATCHDOG
+
 
 def kill_descendants() -> None:
     """Kill all descendants of this process, if there is a /proc file system.
@@ -14,6 +16,7 @@ def kill_descendants() -> None:
     A client that was started by hand may share its process group with other programs of the user,
     so it cannot kill its whole group as a launched one can.
     """
+    WATCHDOG.release()
     while descendants := _descendants(os.getpid()):
         for number in descendants:
             with contextlib.suppress(ProcessLookupError, PermissionError):

@@ -1,0 +1,86 @@
+"""Where physx was installed from, and so where the rest of it can be installed from.
+
+The packages of physx are on no index that anybody guards: the name of one in a hint to install may
+be that of a stranger's package. PEP 610 records the place of every package that did not come from
+an index.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path, PurePosixPath
+from typing import Any
+from urllib.parse import urlsplit, urlunsplit
+from urllib.request import url2pathname
+
+_CORE = "physx-core"
+
+
+def install_hint(distribution: str, extra: str = "", *, update: bool = False) -> str:
+    """Return a sentence that says how to install a package of physx.
+
+    Args:
+        distribution: Name of the package, for example ``physx-torch``.
+        extra: Extra of the package to install with it.
+        update: Whether it is installed already, and too old.
+    """
+    named = f"{distribution}[{extra}]" if extra else distribution
+    try:
+        where = _recorded()
+        found = (named if where is None else _place(where, distribution, named)) or ""
+    except (ImportError, ValueError, LookupError, TypeError, OSError):
+        where, found = {}, ""
+    if not found:
+        place = _without_login(str((where or {}).get("url", ""))) or f"where {_CORE} came from"
+        return f"{'Update' if update else 'Install'} {named} from {place}"
+    command = f"pip install {'--upgrade ' if update else ''}{found}"
+    return f"To {'update' if update else 'install'} it: {command}"
+
+
+def _recorded() -> dict[str, Any] | None:
+    """Return what PEP 610 recorded of the core; None: it came from an index."""
+    from importlib.metadata import distribution
+
+    text = distribution(_CORE).read_text("direct_url.json")
+    if text is None:
+        return None
+    found = json.loads(text)
+    if not isinstance(found, dict):
+        raise ValueError("direct_url.json is no table")
+    return found
+
+
+def _place(where: dict[str, Any], distribution: str, named: str) -> str | None:
+    """Return what pip takes for a package beside the core; None: nothing is known to be there."""
+    url, folder = _without_login(where["url"]), distribution.replace("-", "_")
+    extra = named.removeprefix(distribution)
+    if "dir_info" in where:
+        beside = _local(url).parent / folder
+        editable = "-e " if where["dir_info"].get("editable") else ""
+        exists = (beside / "pyproject.toml").is_file()
+        return editable + _quoted(f"{beside}{extra}") if exists else None
+    if "subdirectory" in where:
+        beside_core = PurePosixPath(where["subdirectory"]).parent / folder
+        if "vcs_info" in where:
+            vcs = where["vcs_info"]
+            revision = vcs.get("requested_revision") or vcs["commit_id"]
+            url = f"{vcs['vcs']}+{url}@{revision}"
+        return _quoted(f"{named} @ {url}#subdirectory={beside_core}")
+    if url.startswith("file:"):
+        files = sorted(_local(url).parent.glob(f"{folder}-*"))
+        return _quoted(f"{files[-1]}{extra}") if files else None
+    return None
+
+
+def _local(url: str) -> Path:
+    return Path(url2pathname(urlsplit(url).path))
+
+
+def _without_login(url: str) -> str:
+    parts = urlsplit(url)
+    return urlunsplit(parts._replace(netloc=parts.netloc.rpartition("@")[2]))
+
+
+def _quoted(text: str) -> str:
+    return text if re.fullmatch(r"[\w./:+@=-]+", text) else f'"{text}"'

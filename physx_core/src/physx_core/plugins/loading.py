@@ -1,0 +1,132 @@
+"""Runs a plugin's own code while it is loaded, whatever that does."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from types import FrameType
+from typing import Any
+
+from physx_core.errors import PluginError, printable
+
+TIMEOUT_VARIABLE = "PHYSX_IMPORT_TIMEOUT"
+"""Environment variable with the time in s that a plugin may take to import."""
+TIMEOUT = 120.0
+"""The same by default: a deep-learning library on a slow disk takes a while."""
+_NOTE_TIME = 10.0
+
+
+class _TimeIsUp(BaseException):
+    """The import of a plugin takes too long; nobody else catches it."""
+
+
+@contextlib.contextmanager
+def loading(plugin: str, who: str, doing: str) -> Iterator[None]:
+    """Make whatever goes wrong in a plugin's own code an error that names it.
+
+    That includes ``sys.exit`` and KeyboardInterrupt, unless a signal raised them. A plugin that
+    takes long is named on standard error; in the main thread it is given up after `TIMEOUT`.
+
+    Args:
+        plugin: Name of the plugin.
+        who: The plugin and its package, for messages.
+        doing: What fails if this fails, for example "fails to import its module".
+
+    Raises:
+        PluginError: If the plugin raises anything, or takes too long.
+    """
+    limit = _timeout()
+    text = f"physx: {who} is still loading; it is given up after {limit:g} s, or by Ctrl-C"
+    note = threading.Timer(min(_NOTE_TIME, limit / 2), _note, [text])
+    note.daemon = True
+    note.start()
+    with contextlib.ExitStack() as stack:
+        stack.callback(note.cancel)
+        signals = stack.enter_context(_seen_signals())
+        try:
+            with _deadline(limit):
+                yield
+        except _TimeIsUp as error:
+            problem = f"it takes longer than {limit:g} s ({TIMEOUT_VARIABLE} sets another limit)"
+            raise PluginError(plugin, f"{who} {doing}: {problem}.") from error
+        except BaseException as error:
+            if signals and not isinstance(error, Exception):
+                raise
+            raise PluginError(plugin, f"{who} {doing}: {_description(error)}") from error
+
+
+def _timeout() -> float:
+    with contextlib.suppress(ValueError):
+        return max(0.01, float(os.environ.get(TIMEOUT_VARIABLE, TIMEOUT)))
+    return TIMEOUT
+
+
+def _note(text: str) -> None:
+    print(printable(text), file=sys.stderr, flush=True)  # noqa: T201 - nothing else runs
+
+
+def _description(error: BaseException) -> str:
+    if isinstance(error, SystemExit):
+        return f"it calls sys.exit({error.code!r})"
+    return str(error) or type(error).__name__
+
+
+def _is_main() -> bool:
+    return threading.current_thread() is threading.main_thread()
+
+
+@contextlib.contextmanager
+def _seen_signals() -> Iterator[list[int]]:
+    """Yield a list to which the numbers of signals are added that arrive meanwhile."""
+    seen: list[int] = []
+    with contextlib.ExitStack() as stack:
+        for number in (signal.SIGINT, signal.SIGTERM) if _is_main() else ():
+            before = signal.getsignal(number)
+            if callable(before):
+                stack.enter_context(_handled(number, _noting(seen, before)))
+        yield seen
+
+
+def _noting(seen: list[int], before: Any) -> Any:
+    def handle(number: int, frame: FrameType | None) -> None:
+        seen.append(number)
+        before(number, frame)
+
+    return handle
+
+
+@contextlib.contextmanager
+def _handled(number: signal.Signals, handle: Any) -> Iterator[None]:
+    """Handle a signal meanwhile; if a plugin sets a handler of its own, that one stays."""
+    before = signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        if signal.getsignal(number) is handle:
+            signal.signal(number, before)
+
+
+@contextlib.contextmanager
+def _deadline(limit: float) -> Iterator[None]:
+    """Raise `_TimeIsUp` after `limit` s, unless the alarm clock is somebody else's."""
+    is_free = _is_main() and signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+    if not is_free or signal.getitimer(signal.ITIMER_REAL)[0]:
+        yield
+        return
+    is_over = False
+
+    def ring(number: int, frame: FrameType | None) -> None:
+        if not is_over:
+            raise _TimeIsUp
+
+    with _handled(signal.SIGALRM, ring):
+        signal.setitimer(signal.ITIMER_REAL, limit, 1.0)  # again, if somebody catches everything
+        try:
+            yield
+        finally:
+            is_over = True
+            signal.setitimer(signal.ITIMER_REAL, 0.0)

@@ -1,0 +1,7 @@
+"""Child processes and temporary folders that go with this process, however it ends."""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

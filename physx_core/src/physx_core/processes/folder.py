@@ -1,0 +1,42 @@
+"""TemporaryFolder: a folder that goes with this process."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import weakref
+from pathlib import Path
+
+from physx_core.closeable import Closeable
+from physx_core.processes.watchdog import WATCHDOG
+
+
+class TemporaryFolder(Closeable):
+    """A folder for temporary files that goes with this process, even if that is killed.
+
+    It is also removed when this object is closed or garbage collected. A process forked from this
+    one leaves it alone.
+
+    Attributes:
+        path: The folder.
+    """
+
+    def __init__(self, prefix: str) -> None:
+        """Make the folder.
+
+        Args:
+            prefix: Beginning of its name.
+        """
+        self.path = WATCHDOG.make_folder(prefix)
+        self._remove = weakref.finalize(self, _remove, self.path, os.getpid())
+        self._remove.atexit = False  # then the watchdog does it, after all exit functions
+
+    def close(self) -> None:
+        """Remove the folder."""
+        self._remove()
+
+
+def _remove(path: Path, owner: int) -> None:
+    if os.getpid() == owner:
+        shutil.rmtree(path, ignore_errors=True)
+        WATCHDOG.settle()
