@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import os
 import sys
 import typing
 from collections.abc import Callable, Mapping
@@ -73,9 +74,22 @@ def _hints(cls: Any) -> dict[str, Any]:
     return typing.get_type_hints(cls)
 
 
-def _validate(instance: Any, cls: Any) -> None:
-    import typeguard
+@functools.cache
+def _typeguard() -> Any:
+    """Import typeguard without its plugins, for which it would read all packages' metadata."""
+    switch = "TYPEGUARD_DISABLE_PLUGIN_AUTOLOAD"
+    before = os.environ.get(switch)
+    os.environ[switch] = before or "1"
+    try:
+        import typeguard
+    finally:
+        if before is None:
+            del os.environ[switch]
+    return typeguard
 
+
+def _validate(instance: Any, cls: Any) -> None:
+    typeguard = _typeguard()
     hints = _hints(cls)
     for option in dataclasses.fields(cls):
         if not option.init:

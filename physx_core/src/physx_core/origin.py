@@ -28,8 +28,8 @@ def install_hint(distribution: str, extra: str = "", *, update: bool = False) ->
     named = f"{distribution}[{extra}]" if extra else distribution
     try:
         where = _recorded()
-        found = (named if where is None else _place(where, distribution, named)) or ""
-    except (ImportError, ValueError, LookupError, TypeError, OSError):
+        found = (_quoted(named) if where is None else _place(where, distribution, named)) or ""
+    except Exception:  # the file was not written by pip, or damaged
         where, found = {}, ""
     if not found:
         place = _without_login(str((where or {}).get("url", ""))) or f"where {_CORE} came from"

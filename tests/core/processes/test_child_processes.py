@@ -188,9 +188,11 @@ def test_a_forked_process_of_multiprocessing_may_close_them_without_effect():
 def test_one_that_is_to_live_on_does(tmp_path):
     line = "print(ChildProcess(['sleep', '60'], lives_on=True).pid, flush=True)"
     owner = start(tmp_path, line, "ChildProcess(['true']).wait()")
-    pid = int(owner.communicate(timeout=60)[0])
+    pid = int(owner.stdout.readline())
+    assert owner.wait(60) == 0
+    owner.stdout.close()
     time.sleep(0.2)
-    assert owner.returncode == 0 and alive(pid)
+    assert alive(pid)
     os.kill(pid, signal.SIGKILL)
     wait_until(lambda: not alive(pid))
 

@@ -42,9 +42,9 @@ def clients():
 
 
 def vector():
-    from physx_gym import VectorEnv
+    from physx_gym import ParallelVectorEnv
 
-    env = VectorEnv("CartPole-v1", 4, processes=2)
+    env = ParallelVectorEnv("CartPole-v1", 4, processes=2)
     env.reset(seed=0)
     kept.append(env)
 

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from physx_core.errors import listed
+
 if TYPE_CHECKING:  # it takes a third of a client's start, and few clients need it
     from importlib.metadata import Distribution, EntryPoint
 
@@ -37,6 +39,14 @@ def find_entries(group: str) -> dict[str, list[EntryPoint]]:
 def find_unreadable() -> dict[str, str]:
     """Return the packages whose entry points cannot be read, with what is wrong with them."""
     return _read_entries(_installed())[1]
+
+
+def unreadable_hint() -> str:
+    """Return a sentence about packages whose entry points cannot be read, empty without any."""
+    found = find_unreadable()
+    if not found:
+        return ""
+    return f"The entry points of {listed(found)} cannot be read: reinstall or remove it."
 
 
 def _installed() -> tuple[tuple[str, int], ...]:

@@ -12,6 +12,7 @@ from types import FrameType
 from typing import Any
 
 from physx_core.errors import PluginError, printable
+from physx_core.plugins.entries import unreadable_hint
 
 TIMEOUT_VARIABLE = "PHYSX_IMPORT_TIMEOUT"
 """Environment variable with the time in s that a plugin may take to import."""
@@ -56,7 +57,9 @@ def loading(plugin: str, who: str, doing: str) -> Iterator[None]:
         except BaseException as error:
             if signals and not isinstance(error, Exception):
                 raise
-            raise PluginError(plugin, f"{who} {doing}: {_description(error)}") from error
+            # Other libraries, such as torch, read all metadata when they are imported.
+            text = f"{who} {doing}: {_description(error)} {unreadable_hint()}"
+            raise PluginError(plugin, text.rstrip()) from error
 
 
 def _timeout() -> float:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pluggy
 
-from physx_core.errors import PluginError, PluginNotFoundError, listed
+from physx_core.errors import PluginError, PluginNotFoundError
 from physx_core.origin import install_hint
 from physx_core.plugins import hookspecs
 from physx_core.plugins.entries import (
@@ -16,8 +16,8 @@ from physx_core.plugins.entries import (
     PLUGINS,
     describe_conflict,
     find_entries,
-    find_unreadable,
     owner_of,
+    unreadable_hint,
 )
 from physx_core.plugins.hookspecs import KINDS, Components, is_component_name, is_plugin_name
 from physx_core.plugins.loading import loading
@@ -120,7 +120,4 @@ def _hint(name: str) -> str:
     """Return what to do about a plugin that is not installed."""
     if (PLUGINS, name) in OFFICIAL:
         return install_hint(OFFICIAL[PLUGINS, name])
-    unreadable = find_unreadable()
-    if unreadable:
-        return f"The entry points of {listed(unreadable)} cannot be read: reinstall or remove it."
-    return "It is none of physx's own: install the package that contains it."
+    return unreadable_hint() or "It is none of physx's own: install the package that contains it."

@@ -68,9 +68,9 @@ def render_picture(
 
 
 def start_viewer(size: tuple[int, int], folder: Path, *options: str) -> Viewer:
-    """Start a viewer without the user's settings and stored layouts."""
+    """Start a viewer without the user's settings and stored layouts; its files go to a folder."""
     window = f"{size[0]}x{size[1] + _TOP_BAR}"
-    places = {"XDG_DATA_HOME": str(folder), "XDG_CONFIG_HOME": str(folder)}
+    places = dict.fromkeys(("XDG_DATA_HOME", "XDG_CONFIG_HOME", "TMPDIR"), str(folder))
     return Viewer(0, ("--headless", "--window-size", window, *options), environment=places)
 
 
