@@ -73,7 +73,7 @@ def test_a_viewer_that_is_gone(offscreen):
     factory.add_points("points", np.zeros((1, 3)))
     visualizer.events(1, 0, factory.take_events())
     visualizer.capture()
-    (viewer,) = psutil.Process().children()
+    (viewer,) = (p for p in psutil.Process().children() if "--headless" in p.cmdline())
     viewer.kill()
     with pytest.raises(VisualizerError, match="The Rerun viewer ended with status -9"):
         visualizer.capture()

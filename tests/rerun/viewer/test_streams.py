@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -43,7 +44,10 @@ def test_a_live_viewer_gets_everything(opened, receiver):
     run_steps(visualizer, 350)
     visualizer.close()
     deadline = time.monotonic() + 60  # the receiver writes its file behind what it has taken
-    while time.monotonic() < deadline and not (path.exists() and len(steps_of(path)) == 350):
+    while time.monotonic() < deadline:
+        with contextlib.suppress(FileNotFoundError, ValueError):  # there is nothing in it yet
+            if len(steps_of(path)) == 350:
+                break
         time.sleep(0.05)
     assert steps_of(path) == steps_of(visualizer.file) == list(range(350))
     live, file = (rr.chunk.RrdReader(p).recordings()[0] for p in (path, visualizer.file))
@@ -54,7 +58,7 @@ def test_a_viewer_that_dies(opened, receiver):
     viewer, _ = receiver
     visualizer = opened(mode="connect", address=viewer.address)
     factory = run_steps(visualizer, 200)
-    viewer.process.kill()
+    viewer.process.send_signal(signal.SIGKILL)
     viewer.process.wait()
     run_steps(visualizer, 200, 200, factory)
     with pytest.warns(UserWarning, match=f"{viewer.address}"):
