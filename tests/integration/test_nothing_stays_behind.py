@@ -30,7 +30,7 @@ WAYS = {
     "os._exit": {4},
 }
 """Way to end to exit statuses."""
-QUICK = {*(("clients", way) for way in WAYS), *((kind, "SIGKILL") for kind in KINDS)}
+QUICK = {("clients", "SIGTERM"), *((kind, "SIGKILL") for kind in KINDS)}
 TIME = 3.0
 
 

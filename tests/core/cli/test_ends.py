@@ -12,12 +12,19 @@ from pathlib import Path
 
 import pytest
 
+from physx_core import Dataset
+from physx_core.cli import main
+from physx_core.errors import DatasetError
+
 pytestmark = pytest.mark.usefixtures("nothing_stays_behind")
 WAYS = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}
 
 
-def end(words, is_running, number):
-    """Start a command, and send it a signal when it runs; return what it wrote to stderr."""
+def end(words, is_running, number, is_ending=None):
+    """Start a command, send it a signal when it runs, and another one when it is ending.
+
+    Return what it wrote to stderr.
+    """
     process = subprocess.Popen(
         [sys.executable, "-m", "physx_core", *words],
         stdin=subprocess.DEVNULL,
@@ -27,12 +34,13 @@ def end(words, is_running, number):
         text=True,
     )
     with process:
-        deadline = time.monotonic() + 60
-        while not is_running():
-            assert process.poll() is None, process.stderr.read()
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        process.send_signal(number)
+        for condition in filter(None, (is_running, is_ending)):
+            deadline = time.monotonic() + 60
+            while not condition():
+                assert process.poll() is None, process.stderr.read()
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
+            process.send_signal(number)
         error = process.communicate(timeout=60)[1]
     status, how = WAYS[number]
     assert process.returncode == status, error
@@ -46,6 +54,62 @@ def test_a_data_generation(number, options):
     words = ["generate", "toy/spring", "--batch-nb", "1000000", "--batch-size", "10", *options]
     place = Path("sessions/data_generation/dataset")
     end(words, lambda: any(place.glob("*.h5")), number)
+
+
+ENVIRONMENT = """
+import time
+from pathlib import Path
+import numpy as np
+from physx_core import Environment
+
+class Slow(Environment):
+    def create(self):
+        pass
+    def init_database(self):
+        self.define_training_fields([("x", np.ndarray)])
+    def step(self):
+        self.set_training_data(x=np.ones(1))
+
+class SlowToClose(Slow):
+    def close(self):
+        Path("closing").touch()
+        time.sleep(60)
+
+class Converts(Slow):
+    def step(self):
+        try:
+            Path("stepping").touch()
+            time.sleep(60)
+        except BaseException:
+            raise KeyError("what an import makes of it") from None
+"""
+
+
+@pytest.mark.parametrize("options", [[], ["--environment.no-as-tcp-ip-client"]])
+def test_a_second_sigterm_ends_what_takes_long_to_close_and_keeps_the_rows(options):
+    Path("slow.py").write_text(ENVIRONMENT)
+    place = Path("sessions/data_generation/dataset")
+
+    def rows():
+        try:
+            with Dataset.open(place) as dataset:
+                return dataset.num_samples("training") if "training" in dataset.modes else 0
+        except DatasetError:
+            return 0
+
+    words = ["generate", "slow.py:SlowToClose", "--batch-nb", "100000000", "--batch-size", "1"]
+    end([*words, *options], rows, signal.SIGTERM, Path("closing").exists)
+    kept = rows()
+    assert main(["verify", str(place), "--repair"]) == main(["verify", str(place)]) == 0
+    assert rows() == kept > 0
+
+
+def test_an_error_that_sigterm_became_does_not_change_the_status():
+    Path("slow.py").write_text(ENVIRONMENT)
+    words = ["generate", "slow.py:Converts", "--environment.no-as-tcp-ip-client"]
+    options = ["--batch-nb", "1", "--batch-size", "1"]
+    error = end([*words, *options], Path("stepping").exists, signal.SIGTERM)
+    assert "what an import makes of it" in error
 
 
 @pytest.mark.parametrize("number", WAYS)

@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,16 @@ def test_a_generated_token_is_removed(start):
     assert status == 130 and "interrupted" in error
     assert token not in out + error and "Ctrl-C" in out
     assert not file.exists()
+
+
+def test_a_generated_token_is_removed_after_a_kill(start, tmp_path):
+    process, printed, _ = start("gym/CartPole-v1", TMPDIR=str(tmp_path))
+    assert tmp_path in Path(printed[1].removeprefix("token: ").strip()).parents
+    end(process, signal.SIGKILL)
+    deadline = time.monotonic() + PATIENCE
+    while [*tmp_path.iterdir()]:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def test_a_token_file_is_created_and_kept(start, tmp_path):

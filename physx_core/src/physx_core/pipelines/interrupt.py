@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
 from typing import Any
 
+from physx_core.errors import PhysxError
+
 
 class Terminated(SystemExit):
     """SIGTERM ended the run; the process exits with status 143."""
@@ -47,6 +49,10 @@ class Interrupt:
         _raise(self.number, None)
 
 
+_LAST = Interrupt()
+"""The last signal whose exception was raised."""
+
+
 @contextlib.contextmanager
 def deferred_interrupt() -> Iterator[Interrupt]:
     """Defer the first Ctrl-C or SIGTERM, and yield what tells whether it came.
@@ -67,21 +73,34 @@ def deferred_interrupt() -> Iterator[Interrupt]:
 def raised_at_sigterm() -> Iterator[None]:
     """Raise `Terminated` at SIGTERM, so that everything is closed before the process exits.
 
+    An exception in the middle of an import may become any other: what leaves this context after
+    SIGTERM is `Terminated`, with a note about an error of physx. A further SIGTERM is raised again.
     Outside the main thread, and if SIGTERM is already handled, nothing changes.
     """
-    with _handled(_raise, {signal.SIGTERM: (signal.SIG_DFL,)}):
-        yield
+    with _handled(_raise, {signal.SIGTERM: (signal.SIG_DFL,)}) as before:
+        if before:
+            _LAST.number = 0
+        try:
+            yield
+        except Exception as error:
+            if not before or _LAST.number != signal.SIGTERM:
+                raise
+            terminated = Terminated()
+            if isinstance(error, PhysxError):
+                terminated.add_note(str(error))
+            raise terminated from error
 
 
 def _raise(number: int, frame: FrameType | None) -> None:
+    _LAST.number = number
     raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
 
 @contextlib.contextmanager
 def _handled(
     handler: Callable[[int, FrameType | None], None], usual: Mapping[int, tuple[Any, ...]]
-) -> Iterator[None]:
-    """Handle signals, those that have one of their usual handlers."""
+) -> Iterator[Mapping[int, Any]]:
+    """Handle signals, those that have one of their usual handlers, and yield these."""
     before: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():
         current = {number: signal.getsignal(number) for number in usual}
@@ -89,7 +108,7 @@ def _handled(
     for number in before:
         signal.signal(number, handler)
     try:
-        yield
+        yield before
     finally:
         for number, kept in before.items():
             signal.signal(number, kept)

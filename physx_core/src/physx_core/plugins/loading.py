@@ -55,7 +55,9 @@ def loading(plugin: str, who: str, doing: str) -> Iterator[None]:
             problem = f"it takes longer than {limit:g} s ({TIMEOUT_VARIABLE} sets another limit)"
             raise PluginError(plugin, f"{who} {doing}: {problem}.") from error
         except BaseException as error:
-            if signals and not isinstance(error, Exception):
+            if signal.SIGINT in signals and isinstance(error, Exception):
+                raise KeyboardInterrupt from error  # an import may make any other of it
+            if signals:
                 raise
             # Other libraries, such as torch, read all metadata when they are imported.
             text = f"{who} {doing}: {_description(error)} {unreadable_hint()}"

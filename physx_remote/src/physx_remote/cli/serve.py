@@ -6,7 +6,6 @@ import contextlib
 import logging
 import os
 import secrets
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ import tyro
 from physx_core.cli import argument_registry
 from physx_core.errors import ConfigError, UsageError
 from physx_core.net import TOKEN_VARIABLE
+from physx_core.processes import TemporaryFolder
 from physx_remote.endpoints import serve
 from physx_remote.godot_rl.launch import write_launcher
 from physx_remote.serving.service import LOG, Service
@@ -126,10 +126,8 @@ def _token_file(given: Path | None) -> Iterator[str | None]:
             raise ConfigError(f"The token file {given} cannot be written: {error}.") from error
         yield str(given.absolute())
     else:
-        folder = os.environ.get("XDG_RUNTIME_DIR")
-        usable = folder if folder and os.access(folder, os.W_OK) else None
-        with tempfile.TemporaryDirectory(prefix="physx-", dir=usable) as made:
-            place = Path(made) / "token"
+        with TemporaryFolder("token-") as made:
+            place = made.path / "token"
             _write_token(place)
             yield str(place)
 
