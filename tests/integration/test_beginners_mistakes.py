@@ -393,9 +393,24 @@ def misspells_an_option_of_an_object():
     drawn(lambda self: self.factory.add_points("cloud", np.zeros((1, 3)), colour="red"))
 
 
-@mistake(e.UsageError, "which is not an Environment")
-def gives_a_class_that_is_no_environment():
+@mistake(e.ReferenceFormError, "Counter", "standard library")
+def gives_a_class_of_python():
     generate("collections:Counter")
+
+
+@mistake(e.ReferenceFormError, "Point")
+def gives_a_class_that_is_no_environment():
+    generate(f"{PROGRAM}:Point")
+
+
+@mistake(e.ReferenceFormError, "Linear")
+def gives_a_network_for_an_environment():
+    generate(Linear)
+
+
+@mistake(e.ReferenceFormError, "Good")
+def gives_an_environment_for_a_network():
+    train(NetworkConfig(Good))
 
 
 @mistake(e.ConfigError, "instance of Good", "give the class, Good, not an instance")
@@ -669,7 +684,7 @@ def trains_with_a_learning_rate_that_is_too_large():
         own(optimization=Steep)
 
 
-@mistake(e.EnvironmentFailedError, "at step 11", "new/network/network_0", "--resume")
+@mistake(e.EnvironmentFailedError, "at step 11", "new/network/network_0", "network_dir")
 def fails_in_an_environment_while_a_network_trains():
     def step(self):
         if self.step_index == 11:

@@ -74,7 +74,7 @@ def said(capsys):
 
 def test_a_generation_says_where_it_writes_what_it_left_and_how_to_continue(said):
     generate()
-    end = ["20 samples in T", "samples: 20 training in sessions/{0}/dataset"]
+    end = ["2 of 2 batches in T", "samples: 20 training in sessions/{0}/dataset"]
     info, training = (
         "next: physx info sessions/{0}",
         "next: physx train sessions/{0} --network.network NETWORK --epoch-nb N --batch-size N",
@@ -380,7 +380,7 @@ def interrupted_training():
     class Interrupted(Training):
         def epoch_end(self):
             super().epoch_end()
-            self._end_early()
+            signal.raise_signal(signal.SIGINT)
 
     data = DatasetConfig(existing_dir=generate().session.path)
     with pytest.raises(KeyboardInterrupt):

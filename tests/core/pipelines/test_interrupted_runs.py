@@ -21,7 +21,7 @@ from physx_core import (
     checkpoint,
 )
 from physx_core.cli import main
-from physx_core.errors import DivergedError, EnvironmentFailedError
+from physx_core.errors import ConfigError, DivergedError, EnvironmentFailedError
 from physx_core.toy import LeastSquares, Linear, Spring
 
 SPRING = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=1)
@@ -97,15 +97,26 @@ def saying(make, event):
 
 
 EVENTS = {"generation": "batch_end", "prediction": "sample_end", "replay": "sample_end"}
+CHECKPOINT = "checkpoint: sessions/new/network/network_0"
+AGAIN = "next: physx train --config sessions/new --network.network-dir sessions/new"
+LEFT = {
+    "generation": ["next: physx info sessions/new"],
+    "training": [CHECKPOINT, "next: physx train sessions/new --resume"],
+    "online training": [CHECKPOINT, AGAIN],
+    "prediction": ["next: physx info sessions/trained"],
+    "replay": ["session: sessions/new is removed, as the run kept nothing in it"],
+}
 
 
 @pytest.mark.parametrize("kind", PIPELINES)
 def test_sigterm_ends_every_pipeline_in_order_with_status_143(kind, nothing_stays_behind):
     Training(NETWORK, DATA, session_name="trained", **OPTIONS).execute()
     code, text = signaled(saying(PIPELINES[kind], EVENTS.get(kind, "batch_end")), [signal.SIGTERM])
-    assert (code, text) == (143, "")
+    assert code == 143 and "Traceback" not in text
+    assert set(LEFT[kind]) <= set(text.splitlines())
     session = "trained" if kind == "prediction" else "new"
-    assert "interrupted after" in Path(f"sessions/{session}/info.txt").read_text()
+    if kind != "replay":
+        assert "interrupted after" in Path(f"sessions/{session}/info.txt").read_text()
     if "training" in kind:
         assert checkpoints("new") == ["network_0"] and progress("new") != (0, 0)
     if kind in ("generation", "online training", "prediction"):
@@ -167,10 +178,28 @@ def test_an_environment_that_fails_leaves_a_checkpoint_and_the_error_names_it():
     with pytest.raises(EnvironmentFailedError, match="the solver diverged") as caught:
         Training(NETWORK, None, config, batch_nb=3, **OPTIONS).execute()
     place = Path("sessions/training/network/network_0")
-    assert str(place) in caught.value.__notes__[-1] and "resume=True" in caught.value.__notes__[-1]
+    assert str(place) in caught.value.__notes__[-1]
+    assert "NetworkConfig.network_dir" in caught.value.__notes__[-1]
     assert progress() == (1, 1)
     Training(NETWORK, batch_nb=3, resume=True, **OPTIONS).execute()
     assert progress(number=1) == (3, 0)
+
+
+def test_a_training_that_cannot_be_resumed_says_how_to_go_on(capfd):
+    config = EnvironmentConfig(Failing, as_tcp_ip_client=False, seed=1)
+    with pytest.raises(EnvironmentFailedError) as caught:
+        Training(NETWORK, None, config, batch_nb=9, **OPTIONS).execute()
+    assert "NetworkConfig.network_dir" in caught.value.__notes__[-1]
+    last = capfd.readouterr().err.splitlines()[-1]
+    assert last == AGAIN.replace("new", "training")
+    words = last.removeprefix("next: physx ").split()
+    assert main([*words, "--environment.environment", "toy/spring", "--batch-nb", "1"]) == 0
+    assert progress("training_1") == (3, 0)
+    with (
+        pytest.raises(ConfigError, match="--network.network-dir sessions/training"),
+        pytest.warns(UserWarning, match='"training_1" is newer'),
+    ):
+        Training(NETWORK, None, config, batch_nb=9, resume=True, **OPTIONS).execute()
 
 
 def test_an_environment_that_fails_before_the_first_batch_leaves_no_checkpoint():

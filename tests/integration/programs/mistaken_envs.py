@@ -84,3 +84,13 @@ class AsksBeforeShapesAreKnown(Good):
     def step(self):
         super().step()
         assert self.get_prediction(state=self._training["state"])["prediction"].shape == (2,)
+
+
+class Point:
+    """Is no environment, though it has an environment's methods."""
+
+    def create(self):
+        self.x = 0.0
+
+    def step(self):
+        self.x += 1.0

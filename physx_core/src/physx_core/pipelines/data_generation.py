@@ -144,8 +144,9 @@ class DataGeneration(NewSessionPipeline):
         )
 
     def _results(self) -> Iterable[str]:
-        duration, made = self._duration, self.batch_id * self.batch_size
-        yield f"{made} samples in {duration:.2f} s, {made / duration:.0f} samples/s"
+        duration = self._duration
+        rate = self.batch_id * self.batch_size / duration
+        yield f"{self.batch_id} of {self.batch_nb} batches in {duration:.2f} s, {rate:.0f} samples/s"
         yield describe_samples(self.dataset.directory)
 
     def _next(self, error: BaseException | None) -> Iterable[str]:

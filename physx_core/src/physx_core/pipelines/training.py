@@ -354,10 +354,10 @@ class Training(NewSessionPipeline):
             last = self.checkpoint_path or "none; save_each_epoch=True writes one after each epoch"
             error.add_note(f"The network could not be saved: {failure} Last checkpoint: {last}.")
         else:
-            error.add_note(
-                f"The network trained so far is {self.checkpoint_path}, from which resume=True "
-                "(physx train --resume) continues."
-            )
+            how = "from which resume=True (physx train --resume) continues"
+            if not can_resume(self.environment_config, self.epoch_id):
+                how = "with which another training starts: NetworkConfig.network_dir"
+            error.add_note(f"The network trained so far is {self.checkpoint_path}, {how}.")
 
     def _check_parameters(self) -> None:
         name = self.learner.network.find_not_finite() if self.on_nan == "stop" else ""
@@ -490,6 +490,8 @@ class Training(NewSessionPipeline):
             yield f"physx stats {path}"
         elif can_resume(self.environment_config, self.epoch_id):
             yield f"physx train {path} --resume"
+        else:
+            yield f"physx train --config {path} --network.network-dir {path}"
 
     def _components(self) -> Mapping[str, str]:
         return describe_training(self.learner, self.environment_config, self.data.dataset)

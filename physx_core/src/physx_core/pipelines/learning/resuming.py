@@ -25,8 +25,10 @@ def read_last_checkpoint(
     found = checkpoint.find(session.network_dir, name, -1)
     if not can_resume(environment, found.progress.epoch):
         raise ConfigError(
-            "A training cannot be resumed while environments generate its samples, as they "
-            "would start over. Train on the stored samples: leave the environment out."
+            "A training cannot be resumed while environments generate its samples, as they would "
+            f"start over. Leave the environment out to train on the stored samples, or start "
+            f"another training with its network: NetworkConfig.network_dir={str(session.path)!r} "
+            f"(--network.network-dir {session.path})."
         )
     return found
 
