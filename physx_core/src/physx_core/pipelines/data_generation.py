@@ -144,9 +144,9 @@ class DataGeneration(NewSessionPipeline):
         )
 
     def _results(self) -> Iterable[str]:
-        duration = self._duration
-        rate = self.batch_id * self.batch_size / duration
-        yield f"{self.batch_id} of {self.batch_nb} batches in {duration:.2f} s, {rate:.0f} samples/s"
+        count, duration = self.batch_id, self._duration
+        rate = count * self.batch_size / duration
+        yield f"{count} of {self.batch_nb} batches in {duration:.2f} s, {rate:.0f} samples/s"
         yield describe_samples(self.dataset.directory)
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
