@@ -161,7 +161,7 @@ def test_a_later_format_is_not_called_damaged(tmp_path, end):
     file = path / DESCRIPTION
     text = file.read_text().replace("format_version = 2", "format_version = 3")
     file.write_text(text[: text.index("[checksum]")] + end)
-    with pytest.raises(CheckpointError, match="version 3.*reads up to 2.*upgrade physx-core"):
+    with pytest.raises(CheckpointError, match="version 3.*reads up to 2.*pip install --upgrade"):
         read(path)
 
 

@@ -12,7 +12,12 @@ from pathlib import Path
 import pytest
 
 from physx_core import ClientHandle, Environment, Launcher, plugins
-from physx_core.errors import ClientError, ComponentNotFoundError, ConfigError
+from physx_core.errors import (
+    ClientError,
+    ComponentNotFoundError,
+    ConfigError,
+    ReferenceFormError,
+)
 from physx_core.workers.launchers import (
     ClientProcess,
     ManualLauncher,
@@ -125,7 +130,7 @@ def test_a_launcher_that_forgets_its_handles_is_named(clients):
 @pytest.mark.parametrize(
     ("settings", "error", "text"),
     [
-        ({"launcher": NoLauncher}, ConfigError, "NoLauncher is not a Launcher"),
+        ({"launcher": NoLauncher}, ReferenceFormError, "not derived from Launcher"),
         ({"launcher_kwargs": {"speed": 3}}, ConfigError, "unexpected keyword argument 'speed'"),
         ({"launcher": "physx/manuel"}, ComponentNotFoundError, 'Did you mean "manual"'),
     ],

@@ -71,7 +71,8 @@ def test_a_refused_prediction_is_the_error_of_the_services(local, clients, servi
             make("Asking", num_clients=2) as source,
         ):
             source.batch(4)
-        assert caught.value.__notes__ == ["in step() of instance 1"]
+        (note,) = caught.value.__notes__
+        assert note in ("in step() of instance 1", "in step() of instance 2")  # whoever was first
 
 
 def test_a_long_prediction_is_not_taken_for_silence(clients, services, unhurried):

@@ -134,7 +134,7 @@ def test_common_optimizers_learn(name):
         ("Adam", {"lr": -1.0}, "Invalid learning rate"),
         ("LBFGS", {}, "several times"),
         ("lr_scheduler", {}, "no optimizer"),
-        (list, {}, "not an optimizer"),
+        (list, {}, "list is a class, but not a torch.optim.Optimizer"),
     ],
 )
 def test_wrong_optimizer(optimizer, arguments, told):
@@ -218,7 +218,7 @@ def test_plateau_looks_at_the_loss_of_the_epoch():
         (("CosinAnnealingLR", {}), 'Did you mean "CosineAnnealingLR"'),
         (("CosineAnnealingLR", {}), "T_max"),
         (("StepLR", {"steps": 3}), "step_size"),
-        ((dict, {}), "rejects its arguments"),
+        ((dict, {}), "dict is a class, but not a torch.optim.LRScheduler"),
         ((id, {}), "not a scheduler"),
     ],
 )

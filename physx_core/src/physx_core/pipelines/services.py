@@ -60,11 +60,10 @@ class RunServices:
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
         """Save an instance's values beside the dataset; earlier ones of other names are kept."""
         path = self._dir / PARAMETERS.format(instance_id)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        merged = {**self.load_parameters(instance_id), **values}
-        partial = path.with_suffix(".partial")
-        partial.write_bytes(encode(merged))
-        partial.replace(path)
+        content = encode({**self.load_parameters(instance_id), **values})
+        with files.storing(str(path)):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            files.replace(path, content)
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
         """Return the values that an instance saved."""
@@ -84,8 +83,10 @@ def _read_parameters(path: Path) -> dict[str, Any]:
     """Return the values in a file, which may come with a stranger's dataset."""
     try:
         values = decode(files.read_content(path, LARGEST_PARAMETERS))
-    except (OSError, ConnectionRefusedByPeerError) as error:
+    except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error}.") from error
+    except ConnectionRefusedByPeerError as error:
+        raise DatasetError(f"{path} is damaged: {error}") from error
     if not isinstance(values, dict):
-        raise DatasetError(f"{path} cannot be read: it does not hold parameters by name.")
+        raise DatasetError(f"{path} is damaged: it does not hold parameters by name.")
     return values
