@@ -147,7 +147,7 @@ def test_a_real_godot_application(tmp_path):
 
 
 def test_the_table_of_options_is_complete():
-    told = dict(re.findall(r"`?(\w+)=([^,`]*)`", TEXT.split("## Options")[1]))
+    told = dict(re.findall(r"`?(\w+)=([^,`]*)`", TEXT.split("## Options")[1].split("\n## ")[0]))
     kinds = {
         "godot-gym": Communication,
         "godot-rl": GodotRL,

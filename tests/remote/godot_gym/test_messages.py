@@ -134,6 +134,10 @@ def test_what_a_field_held_before_is_replaced():
     assert not message.wheels and not message.cameras
     fill(message, position={}, steering={})
     assert message.HasField("position") and message.HasField("steering")
+    for numbers in ([1.0, 2.0], np.ones(2), np.ones(40), [3.0, np.float32(4.0)]):
+        for _ in range(3):
+            fill(message.steering, load=numbers)
+            assert [*message.steering.load] == [*numbers]
 
 
 def test_messages_may_stand_for_dictionaries():

@@ -257,6 +257,8 @@ def test_what_is_no_message_ends_the_connection(service, said):
     ("kind", "value"),
     [
         (Kind.REQUEST, {"do": "dance"}),
+        (Kind.REQUEST, {"do": np.zeros(2)}),
+        (Kind.REQUEST, {"do": "snapshot"}),
         (Kind.REQUEST, {}),
         (Kind.REQUEST, [1, 2]),
         (Kind.REQUEST, {"do": "reset", "worlds": "all"}),

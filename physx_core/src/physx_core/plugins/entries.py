@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import sys
 from collections.abc import Iterable
@@ -104,11 +105,10 @@ def owner_of(entry: EntryPoint) -> str:
     """Return name and version of the distribution that contains an entry point."""
     if entry.dist is None:
         return entry.value
-    try:
+    version = None
+    with contextlib.suppress(Exception):  # its metadata are damaged
         version = entry.dist.version
-    except Exception:  # its metadata are damaged
-        version = "without a version"
-    return f"{_name_of(entry.dist)} {version}"
+    return f"{_name_of(entry.dist)} {version or 'without a version'}"
 
 
 def _name_of(package: Distribution) -> str:

@@ -59,9 +59,9 @@ def loading(plugin: str, who: str, doing: str) -> Iterator[None]:
                 raise KeyboardInterrupt from error  # an import may make any other of it
             if signals:
                 raise
-            # Other libraries, such as torch, read all metadata when they are imported.
-            text = f"{who} {doing}: {_description(error)} {unreadable_hint()}"
-            raise PluginError(plugin, text.rstrip()) from error
+            text = f"{who} {doing}: {_description(error)}"
+            hint = unreadable_hint()  # others, such as torch, read all metadata at their import
+            raise PluginError(plugin, f"{text.rstrip('.')}. {hint}" if hint else text) from error
 
 
 def _timeout() -> float:

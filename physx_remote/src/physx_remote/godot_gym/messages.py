@@ -260,7 +260,7 @@ def _replace(storage: Any, name: str, present: Any, value: Any) -> None:
         if _TYPES[field.type] in ("string", "bytes"):
             convert = _plain if _TYPES[field.type] == "string" else _to_bytes
             _check_list(value)
-            storage.ClearField(name)
+            del present[:]  # ClearField would leave the container without its message
             present.extend([convert(item) for item in value])
         else:
             _set_numbers(storage, name, present, value)
@@ -269,10 +269,10 @@ def _replace(storage: Any, name: str, present: Any, value: Any) -> None:
         storage.ClearField(name)
         _set_message(getattr(storage, name), value)
     elif _is_map(field):
-        _set_map(storage, name, present, field.message_type.fields_by_name["value"], value)
+        _set_map(present, field.message_type.fields_by_name["value"], value)
     else:
         _check_list(value)
-        storage.ClearField(name)
+        del present[:]
         for item in value:
             _set_message(present.add(), item)
 
@@ -286,11 +286,11 @@ def _set_message(storage: Any, value: Any) -> None:
         storage.CopyFrom(value)
 
 
-def _set_map(storage: Any, name: str, present: Any, content: Any, value: Any) -> None:
+def _set_map(present: Any, content: Any, value: Any) -> None:
     """Set a map to a dictionary; `content` describes what its values are."""
     if not isinstance(value, Mapping):
         raise TypeError("a map takes a dictionary")
-    storage.ClearField(name)
+    present.clear()
     for key, item in value.items():
         if content.message_type is not None:
             _set_message(present[_plain(key)], item)
@@ -302,13 +302,13 @@ def _set_map(storage: Any, name: str, present: Any, content: Any, value: Any) ->
 def _set_numbers(storage: Any, name: str, repeated: Any, value: Any) -> None:
     """Set a repeated field of numbers; long floating arrays are copied in wire format."""
     if len(repeated):
-        storage.ClearField(name)
+        del repeated[:]
     if isinstance(value, list) and value and type(value[0]) in (float, int):
         try:
             repeated.extend(value)
             return
         except TypeError:  # a later element is a list or a NumPy number
-            storage.ClearField(name)
+            del repeated[:]
     if not isinstance(value, np.ndarray):
         value = np.asarray(value)
     if value.size > _MANY:
