@@ -867,6 +867,12 @@ def trains_a_torch_network_with_a_learning_rate_that_is_too_large():
     train(fc(optimizer="SGD", lr=1e18), epoch_nb=4)
 
 
+@mistake(e.CheckpointError, "layers.0.weight", "(4, 2)", "(8, 2)")
+def continues_a_network_of_another_size():
+    train(fc(), session_name="first")
+    train(fc([2, 4, 2], network_dir="sessions/first"))
+
+
 # Scripts and warnings -----------------------------------------------------------------------------
 
 
@@ -881,6 +887,14 @@ def test_a_script_without_a_guard_says_what_to_write(tmp_path, nothing_stays_beh
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.returncode == 1
     assert 'Put the pipeline under  if __name__ == "__main__":' in done.stderr
+
+
+@pytest.mark.parametrize("clients", [False, True])
+def test_a_prediction_in_the_first_step_of_a_training_takes_its_shapes_from_the_step(
+    clients, tmp_path, monkeypatch, nothing_stays_behind
+):
+    monkeypatch.chdir(tmp_path)
+    train_online(f"{PROGRAM}:AsksBeforeShapesAreKnown", as_tcp_ip_client=clients)
 
 
 def test_a_misspelt_optional_method_is_a_warning(tmp_path, monkeypatch):
