@@ -86,6 +86,22 @@ def test_debug_shows_the_traceback(capsys):
     assert "Traceback" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("verb", "arguments"),
+    [
+        ("generate", "[ENVIRONMENT]"),
+        ("train", "[DATASET]"),
+        ("predict", "[SESSION] [ENVIRONMENT]"),
+        ("replay", "[DATASET] [ENVIRONMENT]"),
+    ],
+)
+def test_help_shows_the_arguments_without_names_and_examples(verb, arguments, capsys):
+    assert main([verb, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: physx {verb} {arguments} [-h]")
+    assert sum(line.startswith(f"  physx {verb} ") for line in text.splitlines()) == 3
+
+
 def test_help_imports_nothing_heavy():
     code = (
         "import sys; from physx_core.cli import main; main(['--help']); "

@@ -196,6 +196,11 @@ def test_the_command_line_takes_where_numbers_go(capsys):
         "--histograms-every",
         "1",
     ]
-    chosen = ["--statistics", "seen.py:Sees", "--statistics-kwargs", "seen.py:Sees={name='it'}"]
-    assert main(["train", "sessions/run", *words, *chosen]) == 0
-    assert Path("it").read_text() == "epoch"
+    chosen = ["--statistics", "seen.py:Sees", "--statistics-kwargs"]
+    for name, table in (("toml", "{name='toml'}"), ("json", '{"name": "json"}')):
+        assert main(["train", "sessions/run", *words, *chosen, f"seen.py:Sees={table}"]) == 0
+        assert Path(name).read_text() == "epoch"
+    capsys.readouterr()
+    for nonsense in ("5", '{"name"', "name"):
+        assert main(["train", "sessions/run", *words, *chosen, f"seen.py:Sees={nonsense}"]) == 1
+        assert "The statistics_kwargs of seen.py:Sees are " in capsys.readouterr().err

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import tomllib
 from typing import Any
 
@@ -40,11 +42,11 @@ def argument_registry() -> ConstructorRegistry:
 
 
 def _argument(word: str) -> tuple[str, Any]:
-    """Return name and value of ``NAME=VALUE``; the value is TOML, or else a string."""
+    """Return name and value of ``NAME=VALUE``; the value is TOML, or JSON, or else a string."""
     name, equals, text = word.partition("=")
     if not equals:
         raise ValueError(f"{word!r} is not NAME=VALUE")
-    try:
-        return name, tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return name, text
+    for parse in (lambda: tomllib.loads(f"value = {text}")["value"], lambda: json.loads(text)):
+        with contextlib.suppress(ValueError, RecursionError):  # their decoding errors, too
+            return name, parse()
+    return name, text

@@ -28,6 +28,9 @@ def pipeline_from(
     places: Sequence[str],
     words: Sequence[str],
     given: Mapping[str, Any] | None = None,
+    *,
+    arguments: str,
+    examples: Sequence[str],
 ) -> P:
     """Create a pipeline from the words of a command line.
 
@@ -39,6 +42,8 @@ def pipeline_from(
         words: The words after the command. ``--config FILE`` names a TOML file, or a session that
             has one, whose table of the pipeline's kind contains options; words override them.
         given: Table of options that apply unless the file contains them.
+        arguments: What the first words without a dash are, for the help.
+        examples: Words of typical command lines, for the help.
     """
     table, rest = _take_file(make, list(words))
     table = {**(given or {}), **table}
@@ -50,9 +55,13 @@ def pipeline_from(
     if unknown:
         raise UnknownOptionError(f"The table [{make.kind}]", unknown, known)
     form = dataclasses.make_dataclass(verb, options, kw_only=True)
-    form.__doc__ = textwrap.dedent(make.__doc__ or "").split("\n\n")[0]
+    about = textwrap.dedent(make.__doc__ or "").split("\n\n")[0]
+    lines = "\n".join(f"  physx {verb} {example}" for example in examples)
+    about += f"\n\nexamples:\n{lines}"
+    asks = not {"-h", "--help"}.isdisjoint(rest)
     with argument_registry():
-        chosen: Any = tyro.cli(form, args=rest, prog=f"physx {verb}")
+        prog = f"physx {verb} {arguments}" if asks else f"physx {verb}"
+        chosen: Any = tyro.cli(form, args=rest, prog=prog, description=about)
     values = {_python_name(make, name): getattr(chosen, name) for name in (o[0] for o in options)}
     return make(**values)
 

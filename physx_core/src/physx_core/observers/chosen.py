@@ -7,7 +7,7 @@ from typing import Any
 
 from physx_core.components.visualizer import Observer
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import UnknownOptionError
+from physx_core.errors import ConfigError, UnknownOptionError
 from physx_core.plugins import resolve
 
 
@@ -25,12 +25,19 @@ def statistics_observers(
 
     Raises:
         UnknownOptionError: If there are arguments for another reference.
+        ConfigError: If the arguments of a reference are no table.
         PhysxError: If a reference cannot be resolved.
     """
     references = [given] if isinstance(given, str) else list(given)
     unknown = kwargs.keys() - set(map(str, references))
     if unknown:
         raise UnknownOptionError("statistics_kwargs", unknown, map(str, references))
+    for name, options in kwargs.items():
+        if not isinstance(options, Mapping):
+            raise ConfigError(
+                f"The statistics_kwargs of {name} are {options!r:.100} and must be a table: "
+                f"""{{"{name}": {{"option": 1}}}}, on the command line '{name}={{option=1}}'."""
+            )
     drawn = environment.visualizer if environment is not None else None
     return [
         resolve("visualizer", reference)(**kwargs.get(str(reference), {}))

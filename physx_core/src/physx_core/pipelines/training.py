@@ -119,7 +119,7 @@ class Training(NewSessionPipeline):
     statistics: Sequence[str | type[Any]] = ()
     """Observers of numbers beside stats/scalars.csv, for example "torch/tensorboard" or "rerun"."""
     statistics_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Keyword arguments of each observer, by its name."""
+    """Keyword arguments of each observer, by its name; in a command ``rerun={mode="save"}``."""
     histograms_every: int = at_least(0, 0)
     """Number of epochs between histograms of weights and gradients; 0: none."""
     resume: bool = field(default=False, metadata={"recorded": False})

@@ -26,7 +26,19 @@ def run(words: Sequence[str]) -> None:
     place = ("dataset.existing_dir", "environment.environment")
     viewers = _visualizer_plugins()
     viewer = {"visualizer": viewers[0]} if len(viewers) == 1 else {}
-    pipeline = pipeline_from(Replay, "replay", place, words, _given(words, viewer))
+    pipeline = pipeline_from(
+        Replay,
+        "replay",
+        place,
+        words,
+        _given(words, viewer),
+        arguments="[DATASET] [ENVIRONMENT]",
+        examples=(
+            "sessions/data_generation",
+            "sessions/data_generation dart/arm --environment.visualizer rerun",
+            "sessions/training --mode validation",
+        ),
+    )
     config = pipeline.environment_config
     is_given = any(word.partition("=")[0] == _VISUALIZER for word in words)
     if config is not None and config.visualizer is None and not is_given:

@@ -20,4 +20,16 @@ def run(words: Sequence[str]) -> None:
             Session.existing(session.parent, session.name)
             given = [] if "--config" in words else ["--config", str(session)]
             words = [*given, *words]
-    pipeline_from(Training, "train", ("dataset.existing_dir",), words).execute()
+    pipeline_from(
+        Training,
+        "train",
+        ("dataset.existing_dir",),
+        words,
+        arguments="[DATASET]",
+        examples=(
+            "sessions/data_generation --network.network torch/fc --network.network-kwargs layers=[64] "
+            "--epoch-nb 10 --batch-size 32",
+            "sessions/training --resume --epoch-nb 20",
+            "--config sessions/training",
+        ),
+    ).execute()

@@ -253,8 +253,9 @@ class Server:
         numbers = range(1, self._instance_nb + 1)
         free = [n for n in numbers if n not in self.peers or self.peers[n].vacant]
         if not free or (wanted and wanted not in free):
+            name = f"instance {wanted}" if wanted else "another client"
             refusal = ConnectionRefusedByPeerError(
-                f"The server has no place for instance {wanted or 'of any number'}: of its "
+                f"The server has no place for {name}: of its "
                 f"{self._instance_nb} instances {free or 'none'} are free."
             )
             peer.send(pack(Kind.ERROR, encode_error(refusal)))
