@@ -16,7 +16,7 @@ def test_the_main_job_by_commands(capsys):
         main([*GENERATE, *LOCAL, "--environment.env-kwargs", "mass=2", "--environment.seed", "3"])
         == 0
     )
-    assert "20 samples" in capsys.readouterr().err
+    assert "samples: 20 training" in capsys.readouterr().err
     train = ["train", "sessions/data_generation", "--network.network", "toy/linear"]
     assert main([*train, "--epoch-nb", "1", "--batch-size", "5"]) == 0
     assert "training loss" in capsys.readouterr().err
@@ -37,7 +37,7 @@ def test_a_file_gives_options_and_words_replace_them(capsys, tmp_path):
     )
     assert main(["generate", "--config", "job.toml", "--batch-size", "5"]) == 0
     text = capsys.readouterr().err
-    assert "15 samples" in text and "sessions/mine" in text
+    assert "samples: 15 training" in text and "sessions/mine" in text
     assert main(["generate", "--config", "sessions/mine/config.toml"]) == 0
     assert "sessions/mine_1" in capsys.readouterr().err
 

@@ -27,8 +27,7 @@ def run(words: Sequence[str]) -> None:
         words,
         arguments="[DATASET]",
         examples=(
-            "sessions/data_generation --network.network torch/fc --network.network-kwargs layers=[64] "
-            "--epoch-nb 10 --batch-size 32",
+            "sessions/data_generation --network.network toy/linear --epoch-nb 10 --batch-size 32",
             "sessions/training --resume --epoch-nb 20",
             "--config sessions/training",
         ),
