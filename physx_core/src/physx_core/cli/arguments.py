@@ -46,7 +46,8 @@ def _argument(word: str) -> tuple[str, Any]:
     name, equals, text = word.partition("=")
     if not equals:
         raise ValueError(f"{word!r} is not NAME=VALUE")
-    for parse in (lambda: tomllib.loads(f"value = {text}")["value"], lambda: json.loads(text)):
-        with contextlib.suppress(ValueError, RecursionError):  # their decoding errors, too
-            return name, parse()
+    with contextlib.suppress(ValueError, RecursionError):  # a TOMLDecodeError is a ValueError
+        return name, tomllib.loads(f"value = {text}")["value"]
+    with contextlib.suppress(ValueError, RecursionError):
+        return name, json.loads(text)
     return name, text
