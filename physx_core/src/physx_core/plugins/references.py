@@ -205,7 +205,7 @@ def check_recorded(
         return
     if is_of_plugin(kind, reference):
         reference = None
-    for where, text in _texts((kind, reference), (f"{kind}_kwargs", arguments)):
+    for where, text in _texts(file, (kind, reference), (f"{kind}_kwargs", arguments)):
         if ":" in text:
             raise UntrustedReferenceError(
                 f'{file} has {where} = "{text:.200}", which may be any code. A file may only name '
@@ -226,7 +226,7 @@ def is_of_plugin(kind: str, reference: Any) -> bool:
     return False
 
 
-def _texts(*values: tuple[str, Any]) -> Iterator[tuple[str, str]]:
+def _texts(file: object, *values: tuple[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield all texts in nested plain data, each with the place where it is."""
     left = list(values)
     for _ in range(_MOST_VALUES):
@@ -240,8 +240,8 @@ def _texts(*values: tuple[str, Any]) -> Iterator[tuple[str, str]]:
         elif isinstance(value, (list, tuple)):
             left += [(where, item) for item in value]
     raise UntrustedReferenceError(
-        f"{values[0][0]}_kwargs in a file have more than {_MOST_VALUES} values. If that is right: "
-        "--trust (in Python trust=True)."
+        f"{file} has more than {_MOST_VALUES} values in {values[-1][0]}. If that is right: --trust "
+        "(in Python trust=True)."
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from physx_core.errors import ModelError, listed
+from physx_core.files import read_content
 from physx_core.rotations import from_roll_pitch_yaw, to_matrix
 from physx_core.typing import Vector
 
@@ -24,6 +26,10 @@ _SIZES: dict[str, dict[str, int]] = {
     "capsule": {"radius": 1, "length": 1},
 }
 """Attributes that give the size of each kind of shape, and how many numbers each has."""
+_LARGEST = 2**24
+"""Bytes of a URDF file."""
+_MOST = {"link": 400, "visual": 4000, "collision": 4000}
+"""Elements of a URDF file; engines take time and memory that grow with higher powers of these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,11 +123,14 @@ def parse_urdf(path: Path) -> Element:
         ModelError: If the file is missing or is not a URDF file.
     """
     try:
-        text = path.read_bytes()
+        text = read_content(Path(os.path.realpath(path)), _LARGEST)
     except FileNotFoundError:
         raise ModelError(f"There is no URDF file {path}.") from None
     except OSError as error:
-        raise ModelError(f"{path} cannot be read as a URDF file: {error}.") from error
+        why = error.strerror or error
+        raise ModelError(f"{path} cannot be read as a URDF file: {why}.") from error
+    if b"\0" in text:
+        raise ModelError(f"{path} is UTF-16 or no text; a URDF file is UTF-8.")
     if b"<!DOCTYPE" in text:
         raise ModelError(
             f"{path} has a DOCTYPE, which URDF files do not need and whose entities may be a bomb."
@@ -132,6 +141,10 @@ def parse_urdf(path: Path) -> Element:
         raise ModelError(f"{path} is not valid XML: {error}.") from error
     if root.tag != "robot":
         raise ModelError(f'{path} is not a URDF file: its root element is "{root.tag}".')
+    for tag, most in _MOST.items():
+        count = sum(1 for _ in root.iter(tag))
+        if count > most:
+            raise ModelError(f'{path} has {count} elements "{tag}"; a model may have {most}.')
     return root
 
 

@@ -17,6 +17,7 @@ from physx_core.errors import ModelError
 from physx_core.rotations import to_matrix
 from physx_core.simulation import Ground, HeightField, Stairs
 from physx_core.typing import Vector
+from physx_dart.models.meshes import geometry_file
 from physx_dart.models.parts import Mover, Static
 from physx_dart.models.shapes import CollisionShape
 
@@ -117,7 +118,8 @@ def _attach(
 def _dart_shape(shape: CollisionShape) -> Any:
     size = list(shape.size)
     if shape.mesh is not None:
-        loaded = _load_mesh(shape.mesh)
+        with geometry_file(shape.mesh) as bare:
+            loaded = _load_mesh(bare)
         loaded.setScale(size)
         return loaded
     if shape.kind == "box":

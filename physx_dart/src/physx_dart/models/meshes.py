@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,9 @@ from physx_core.errors import ModelError
 from physx_core.typing import Vector
 
 _FORMATS = (".stl", ".obj", ".dae")
+_LARGEST = 2**27
+"""Bytes of a mesh file; loading takes several times as much memory."""
+_GEOMETRY = ([b"v"], [b"vn"], [b"vt"], [b"f"], [b"o"], [b"g"])
 
 
 def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
@@ -24,16 +29,36 @@ def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
         raise ModelError(f"There is no mesh file {path}.")
     if path.suffix.lower() not in _FORMATS:
         raise ModelError(f"The mesh {path} is not in one of the formats {', '.join(_FORMATS)}.")
+    if path.stat().st_size > _LARGEST:
+        raise ModelError(f"The mesh {path} has more than {_LARGEST} bytes: simplify it.")
     import coal  # only worlds with meshes need it
 
     try:
-        mesh = coal.MeshLoader().load(str(path), np.array(scale, np.float64))
+        with geometry_file(path) as bare:
+            mesh = coal.MeshLoader().load(str(bare), np.array(scale, np.float64))
         vertices = np.array(mesh.vertices(), np.float64).reshape(-1, 3)
     except (ValueError, RuntimeError, TypeError) as error:
         raise ModelError(f"The mesh {path} cannot be read: {error}") from error
     if not len(vertices) or not np.isfinite(vertices).all():
         raise ModelError(f"The mesh {path} has no vertices, or some that are not finite.")
     return vertices
+
+
+@contextmanager
+def geometry_file(path: Path) -> Iterator[Path]:
+    """Yield a file with the vertices and faces of a mesh, which names no other file.
+
+    An obj file can name files of materials, anywhere, which the engines' libraries would read.
+    """
+    if path.suffix.lower() != ".obj":
+        yield path
+        return
+    content = path.read_bytes().replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    lines = content.splitlines(keepends=True)
+    with tempfile.TemporaryDirectory() as folder:
+        bare = Path(folder, path.name)
+        bare.write_bytes(b"".join(line for line in lines if line.split(None, 1)[:1] in _GEOMETRY))
+        yield bare
 
 
 def bounding_box(vertices: Vector) -> tuple[Vector, Vector]:

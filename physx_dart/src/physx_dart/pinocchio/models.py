@@ -14,6 +14,7 @@ from physx_dart.models.parts import Mover
 
 _TRANSLATION, _ROTATION = "physx translation", "physx rotation"
 _LINK = "physx link "
+_MOST_VELOCITIES = 192
 
 
 def load_model(mover: Mover, gravity: tuple[float, ...], *, armature: Vector) -> Any:
@@ -58,9 +59,15 @@ def frames_of(model: Any, mover: Mover) -> list[int]:
 
 def _parse(mover: Mover, *root: Any) -> Any:
     try:
-        return pinocchio.buildModelFromXML(mover.model.text, *root)
+        model = pinocchio.buildModelFromXML(mover.model.text, *root)
     except (ValueError, RuntimeError) as error:
         raise ModelError(f"Pinocchio cannot load {mover.model.path}: {error}") from error
+    if model.nv > _MOST_VELOCITIES:
+        raise ModelError(
+            f"{mover.model.path} has {model.nv} degrees of freedom. Pinocchio takes memory that "
+            f"grows with their cube, so there may be {_MOST_VELOCITIES}; use the engine dart."
+        )
+    return model
 
 
 def _weld(model: Any, mover: Mover) -> None:

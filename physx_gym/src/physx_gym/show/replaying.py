@@ -18,6 +18,8 @@ from physx_gym.show.rendering import PICTURE_SIZE, Picture, open_viewer
 from physx_gym.telemetry.episode_log import Log
 from physx_gym.telemetry.log_file import Source, as_logs
 
+_FRAMES, _FRAMES_PER_ROW = 10_000, 100
+
 
 def replay(
     logs: Source | Sequence[Source],
@@ -54,7 +56,7 @@ def replay(
     checks.positive("frame_rate", frame_rate)
     chosen = as_logs(logs, compare)
     motions = [_Motion(number, log, backend) for number, log in enumerate(chosen, 1)]
-    count = 1 + max(int(motion.duration * frame_rate + 1e-9) for motion in motions)
+    count = max(motion.count_frames(frame_rate) for motion in motions)
     options: dict[str, Any] = {"max_instances": len(motions), **viewer}
     if record_video_path is not None:
         options = {"mode": "offscreen", "save": False, "picture_size": PICTURE_SIZE} | options
@@ -98,10 +100,10 @@ class _Motion:
 
     def __init__(self, number: int, log: Log, backend: Any) -> None:
         """Rebuild the world of the log."""
-        self._number = number
+        self._number, self._label = number, log.label
         states = log.trajectory()
         self._times, self._positions = states.times, states.positions
-        self.duration = float(self._times[-1] - self._times[0])
+        self._duration = float(self._times[-1] - self._times[0])
         world, engine = log.world(), _backend(log, backend)
         self._simulation = engine.build(world)
         layout = self._simulation.layout
@@ -113,6 +115,17 @@ class _Motion:
         self._factory = Factory()
         title = f"{number}: {log.label}"
         self._drawing = WorldDrawing(self._factory, world, engine, layout, title)
+
+    def count_frames(self, frame_rate: float) -> int:
+        """Return how many frames show it, checking that a few rows do not claim to be an age."""
+        count = 1 + self._duration * frame_rate + 1e-9
+        most = max(_FRAMES, _FRAMES_PER_ROW * len(self._times))
+        if not count <= most:
+            raise LogError(
+                f'The log "{self._label}" has {len(self._times)} rows of {self._duration:.4g} s in '
+                f"all, which would be more than {most} frames. Lower the frame_rate."
+            )
+        return int(count)
 
     def draw(self, shown: Visualizer, frame: int, time: float) -> None:
         """Draw the state at a time after the start, in s."""

@@ -25,12 +25,13 @@ _MOST_OPERATIONS = 100
 _MOST_CALLS = 6
 _OPERATIONS = {
     "PROTO", "FRAME", "STOP", "GLOBAL", "STACK_GLOBAL", "REDUCE", "BUILD", "MARK", "NONE",
-    "NEWTRUE", "NEWFALSE", "MEMOIZE", "BINPUT", "LONG_BINPUT", "BINGET", "LONG_BINGET", "BININT",
-    "BININT1", "BININT2", "LONG1", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3",
+    "NEWTRUE", "NEWFALSE", "MEMOIZE", "BINPUT", "BINGET", "BININT", "BININT1", "BININT2", "LONG1",
+    "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3",
     "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8", "SHORT_BINBYTES", "BINBYTES", "BINBYTES8",
     "BYTEARRAY8",
 }  # fmt: skip
-"""Operations in the pickles that NumPy writes."""
+"""Operations in the pickles that NumPy writes; LONG_BINPUT, whose number is how much memory is
+taken, is not among them."""
 _KIND = re.compile(r"[biufc]\d{1,2}")
 _SHAPE_LENGTH = 64
 
@@ -54,7 +55,10 @@ def load_array(content: bytes) -> Array:
         raise ArrayPickleError(f"its pickle is damaged: {str(error)[:200]}") from error
     if not isinstance(found, _Array):
         raise ArrayPickleError(f"its pickle holds a {type(found).__name__}, not an array")
-    return found.make()
+    try:
+        return found.make()
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ArrayPickleError(f"it has an impossible type or shape: {str(error)[:200]}") from error
 
 
 def _check_operations(content: bytes) -> None:

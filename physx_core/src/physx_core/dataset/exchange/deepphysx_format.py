@@ -12,7 +12,7 @@ import contextlib
 import itertools
 import re
 import sqlite3
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,7 +59,7 @@ class _Part:
 
     place: str
     rows: int
-    read: Callable[[int, int], Sequence[Any] | Array]
+    read: Callable[[int, int], Iterable[Any]]
 
 
 class PartsColumn:
@@ -95,12 +95,13 @@ class PartsColumn:
 
     def _rows(self) -> Iterator[Array]:
         for part in self._parts:
+            number = 0
             for start in range(0, part.rows, _AT_A_TIME):
-                values = part.read(start, min(_AT_A_TIME, part.rows - start))
-                if len(values) != min(_AT_A_TIME, part.rows - start):
-                    raise ExchangeError(f"{part.place} has fewer rows than were counted.")
-                for number, value in enumerate(values, start):
+                for value in part.read(start, min(_AT_A_TIME, part.rows - start)):
                     yield _array_of(f"Row {number} of {part.place}", value)
+                    number += 1
+            if number != part.rows:
+                raise ExchangeError(f"{part.place} has fewer rows than were counted.")
 
 
 def _array_of(where: str, value: Any) -> Array:
@@ -207,11 +208,13 @@ def _database_part(
     query = f'SELECT "{quoted}" FROM "{table}" ORDER BY rowid'
     cursor = database.cursor()
 
-    def read(start: int, count: int) -> list[Any]:
+    def read(start: int, count: int) -> Iterator[Any]:
+        """Yield the next rows one by one: each may be as large as the file."""
         with _reading(path):
             if start == 0:
                 cursor.execute(query)
-            return [value for (value,) in cursor.fetchmany(count)]
+            for (value,) in itertools.islice(cursor, count):
+                yield value
 
     return _Part(f'"{name}" in the table {table} of {path}', rows, read)
 
@@ -231,14 +234,19 @@ def _tables(path: Path, database: sqlite3.Connection) -> dict[str, tuple[int, li
         name.lower(): str(text)
         for name, text in database.execute("SELECT name, sql FROM sqlite_master WHERE type='table'")
     }
-    tables = {}
+    tables, nbytes = {}, path.stat().st_size
     for name in _TABLES:
         if name not in found:
             continue
-        columns = database.execute(f'PRAGMA table_xinfo("{name}")').fetchall()
-        if any(hidden for *_, hidden in columns) or found[name].upper().startswith("CREATE V"):
+        is_plain = found[name].upper().startswith("CREATE TABLE")
+        columns = database.execute(f'PRAGMA table_xinfo("{name}")').fetchall() if is_plain else []
+        if not is_plain or any(hidden for *_, hidden in columns):
             raise ExchangeError(f"The table {name} of {path} is computed, not stored.")
-        (rows,) = database.execute(f'SELECT count(*) FROM "{name}"').fetchone()
+        # Each row takes bytes, but in a damaged file it may be found on several ways.
+        counted = f'SELECT count(*) FROM (SELECT 1 FROM "{name}" LIMIT {nbytes})'
+        (rows,) = database.execute(counted).fetchone()
+        if rows == nbytes:
+            raise ExchangeError(f"{path} is damaged: its table {name} has more rows than bytes.")
         tables[name] = rows, [column[1] for column in columns if column[1] not in _HIDDEN]
     allowed, denied = sqlite3.SQLITE_OK, sqlite3.SQLITE_DENY
     database.set_authorizer(lambda action, *_: allowed if action in _ALLOWED else denied)

@@ -56,13 +56,21 @@ class Learner:
         group: The processes that train the network together.
     """
 
-    def __init__(self, config: NetworkConfig, *, trains: bool, stops_at_nan: bool = True) -> None:
+    def __init__(
+        self,
+        config: NetworkConfig,
+        *,
+        trains: bool,
+        stops_at_nan: bool = True,
+        network: Network | None = None,
+    ) -> None:
         """Create the components.
 
         Args:
             config: The components and their arguments.
             trains: Whether an optimization is created too.
             stops_at_nan: Whether `optimize` raises for a loss or gradient that is not finite.
+            network: The network, if it was created already.
 
         Raises:
             ConfigError: If no network is configured, or a component rejects its arguments.
@@ -72,7 +80,7 @@ class Learner:
             raise ConfigError(
                 'NetworkConfig.network is missing: name a network, for example "torch/fc".'
             )
-        self.network: Network = create_network(config)
+        self.network: Network = network or create_network(config)
         reference = config.transformation or self.network.default_transformation
         self.transformation: Transformation = create(
             "transformation", reference, config.transformation_kwargs, Transformation
@@ -404,7 +412,14 @@ def load_learner(
     chosen = {"data_type": found.network.get("data_type", config.data_type)}
     for kind in ("network", "transformation"):
         chosen |= _choose(kind, found, config, trust)
-    learner = _create_learner(dataclasses.replace(config, **chosen), found, config.network is None)
+    try:
+        merged = dataclasses.replace(config, **chosen)
+    except ConfigError as error:  # the user's own options are valid
+        raise CheckpointError(
+            f"{found.path / checkpoint.DESCRIPTION} is invalid: {error}"
+        ) from error
+    network = None if config.network else _create_recorded(merged, found)
+    learner = Learner(merged, trains=False, network=network)
     used, recorded = learner.config.transformation, found.network.get("transformation")
     if config.transformation is None and recorded and not is_recorded_as(used, recorded):
         _check("transformation", found, recorded, {}, trust)
@@ -414,27 +429,19 @@ def load_learner(
     return learner
 
 
-def _create_learner(config: NetworkConfig, found: checkpoint.Checkpoint, recorded: bool) -> Learner:
-    """Create the components of a checkpoint.
-
-    Args:
-        config: The components and their arguments.
-        found: The checkpoint.
-        recorded: Whether the network is the checkpoint's choice, not the user's.
-    """
-    if not recorded:
-        return Learner(config, trains=False)
+def _create_recorded(config: NetworkConfig, found: checkpoint.Checkpoint) -> Network:
+    """Create the network that a checkpoint names, with its arguments."""
     try:
         make, arguments = resolve_network(config.network, config.network_kwargs)
         if isinstance(make, type) and issubclass(make, Network):
             make.check_arguments(arguments, found.path / make.parameters_file)
-        return Learner(config, trains=False)
-    except PhysxError:
-        raise
+        return create_network(config)
     except Exception as error:  # whatever a component raises for arguments of a damaged file
+        if isinstance(error, PhysxError) and not isinstance(error, ConfigError):
+            raise
         raise CheckpointError(
             f'{found.path / checkpoint.DESCRIPTION} describes no "{config.network}" that can be '
-            f"created: {error}."
+            f"created: {str(error).removesuffix('.')}."
         ) from error
 
 
