@@ -57,7 +57,7 @@ def test_the_core_alone_generates_and_trains_and_torch_adds_its_network(empty, r
     foreign = {"gymnasium", "torch", "dartpy", "pin", "rerun-sdk"}
     assert not foreign & {package["name"] for package in listed}
     generate = (*PHYSX, "generate", "toy/spring", "--batch-nb", 2, "--batch-size", 10)
-    assert "20 samples" in run(*generate, python=python).stderr
+    assert "20 training" in run(*generate, python=python).stderr
 
     def pip(name):
         return f"pip install {next(wheels.glob(f'{name}-*.whl'))}"
@@ -93,7 +93,7 @@ def test_the_core_alone_generates_and_trains_and_torch_adds_its_network(empty, r
 )
 def test_each_plugin_works_with_the_core_alone(name, command, empty, run):
     python = empty("physx_core", name)
-    assert "20 samples" in run(*PHYSX, *command.split(), python=python).stderr
+    assert "20 training" in run(*PHYSX, *command.split(), python=python).stderr
 
 
 def test_remote_works_with_the_core_alone(empty, run, tmp_path):
