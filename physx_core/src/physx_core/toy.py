@@ -23,6 +23,9 @@ from physx_core.typing import Array, Batch, Tensors
 
 _LONGEST_HEADER = 2**14
 _WIDEST = 16
+_UNREADABLE = (
+    OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error
+)  # fmt: skip
 
 
 class Spring(Environment):
@@ -174,7 +177,7 @@ class Linear(Network):
                 if nbytes > self.weights.size * _WIDEST + _LONGEST_HEADER:
                     raise ValueError(f"{nbytes} bytes are too many")
                 weights = np.lib.format.read_array(file, allow_pickle=False)
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        except _UNREADABLE as error:
             raise CheckpointError(
                 f"{path} does not contain weights of toy/linear: {error}."
             ) from error

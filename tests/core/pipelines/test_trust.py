@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import zipfile
 import zlib
 
 import numpy as np
@@ -20,8 +21,13 @@ from physx_core import (
     plugins,
 )
 from physx_core.cli import main
-from physx_core.components import Transformation
-from physx_core.errors import ConfigError, ReferenceFormError, UntrustedReferenceError
+from physx_core.components import Network, Transformation
+from physx_core.errors import (
+    CheckpointError,
+    ConfigError,
+    ReferenceFormError,
+    UntrustedReferenceError,
+)
 from physx_core.pipelines import Replay, load_learner
 from physx_core.toy import Linear
 
@@ -242,3 +248,40 @@ def test_notes_of_a_stranger_reach_no_method(tmp_path):
         dataset.append("training", {"x": np.ones((2, 1))})
         dataset.update_info(**{"self": 5, "mode": "x"})
         assert dataset.info["self"] == 5
+
+
+class Numbers(Network):
+    """Has the parameters and files that a network in NumPy has by default."""
+
+    def __init__(self):
+        self.weights = np.zeros((2, 3))
+
+    def get_parameters(self):
+        return {"weights": self.weights}
+
+    def predict(self, data):
+        return data
+
+
+@pytest.mark.parametrize("kind", ["bomb", "claim", "pickle", "one array", "text", "cut"])
+def test_parameters_in_numpy_may_come_from_a_stranger(tmp_path, kind):
+    network, path = Numbers(), tmp_path / "a.npz"
+    network.save_parameters(path)
+    network.load_parameters(path)
+    if kind == "bomb":
+        np.savez_compressed(path, weights=np.zeros((2000, 1000)))
+    elif kind == "claim":
+        header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (2, %d), }" % 2**50
+        content = b"\x93NUMPY\x01\x00\x80\x00" + header.ljust(127) + b"\n"
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("weights.npy", content)
+    elif kind == "pickle":
+        np.savez(path, weights=np.array([{}], object))
+    elif kind == "one array":
+        with path.open("wb") as file:
+            np.save(file, network.weights)
+    else:
+        content = b"text" if kind == "text" else path.read_bytes()[:-30]
+        path.write_bytes(content)
+    with pytest.raises(CheckpointError, match=r"a\.npz does not contain parameters"):
+        network.load_parameters(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import zipfile
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +22,14 @@ from physx_core.errors import (
 )
 from physx_core.fields import Field, is_finite
 from physx_core.typing import Batch, Tensors
+
+_UNREADABLE = (
+    OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, MemoryError,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What NumPy raises for a file that is no archive of arrays, or damaged."""
+_LONGEST_HEADER = 2**14
+_WIDEST = 16
 
 
 class Network(ABC):
@@ -177,8 +186,13 @@ class Network(ABC):
         own = self.get_parameters()
         try:
             with np.load(path, allow_pickle=False) as stored:
+                nbytes = sum(item.file_size for item in stored.zip.infolist())
+                if nbytes > sum(
+                    np.size(array) * _WIDEST + _LONGEST_HEADER for array in own.values()
+                ):
+                    raise ValueError(f"{nbytes} bytes are too many")
                 read = {name: stored[name] for name in stored.files}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except _UNREADABLE as error:
             raise CheckpointError(f"{path} does not contain parameters: {error}.") from error
         shapes, found = (
             {name: np.shape(array) for name, array in arrays.items()} for arrays in (own, read)
