@@ -60,6 +60,8 @@ class Machine:
         subprocess.run(step.split(), check=True)
 
     def remove(self):
+        # With its namespace it would go some time later, and be in the way of the next test.
+        subprocess.run(["ip", "link", "del", f"{self._name}a"], capture_output=True, check=False)
         for name in (self._name, f"{self._name}s"):
             subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
 

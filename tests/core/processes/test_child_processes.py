@@ -121,6 +121,16 @@ def test_a_watchdog_that_somebody_killed_is_replaced(tmp_path):
     wait_until(lambda: not any(map(alive, pids)))
 
 
+def test_a_watchdog_that_is_told_to_end_stays(tmp_path):
+    tell = KILL_THE_SHELL.replace("-KILL", "-TERM")
+    owner = start(tmp_path, "one = ChildProcess(['sleep', '60'])", tell, PRINT_ONE)
+    pid = int(owner.stdout.readline())
+    assert alive(pid)
+    owner.kill()
+    owner.communicate()
+    wait_until(lambda: not alive(pid))
+
+
 HEAD = """
 import os, signal, subprocess, sys, time
 from physx_core.processes import ChildProcess, TemporaryFolder
@@ -129,6 +139,7 @@ KILL_THE_SHELL = """
 subprocess.run(["pkill", "-KILL", "-P", str(os.getpid()), "-f", "physx-watchdog"], check=True)
 time.sleep(0.1)
 """
+PRINT_ONE = "print(one.pid, flush=True); time.sleep(60)"
 PRINT_TWO = (
     "two = ChildProcess(['sleep', '60']); print(one.pid, two.pid, flush=True); time.sleep(60)"
 )

@@ -10,8 +10,10 @@ from pathlib import Path
 
 _END = "end"
 # Each line names all process groups; the last one counts once the pipe is closed. Processes take a
-# moment to die, in which they may still write into the folder.
+# moment to die, in which they may still write into the folder. Whoever ends all processes of a job
+# may signal this one before the others.
 _SCRIPT = (
+    'trap "" HUP INT TERM; '
     f'while read -r line; do [ "$line" = {_END} ] && exit; groups=$line; done; '
     'for group in $groups; do kill -s KILL -- "-$group"; done; '
     'rm -rf -- "$1" || { sleep 0.2; rm -rf -- "$1"; }'
