@@ -663,13 +663,34 @@ def returns_an_array_from_transform_loss():
     train(of("toy/linear", optimization=Own))
 
 
-@mistake(e.UsageError, "Own.epoch_begin() must call super().epoch_begin()")
-def overrides_a_method_without_super():
-    class Own(Training):
-        def epoch_begin(self):
-            pass
+def train_without(method):
+    own = type("Own", (Training,), {method: lambda self: None})
+    own(LINEAR, KEPT, epoch_nb=1, batch_size=4, session_name="new").execute()
 
-    Own(LINEAR, KEPT, epoch_nb=1, batch_size=4, session_name="new").execute()
+
+@mistake(e.UsageError, "Own.epoch_begin() must call super().epoch_begin()")
+def overrides_epoch_begin_without_super():
+    train_without("epoch_begin")
+
+
+@mistake(e.UsageError, "Own.batch_produce() must call super().batch_produce()")
+def overrides_batch_produce_without_super():
+    train_without("batch_produce")
+
+
+@mistake(e.UsageError, "Own.optimize() must call super().optimize()")
+def overrides_optimize_without_super():
+    train_without("optimize")
+
+
+@mistake(e.UsageError, "Own.batch_count() must call super().batch_count()")
+def overrides_batch_count_without_super():
+    train_without("batch_count")
+
+
+@mistake(e.UsageError, "Own.epoch_count() must call super().epoch_count()", "new/network/network_0")
+def overrides_epoch_count_without_super():
+    train_without("epoch_count")
 
 
 @mistake(

@@ -64,7 +64,7 @@ class DataGeneration(NewSessionPipeline):
             while self.batch_condition():
                 self.batch_begin()
                 self.batch_produce()
-                self.batch_count()
+                self._count("batch_id", "batch_count")
                 self.batch_end()
             self.data_generation_end()
 

@@ -173,6 +173,16 @@ class Pipeline(ABC):
             with contextlib.suppress(OSError):  # the run's own error matters more
                 self.session.note(f"{how} after {self._duration:.1f} s")
 
+    def _count(self, counter: str, method: str) -> None:
+        """Call the method that counts; one that overrides it without `super` would never end."""
+        before = getattr(self, counter)
+        getattr(self, method)()
+        if getattr(self, counter) == before:
+            raise self._lacks_super(method)
+
+    def _lacks_super(self, method: str) -> UsageError:
+        return UsageError(f"{type(self).__name__}.{method}() must call super().{method}().")
+
     @contextlib.contextmanager
     def _running(self) -> Iterator[None]:
         """Open the pipeline for the duration of a run, unless the user has opened it."""

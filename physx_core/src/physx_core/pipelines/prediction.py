@@ -97,7 +97,7 @@ class Prediction(Pipeline):
             while self.prediction_condition() and not interrupt:
                 self.sample_begin()
                 self.predict()
-                self.sample_end()
+                self._count("step_id", "sample_end")
             self.prediction_end()
             unfinished = self.step_nb >= 0 and self.prediction_condition()
             if interrupt.number == signal.SIGTERM or (interrupt and unfinished):

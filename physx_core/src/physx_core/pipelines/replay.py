@@ -76,7 +76,7 @@ class Replay(NewSessionPipeline):
             while self.replay_condition() and not interrupt:
                 self.sample_begin()
                 self.replay()
-                self.sample_end()
+                self._count("step_id", "sample_end")
             self.replay_end()
             if interrupt.number == signal.SIGTERM:
                 interrupt.end()

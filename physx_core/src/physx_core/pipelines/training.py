@@ -24,7 +24,7 @@ from physx_core.config import (
     to_plain,
 )
 from physx_core.dataset import Dataset
-from physx_core.errors import DivergedError, UsageError
+from physx_core.errors import DivergedError
 from physx_core.observers import statistics_observers
 from physx_core.pipelines.interrupt import Interrupt, Terminated, deferred_interrupt
 from physx_core.pipelines.learning.learner import Learner
@@ -159,15 +159,21 @@ class Training(NewSessionPipeline):
             try:
                 while self.epoch_condition():
                     self.epoch_begin()
+                    if self._epoch_batches is None:
+                        raise self._lacks_super("epoch_begin")
                     while self.batch_condition():
                         self.batch_begin()
                         self.batch_produce()
+                        if not hasattr(self, "batch"):
+                            raise self._lacks_super("batch_produce")
                         self.optimize()
-                        self.batch_count()
+                        if not self.losses:
+                            raise self._lacks_super("optimize")
+                        self._count("batch_id", "batch_count")
                         self.batch_end()
                         if self.group.any(bool(interrupt)) and self.batch_condition():
                             self._end_early(interrupt)
-                    self.epoch_count()
+                    self._count("epoch_id", "epoch_count")
                     self.epoch_end()
                     if self.group.any(bool(interrupt)):
                         self._end_early(interrupt)
@@ -199,11 +205,7 @@ class Training(NewSessionPipeline):
 
     def batch_condition(self) -> bool:
         """Return whether there are batches left in the current epoch."""
-        if self._epoch_batches is None:
-            raise UsageError(
-                f"{type(self).__name__}.epoch_begin() must call super().epoch_begin()."
-            )
-        return self.batch_id < self._epoch_batches
+        return self.batch_id < (self._epoch_batches or 0)
 
     def batch_begin(self) -> None:
         """Called before each batch."""
