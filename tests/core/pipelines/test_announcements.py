@@ -345,6 +345,21 @@ def test_a_name_that_was_numbered_since_is_used_with_a_warning():
     Prediction(NetworkConfig(), SPRING, session_name="net_1", step_nb=1).execute()
 
 
+def test_commands_warn_on_one_line(tmp_path):
+    generate()
+    generate()
+    words = ["physx_core", "generate", "toy/spring", "--session-name", "spring", "--no-new-session"]
+    done = subprocess.run(
+        [sys.executable, "-m", *words, "--batch-nb", "1", "--batch-size", "1"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    (line,) = (line for line in done.stderr.splitlines() if "is newer" in line)
+    assert line.startswith('physx: UserWarning: The session "spring" is used, but "spring_1" is')
+    assert ".py" not in done.stderr
+
+
 def test_a_missing_session_is_not_continued_in_silence():
     generate()
     generate()

@@ -10,7 +10,8 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = [word for word in words if word != "--debug"]
     try:
         _show_crashes()
-        with raised_at_sigterm():
+        with raised_at_sigterm(), contextlib.nullcontext() if debug else _short_warnings():
             return _dispatch(words)
     except PhysxError as error:
         if debug:
@@ -71,6 +72,27 @@ def _show_crashes() -> None:
     if not faulthandler.is_enabled():
         with contextlib.suppress(io.UnsupportedOperation, AttributeError):  # there is no stderr
             faulthandler.enable()
+
+
+@contextlib.contextmanager
+def _short_warnings() -> Iterator[None]:
+    """Show warnings on one line, without the place in the source that gives them."""
+
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        line: str | None = None,
+    ) -> str:
+        return printable(f"physx: {category.__name__}: {message}") + "\n"
+
+    usual = warnings.formatwarning
+    warnings.formatwarning = show
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
 
 
 def _interrupted(error: BaseException, how: str, number: signal.Signals) -> int:
