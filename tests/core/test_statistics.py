@@ -36,6 +36,13 @@ def test_mean_and_std_have_the_fields_shape(shape, dtype):
     assert_allclose(statistics.mean, rows.astype(np.float64).mean(axis=0), rtol=1e-12)
 
 
+def test_statistics_that_are_written_as_they_were_read_do_not_change():
+    for seed in range(50):
+        rows = np.random.default_rng(seed).normal(size=(20, 4))
+        plain = statistics_of(rows).to_dict()
+        assert RunningStatistics.from_dict(plain).to_dict() == plain
+
+
 @pytest.mark.parametrize("offset", [1e6, 1e9, -1e12])
 def test_a_large_offset_costs_no_digits(offset):
     exact = np.random.default_rng(0).integers(-8, 8, size=(5000, 2)) * 0.25

@@ -63,6 +63,7 @@ class RunningStatistics:
         self._origin: Doubles = np.zeros(())
         self._mean: Doubles = np.zeros(())  # relative to the origin
         self._squares: Doubles = np.zeros(())  # sum of squared deviations from the mean
+        self._std: Doubles | None = None  # as it was read, which its square would not give back
         self._minimum: Doubles = np.zeros(())
         self._maximum: Doubles = np.zeros(())
 
@@ -74,6 +75,8 @@ class RunningStatistics:
     @property
     def std(self) -> Doubles:
         """Standard deviation (of the population) of each component, in the field's unit."""
+        if self._std is not None:
+            return self._std
         return np.asarray(np.sqrt(self._squares / max(self.count, 1)))
 
     @property
@@ -146,7 +149,8 @@ class RunningStatistics:
         statistics._minimum = np.asarray(plain["minimum"], np.float64)
         statistics._maximum = np.asarray(plain["maximum"], np.float64)
         statistics.count = int(plain["count"])
-        statistics._squares = np.asarray(plain["std"], np.float64) ** 2 * statistics.count
+        statistics._std = np.asarray(plain["std"], np.float64)
+        statistics._squares = statistics._std**2 * statistics.count
         return statistics
 
     def _start_at(self, origin: Doubles) -> None:
@@ -159,7 +163,7 @@ class RunningStatistics:
         self._maximum = np.maximum(self._maximum, maximum, dtype=np.float64)
 
     def _combine(self, count: int, mean: Doubles, squares: Doubles) -> None:
-        total = self.count + count
+        self._std, total = None, self.count + count
         difference = mean - self._mean
         self._squares = self._squares + squares + difference**2 * (self.count * count / total)
         self._mean = self._mean + difference * (count / total)
