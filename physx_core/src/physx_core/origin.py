@@ -1,4 +1,4 @@
-"""Where physx was installed from, and so where the rest of it can be installed from.
+"""Tells how to install a package of physx: from the place that physx itself came from.
 
 The packages of physx are on no index that anybody guards: the name of one in a hint to install may
 be that of a stranger's package. PEP 610 records the place of every package that did not come from
