@@ -148,6 +148,12 @@ class Model:
             for stream in mode.streams.values():
                 stream.kept = stream.stored = len(stream.rows)
 
+    def keep_stored(self) -> None:
+        """The stored rows are kept; of single samples, a writer that died may have had more."""
+        for mode in self.now.modes.values():
+            for stream in mode.streams.values():
+                stream.kept = stream.stored
+
     def keep_updates(self) -> None:
         """All updates are kept."""
         for key, limits in self.versions.items():
@@ -439,7 +445,7 @@ class History:
     def _collapse(self, owner: Any) -> None:
         """From now on what is there is known, kept, and in one order."""
         self._model.also = ()
-        self._model.keep()
+        self._model.keep_stored()
         self._model.keep_updates()
         seen = self._quiet_look()
         problem = self._model.promise("").broken(seen, power=False)
