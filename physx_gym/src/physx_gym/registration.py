@@ -37,16 +37,16 @@ def register() -> None:
 
 
 def make_vector(id: str, num_envs: int, **options: Any) -> Any:
-    """Return a vector environment whose environments run in client processes.
+    """Return a vector environment whose environments run in processes of their own.
 
     Args:
         id: Id of the environment.
         num_envs: Number of environments.
-        options: ``processes``, ``autoreset_mode``, ``copy`` and ``timeout`` of `ParallelVectorEnv`;
-            all others are for each environment.
+        options: ``num_processes``, ``batch_size``, ``autoreset_mode``, ``copy`` and ``timeout`` of
+            `ParallelVectorEnv`; all others are for each environment.
     """
     from physx_gym.vector.vector_env import ParallelVectorEnv
 
-    names = ("processes", "autoreset_mode", "copy", "timeout")
+    names = ("num_processes", "batch_size", "autoreset_mode", "copy", "timeout")
     own = {name: options.pop(name) for name in names if name in options}
     return ParallelVectorEnv(id, num_envs, env_kwargs=options, **own)

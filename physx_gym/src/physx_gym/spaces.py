@@ -172,9 +172,12 @@ class SpaceFields:
             self.leaves.append(leaf)
             self.fields.append(Field(name, tuple(leaf.shape or ()), np.dtype(leaf.dtype)))
         self._names = {path: name for name, (path, _) in self._places.items()}
+        self._only = self._names.get(())  # of a space that is a leaf itself
 
     def arrays(self, value: Any) -> dict[str, Array]:
         """Return an element of the space, or a batch of them, as an array for each field."""
+        if self._only is not None:
+            return {self._only: np.asarray(value, self.space.dtype)}
         found = {}
         for name, (path, dtype) in self._places.items():
             found[name] = np.asarray(value_at(value, path), dtype)
@@ -182,6 +185,8 @@ class SpaceFields:
 
     def value(self, arrays: Mapping[str, Any]) -> Any:
         """Return the element of the space that the arrays of its fields stand for."""
+        if self._only is not None and not isinstance(self.space, spaces.Discrete):
+            return arrays[self._only]
 
         def take(path: Path, leaf: Any) -> Any:
             array = arrays[self._names[path]]

@@ -202,7 +202,7 @@ def push(observation):
 
 
 def test_make_vec_runs_them_in_processes(nothing_stays_behind):
-    env = gymnasium.make_vec("physx/Cartpole-v0", num_envs=2, processes=2, backend="dart")
+    env = gymnasium.make_vec("physx/Cartpole-v0", num_envs=2, num_processes=2, backend="dart")
     try:
         single = make("Cartpole", "dart")
         first, _ = env.reset(seed=5)

@@ -136,7 +136,7 @@ def test_it_returns_what_gymnasium_returns(mode, nothing_stays_behind):
         "CartPole-v1",
         3,
         env_kwargs={"max_episode_steps": 7},
-        processes=2,
+        num_processes=2,
         autoreset_mode=mode,
     )
     theirs = SyncVectorEnv([make] * 3, autoreset_mode=mode)
@@ -155,7 +155,7 @@ def test_it_returns_what_gymnasium_returns(mode, nothing_stays_behind):
 @pytest.mark.parametrize("count", [4, 5])
 def test_infos_whose_layout_changes(count, nothing_stays_behind):
     ours, theirs = (
-        ParallelVectorEnv(HERE + "Talker", count, processes=2),
+        ParallelVectorEnv(HERE + "Talker", count, num_processes=2),
         SyncVectorEnv([Talker] * count),
     )
     actions = {"kind": np.zeros(count, int), "size": np.zeros((count, 1), np.float32)}
@@ -167,7 +167,7 @@ def test_infos_whose_layout_changes(count, nothing_stays_behind):
 
 def test_nan_and_infinity_are_passed_through(nothing_stays_behind):
     ours, theirs = (
-        ParallelVectorEnv(HERE + "Broken", 2, processes=2),
+        ParallelVectorEnv(HERE + "Broken", 2, num_processes=2),
         SyncVectorEnv([Broken] * 2),
     )
     actions = {"kind": np.zeros(2, int), "size": np.zeros((2, 1), np.float32)}
@@ -179,7 +179,7 @@ def test_nan_and_infinity_are_passed_through(nothing_stays_behind):
 
 def test_nested_spaces_infos_calls_and_attributes(caplog, nothing_stays_behind):
     env = ParallelVectorEnv(
-        HERE + "Counter", 3, env_kwargs={"render_mode": "rgb_array"}, processes=3
+        HERE + "Counter", 3, env_kwargs={"render_mode": "rgb_array"}, num_processes=3
     )
     with contextlib.closing(env):
         observation, infos = env.reset(seed=1, options={"start": 1})
@@ -216,7 +216,7 @@ def test_nested_spaces_infos_calls_and_attributes(caplog, nothing_stays_behind):
 
 def test_disabled_autoreset_with_a_mask(nothing_stays_behind):
     env = ParallelVectorEnv(
-        HERE + "Counter", 2, processes=1, autoreset_mode="Disabled", env_kwargs={"length": 9}
+        HERE + "Counter", 2, num_processes=1, autoreset_mode="Disabled", env_kwargs={"length": 9}
     )
     with contextlib.closing(env):
         env.reset(seed=0)
@@ -240,7 +240,7 @@ def test_mistakes_and_failures_are_reported(nothing_stays_behind):
         ParallelVectorEnv("CartPole-v1", 1, env_kwargs=3)
     with pytest.raises(UnknownOptionError, match="NextStep"):
         ParallelVectorEnv("CartPole-v1", 1, autoreset_mode="NextStop")
-    env = ParallelVectorEnv(HERE + "Counter", 2, env_kwargs={"fails_at": 2}, processes=2)
+    env = ParallelVectorEnv(HERE + "Counter", 2, env_kwargs={"fails_at": 2}, num_processes=2)
     with contextlib.closing(env):
         env.reset()
         with pytest.raises(ActionError, match=r"shape \(3,\) but need \(2,\)"):
@@ -258,7 +258,7 @@ def test_mistakes_and_failures_are_reported(nothing_stays_behind):
 
 
 def test_it_closes_while_a_forked_process_lives():
-    env = ParallelVectorEnv(HERE + "Counter", 2, processes=2)
+    env = ParallelVectorEnv(HERE + "Counter", 2, num_processes=2)
     child = os.fork()
     if not child:  # it inherits all open files
         signal.pause()

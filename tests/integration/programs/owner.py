@@ -44,7 +44,7 @@ def clients():
 def vector():
     from physx_gym import ParallelVectorEnv
 
-    env = ParallelVectorEnv("CartPole-v1", 4, processes=2)
+    env = ParallelVectorEnv("CartPole-v1", 4, num_processes=2)
     env.reset(seed=0)
     kept.append(env)
 

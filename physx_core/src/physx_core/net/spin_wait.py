@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import platform
+import threading
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -11,6 +13,22 @@ Found = TypeVar("Found")
 
 yield_core: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
 """Let another process that waits for this processor core run."""
+
+
+_LOCK = threading.Lock()
+_LOCKING_ORDERS = platform.machine() in ("x86_64", "AMD64", "i386", "i686")
+
+
+def fence() -> None:
+    """Have other cores see what was written to shared memory before this call before what follows.
+
+    Nor are values that are read after it older than it.
+    """
+    if _LOCKING_ORDERS:
+        with _LOCK:  # its atomic instruction is a full barrier there
+            pass
+    else:
+        yield_core()  # a scheduler's is one everywhere
 
 
 def has_core_for_each(clients: int) -> bool:

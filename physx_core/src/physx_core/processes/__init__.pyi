@@ -3,3 +3,9 @@
 from .child import ChildProcess as ChildProcess
 from .descendants import kill_descendants as kill_descendants
 from .folder import TemporaryFolder as TemporaryFolder
+from .memory import anonymous_file as anonymous_file
+from .tail import OutputTail as OutputTail
+from .worker import CLIENT_VARIABLE as CLIENT_VARIABLE
+from .worker import describe_exit as describe_exit
+from .worker import prepare_worker as prepare_worker
+from .worker import worker_variables as worker_variables

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import faulthandler
 import os
-import signal
 import sys
 
 from physx_core.errors import PhysxError
 from physx_core.net.handshake import TOKEN_VARIABLE
-from physx_core.processes import kill_descendants
+from physx_core.processes import kill_descendants, prepare_worker
 from physx_core.workers.client.worker import run_client
 
 
@@ -21,13 +18,8 @@ def main() -> int:
     parser.add_argument("--connect", metavar="HOST:PORT", required=True, help="the server")
     parser.add_argument("--instance", type=int, help="number of the instance; any by default")
     options = parser.parse_args()
-    faulthandler.enable()  # a crash of an engine shows where it happened
-    faulthandler.register(signal.SIGTERM, all_threads=False, chain=True)  # and so does a hang
+    prepare_worker()
     token = os.environ.pop(TOKEN_VARIABLE, "")
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the server decides when a run ends
-    if hasattr(os, "SCHED_BATCH"):  # a client that wakes up lets the server wake the others first
-        with contextlib.suppress(OSError):  # not every container lets it choose
-            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     try:
         return run_client(options.connect, token, options.instance)
     except PhysxError as error:

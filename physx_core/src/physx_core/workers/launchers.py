@@ -7,21 +7,14 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterable, Sequence
-from typing import IO
 
 from physx_core.components.launcher import ClientHandle, Launcher
 from physx_core.errors import ClientError, ConfigError
 from physx_core.net.handshake import TOKEN_VARIABLE
-from physx_core.processes import ChildProcess
+from physx_core.processes import ChildProcess, OutputTail, worker_variables
 
-CLIENT_VARIABLE = "PHYSX_CLIENT"
-"""Environment variable that is set in every client process."""
-
-_TAIL = 8192
-_LINES = 60
 _TERMINATE_TIME = 0.5
 
 
@@ -56,12 +49,9 @@ class ClientProcess(ClientHandle):
             *(sys.executable, "-P", "-m", "physx_core.workers"),
             *("--connect", address, "--instance", str(instance_id)),
         ]
-        self._variables = {TOKEN_VARIABLE: token, CLIENT_VARIABLE: "1"}
-        # Instances share the processor cores: a numerical library must not take all for each.
-        self._variables["OMP_NUM_THREADS"] = os.environ.get("OMP_NUM_THREADS", "1")
+        self._variables = {TOKEN_VARIABLE: token, **worker_variables()}
         self._process: ChildProcess | None = None
-        self._reader: threading.Thread | None = None
-        self._tail = b""
+        self._tail: OutputTail | None = None
 
     def start(self) -> None:
         """Start the process."""
@@ -74,10 +64,8 @@ class ClientProcess(ClientHandle):
         if self._core is not None:
             with contextlib.suppress(ProcessLookupError):  # it has ended already
                 os.sched_setaffinity(self._process.pid, {self._core})
-        self._reader = threading.Thread(
-            target=self._keep_tail, args=(self._process.stderr,), daemon=True
-        )
-        self._reader.start()
+        assert self._process.stderr is not None
+        self._tail = OutputTail(self._process.stderr)
 
     @property
     def pid(self) -> int | None:
@@ -90,10 +78,9 @@ class ClientProcess(ClientHandle):
 
     def stderr(self) -> str:
         """Return the last lines that the process wrote to its standard error."""
-        if self._reader is not None and self.exit_status() is not None:
-            self._reader.join(0.2)
-        lines = self._tail.decode(errors="replace").splitlines()
-        return "\n".join(lines[-_LINES:])
+        if self._tail is None:
+            return ""
+        return self._tail.text(0.0 if self.exit_status() is None else 0.2)
 
     def terminate(self) -> None:
         """Ask the process and those that it started to exit."""
@@ -108,11 +95,6 @@ class ClientProcess(ClientHandle):
     def wait(self, until: float) -> bool:
         """Wait for the end of the process: see `ClientHandle.wait`."""
         return self._process is None or super().wait(until)
-
-    def _keep_tail(self, stream: IO[bytes]) -> None:
-        with stream:
-            while chunk := stream.read(_TAIL):
-                self._tail = (self._tail + chunk)[-_TAIL:]
 
 
 class SubprocessLauncher(Launcher):

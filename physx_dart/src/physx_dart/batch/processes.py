@@ -7,18 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import socket
 import sys
-import tempfile
 import weakref
-from typing import IO
 
 import numpy as np
 
 from physx_core import Closeable
 from physx_core.errors import SimulationError
-from physx_core.processes import ChildProcess
+from physx_core.processes import ChildProcess, anonymous_file, describe_exit, worker_variables
 from physx_core.typing import Vector
 from physx_dart.batch.worker import (
     DONE,
@@ -99,7 +96,7 @@ class ParallelDynamics(Closeable):
     def _start_workers(self, count: int) -> tuple[list[_Worker], SharedRows]:
         """Return `count` other processes, and the memory that they share."""
         if self._memory is None:
-            file = self._held.enter_context(_anonymous_file())
+            file = self._held.enter_context(anonymous_file("physx_batches"))
             self._memory = SharedRows(file.fileno(), self._algorithms.nq, self._algorithms.nv)
         new = [_Worker(self._memory.file, self._held) for _ in range(count - len(self._workers))]
         for worker in new:
@@ -122,11 +119,9 @@ class _Worker:
         held.enter_context(self._link)
         passed = [theirs.fileno(), file]
         command = [sys.executable, "-P", "-m", "physx_dart.batch.worker", *map(str, passed)]
-        # The processes share the cores: numerical libraries must not use all of them in each.
-        threads = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
         with theirs:
             try:
-                self._process = ChildProcess(command, variables=threads, pass_fds=passed)
+                self._process = ChildProcess(command, variables=worker_variables(), pass_fds=passed)
             except OSError as error:
                 raise SimulationError(
                     f"A process for batches cannot be started: {error}."
@@ -148,11 +143,8 @@ class _Worker:
         raise self._lost()
 
     def _lost(self) -> SimulationError:
-        status, how = self._process.wait(_PATIENCE), "closed its connection"
-        if status is not None:
-            how = f"ended with exit status {status}"
-            if status < 0:
-                how = f"was ended by signal {-status} ({signal.strsignal(-status)})"
+        status = self._process.wait(_PATIENCE)
+        how = "closed its connection" if status is None else describe_exit(status)
         return SimulationError(
             f"A process that computed rows of a batch (pid {self._process.pid}) {how}; its "
             "standard error may say why. The next batch starts a new one; processes=1 needs none."
@@ -163,10 +155,3 @@ def _end_processes(held: contextlib.ExitStack, owner: int) -> None:
     """End processes and free their memory; a forked process leaves this to its parent."""
     if os.getpid() == owner:
         held.close()
-
-
-def _anonymous_file() -> IO[bytes]:
-    """Return a file without a name, in memory if the system supports that."""
-    if hasattr(os, "memfd_create"):
-        return os.fdopen(os.memfd_create("physx_batches"), "r+b", buffering=0)
-    return tempfile.TemporaryFile(buffering=0)

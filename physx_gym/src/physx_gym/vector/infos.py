@@ -1,14 +1,34 @@
-"""Infos of a vector environment as records of numbers, while all have the same layout."""
+"""Infos in shared memory: records of numbers of a known layout, or encoded values."""
 
 from __future__ import annotations
 
+import enum
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from physx_core.net import decode
 from physx_core.typing import Array
+
+LENGTH = 8
+"""Bytes of the length in front of an encoded value."""
+
+
+class InfoKind(enum.IntEnum):
+    """The form of an info; a positive number is that of the layout of which it is a record.
+
+    A worker counts its layouts from 1, and sends each before it uses it.
+    """
+
+    NONE = 0
+    """There is no info."""
+    PACKED = -1
+    """An encoded value."""
+    SENT = -2
+    """The worker sent it as a message, as it did not fit."""
+
 
 _CODES: dict[type[Any], str] = {
     **{float: "d", int: "q", bool: "?"},
@@ -17,6 +37,21 @@ _CODES: dict[type[Any], str] = {
     **{np.float16: "e", np.float32: "f", np.float64: "d"},
 }
 _KINDS = {kind.__name__: kind for kind in _CODES}
+
+
+def put_packed(target: Array, encoded: bytes) -> bool:
+    """Write an encoded value to the start of an array of bytes; return whether it fits."""
+    whole = len(encoded).to_bytes(LENGTH, "little") + encoded
+    if len(whole) > len(target):
+        return False
+    target[: len(whole)] = np.frombuffer(whole, np.uint8)
+    return True
+
+
+def unpack(data: Array) -> Any:
+    """Return the value that `put_packed` wrote."""
+    length = int.from_bytes(data[:LENGTH].tobytes(), "little")
+    return decode(data[LENGTH : LENGTH + length].tobytes())
 
 
 class _Entry(NamedTuple):
@@ -74,9 +109,9 @@ class InfoLayout:
         """Return the records at the start of each row of bytes, shape (rows,)."""
         return data[:, : self.dtype.itemsize].copy().view(self.dtype)[:, 0]
 
-    def info(self, record: Any) -> dict[str, Any]:
-        """Return the info that a record was written from."""
-        return _info(self._entries, iter(record))
+    def info(self, data: Array) -> dict[str, Any]:
+        """Return the info that was written to the start of an array of bytes."""
+        return _info(self._entries, iter(self.records(data[np.newaxis])[0]))
 
     def columns(self, records: Array, given: Array) -> dict[str, Any]:
         """Return records in the form of the infos of Gymnasium's vector environments.

@@ -2,42 +2,52 @@
 
 from __future__ import annotations
 
-import contextlib
-import itertools
 import logging
 import operator
 import os
+import weakref
+from collections import deque
 from collections.abc import Mapping, Sequence
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from physx_core import EnvironmentConfig
-from physx_core.components import Event
 from physx_core.config import reference_of
 from physx_core.errors import ActionError, ConfigError, UnknownOptionError, UsageError
-from physx_core.sources import ClientSource
-from physx_core.typing import Array, Batch, Sample
+from physx_core.net import Frame, Kind, decode
+from physx_core.processes import anonymous_file
+from physx_core.typing import Array, Batch
 from physx_gym.bridge.make_env import make_env
 from physx_gym.spaces import SpaceFields
-from physx_gym.vector.infos import InfoLayout
-from physx_gym.vector.rows import ROW, InfoKind, RowLayout, unpack
-from physx_gym.vector.worker import COMMAND, FORBIDDEN, VectorWorker, pack_commands
+from physx_gym.vector.batch import SharedBatch
+from physx_gym.vector.infos import InfoKind, InfoLayout, unpack
+from physx_gym.vector.workers import Workers
+
+FORBIDDEN = ("reset", "step", "close")
+"""Methods that `call` rejects."""
 
 _LOG = logging.getLogger("physx")
 
 
 class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
-    """A vector environment whose environments are stepped in client processes.
+    """A vector environment whose environments are stepped in processes of their own.
 
-    ``gymnasium.make_vec("physx/Ant-v0", num_envs=4)`` creates one. It does what Gymnasium's
-    `AsyncVectorEnv` does, with clients like those of a data generation: they are spawned,
-    authenticated and monitored, and always end with it. If an environment raises, the error has
-    its traceback.
+    ``gymnasium.make_vec("physx/Ant-v0", num_envs=8, num_processes=2)`` creates one. `step` does
+    what that of Gymnasium's `AsyncVectorEnv` does. `send` and `recv` do not wait for all of them:
+    while the results of `batch_size` environments are looked at, the others go on.
+
+    Observations, rewards and ends are written to shared memory by the processes. These end with the
+    vector environment, or with this process, however that ends. If an environment raises, the error
+    has its traceback; if a process ends, it says how and where. Either ends the vector environment.
 
     Infos may hold plain values and arrays; others are left out, and a warning names them.
+
+    Attributes:
+        batch_size: Number of environments whose results `recv` returns.
+        autoreset_mode: What happens after the end of an episode.
     """
 
     def __init__(
@@ -46,7 +56,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         num_envs: int = 1,
         *,
         env_kwargs: Mapping[str, Any] | None = None,
-        processes: int | None = None,
+        num_processes: int | None = None,
+        batch_size: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         copy: bool = True,
         timeout: float = 60.0,
@@ -58,68 +69,73 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
                 class.
             num_envs: Number of environments.
             env_kwargs: Keyword arguments of each environment.
-            processes: Number of processes that share the environments; None: one for each
-                processor, but no more than environments.
+            num_processes: Number of processes that share the environments; None: one for each
+                processor core. There are never more than environments.
+            batch_size: Number of environments whose results `recv` returns; None: all.
             autoreset_mode: What happens after the end of an episode.
-            copy: Whether observations are copies; otherwise they are valid until the next call.
-            timeout: Longest duration of a step, in s.
+            copy: Whether the results of `reset` and `step` are copies; otherwise observations are
+                views of the shared memory, valid until the next call.
+            timeout: Longest duration of a step of an environment, in s.
 
         Raises:
             ConfigError: If a value is out of range, or values of a space do not have a fixed shape.
             UnknownOptionError: If the autoreset mode is unknown.
             PhysxError: If an environment or a process fails.
         """
-        if num_envs < 1 or (processes is not None and processes < 1):
-            raise ConfigError("num_envs and processes must be at least 1.")
+        if min(num_envs, num_processes or 1) < 1 or not 1 <= (batch_size or 1) <= num_envs:
+            raise ConfigError(
+                "num_envs and num_processes must be at least 1, and batch_size between 1 and "
+                f"num_envs: {num_envs}, {num_processes} and {batch_size} were given."
+            )
         if not isinstance(env_kwargs or {}, Mapping):
             raise ConfigError(f"env_kwargs is {env_kwargs!r} but must be a dictionary.")
         modes = {each.value: each for each in AutoresetMode}
         if not isinstance(autoreset_mode, AutoresetMode) and autoreset_mode not in modes:
             raise UnknownOptionError("autoreset_mode", [str(autoreset_mode)], modes)
         name, options = reference_of(env), dict(env_kwargs or {})
-        mode = AutoresetMode(autoreset_mode)
-        self.num_envs = num_envs
-        self._describe(name, options, mode)
-        share = -(-num_envs // min(processes or len(os.sched_getaffinity(0)), num_envs))
-        self._share, self._copy = share, copy
-        has_finals = mode is AutoresetMode.SAME_STEP
-        self._row = RowLayout(self._observations, share, has_finals=has_finals)
-        self._reports = _Reports()
-        config = EnvironmentConfig(
-            VectorWorker,
-            num_clients=-(-num_envs // share),
-            timeout=timeout,
-            env_kwargs={
-                "env": name,
-                "num_envs": num_envs,
-                "share": share,
-                "make_kwargs": options,
-                "autoreset": mode.value,
-            },
-        )
-        self._clients = config.num_clients
-        source = ClientSource(config, self._reports, [0], run_ahead=0)
-        self._source: ClientSource | None = source
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(source)
-            self._receive()
-            stack.pop_all()
+        self.num_envs, self.batch_size = num_envs, batch_size or num_envs
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self._copy = copy
+        self._describe(name, options)
+        workers = min(num_processes or len(os.sched_getaffinity(0)), num_envs)
+        starts = [num_envs * number // workers for number in range(workers + 1)]
+        self._starts, shares = starts, [stop - start for start, stop in pairwise(starts)]
+        self._worker_of = np.repeat(np.arange(workers), shares).tolist()
+        self._all = np.arange(num_envs)
+        # The environments that owe a result, by worker, in the order in which it delivers them.
+        self._owed: list[deque[int]] = [deque() for _ in range(workers)]
+        self._owes = np.zeros(num_envs, np.bool_)
+        self._next = 0  # the worker whose results are taken first
+        self._infos = _Infos(workers)
+        fields = self._observations.fields, self._actions.fields
+        setup = {
+            "env": name,
+            "options": options,
+            "autoreset": self.autoreset_mode.value,
+            "shares": shares,
+            "observations": [field.to_dict() for field in fields[0]],
+            "actions": [field.to_dict() for field in fields[1]],
+        }
+        has_finals = self.autoreset_mode is AutoresetMode.SAME_STEP
+        with anonymous_file("physx_vector") as file:
+            self._batch = SharedBatch(file.fileno(), shares, *fields, has_finals=has_finals)
+            self._workers = Workers(self._batch, file.fileno(), setup, timeout)
+        weakref.finalize(self, self._workers.close, orderly=False).atexit = False
 
-    def _describe(self, name: str, options: Mapping[str, Any], mode: AutoresetMode) -> None:
+    def _describe(self, name: str, options: Mapping[str, Any]) -> None:
         """Take over spaces and metadata from a single environment, which is closed again."""
         env = make_env(name, options)
         self.single_observation_space = env.observation_space
         self.single_action_space = env.action_space
-        self.metadata = {**env.metadata, "autoreset_mode": mode}
+        self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode, self.spec = env.render_mode, env.spec
         env.close()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._mode = mode
         self._observations = SpaceFields(self.single_observation_space, "observation")
         self._actions = SpaceFields(self.single_action_space, "action")
 
-    # Stepping -------------------------------------------------------------------------------
+    # Steps ----------------------------------------------------------------------------------
 
     def reset(
         self,
@@ -129,6 +145,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Begin new episodes; return observations and infos.
 
+        Results that environments still owe are dropped.
+
         Args:
             seed: Environment i gets ``seed + i``; or a seed for each.
             options: Passed to `reset` of each environment, except for ``reset_mask``, shape
@@ -137,32 +155,11 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             ConfigError: If the number or type of the seeds, or the mask, is wrong.
         """
-        count = self.num_envs
-        options = dict(options or {})
-        mask = np.asarray(options.pop("reset_mask", np.ones(count, np.bool_)))
-        seeds = self._seeds(seed)
-        if len(seeds) != count or mask.shape != (count,) or mask.dtype != np.bool_:
-            raise ConfigError(
-                f"reset() of {count} environments got {len(seeds)} seeds, and a mask of shape "
-                f"{mask.shape} and type {mask.dtype}: give one seed and one bool for each."
-            )
-        if not mask.any():
-            raise ConfigError("reset_mask does not select any environment.")
-        shares = zip(self._split(seeds), self._split(mask.tolist()), strict=True)
-        self._command(
-            "reset", [{"seeds": s, "mask": m, "options": options or None} for s, m in shares]
-        )
-        records = self._receive()
-        return self._observed(records), self._infos(records, {})
-
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        try:
-            each = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
-            return [None if one is None else operator.index(one) for one in each]
-        except TypeError as error:
-            raise ConfigError(f"The seeds are {seed!r} but must be whole numbers.") from error
+        self.async_reset(seed=seed, options=options)
+        begun = self._take(self.num_envs)
+        kinds = np.zeros_like(self._batch.kinds)
+        kinds[begun] = self._batch.kinds[begun]
+        return self._observed(None), self._infos_of(None, kinds)
 
     def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Step all environments.
@@ -176,80 +173,209 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
 
         Raises:
             ActionError: If the actions do not have the shape of the space.
+            UsageError: If environments owe results of `send`.
             PhysxError: If an environment raises, or a process fails.
         """
-        self._open().apply(self._split_actions(actions), at_once=False)
-        records = self._receive()
-        terminated, truncated = records["terminated"].copy(), records["truncated"].copy()
-        finals: dict[int, Any] = {}
-        if self._mode is AutoresetMode.SAME_STEP:
-            names = [field.name for field in self._observations.fields]
-            for i in np.flatnonzero(terminated | truncated).tolist():
-                arrays = {name: records[f"final_{name}"][i].copy() for name in names}
-                finals[i] = self._observations.value(arrays)
-        infos = self._infos(records, finals)
-        return self._observed(records), records["reward"].copy(), terminated, truncated, infos
+        self.send(actions)
+        self._take(self.num_envs)
+        return self._results(None)
 
-    def _split_actions(self, actions: Any) -> Batch:
-        """Return the actions by client: arrays of shape (clients, share, *shape)."""
-        shares: Batch = {}
+    def async_reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> None:
+        """Begin new episodes as `reset` does, without waiting; `recv` returns the observations."""
+        count = self.num_envs
+        options = dict(options or {})
+        mask = np.asarray(options.pop("reset_mask", np.ones(count, np.bool_)))
+        seeds = self._seeds(seed)
+        if len(seeds) != count or mask.shape != (count,) or mask.dtype != np.bool_:
+            raise ConfigError(
+                f"reset() of {count} environments got {len(seeds)} seeds, and a mask of shape "
+                f"{mask.shape} and type {mask.dtype}: give one seed and one bool for each."
+            )
+        if not mask.any():
+            raise ConfigError("reset_mask does not select any environment.")
+        workers = self._open()
+        self._take(count)
+        arguments = []
+        for start, stop in pairwise(self._starts):
+            places = np.flatnonzero(mask[start:stop]).tolist()
+            chosen = [seeds[start + place] for place in places]
+            arguments.append({"places": places, "seeds": chosen, "options": options or None})
+        workers.command("reset", arguments)
+        self._ask(np.flatnonzero(mask))
+
+    def send(self, actions: Any, env_ids: Any = None) -> None:
+        """Have environments begin a step; `recv` returns the results.
+
+        Args:
+            actions: A batch of actions, one for each of these environments.
+            env_ids: Numbers of the environments, shape (n,); None: all.
+
+        Raises:
+            ActionError: If the actions do not have the shape of the space.
+            ConfigError: If the numbers are not those of different environments.
+            UsageError: If one of the environments still owes the result of its last step.
+            PhysxError: If a process has ended.
+        """
+        self._open()
+        ids = self._all if env_ids is None else self._chosen(env_ids)
+        owing = ids[self._owes[ids]]
+        if len(owing):
+            raise UsageError(
+                f"Environment {owing[0]} still owes the result of its last step: take it with "
+                "recv() before it gets another action, or begin anew with reset()."
+            )
+        for name, array in self._action_arrays(actions, len(ids)).items():
+            self._batch.actions[name][slice(None) if ids is self._all else ids] = array
+        self._ask(np.sort(ids))
+
+    def recv(self) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
+        """Wait for the results of `batch_size` environments, or of all that owe some, if fewer.
+
+        They are taken in the order in which the processes deliver them, from one after the other,
+        so none is passed over.
+
+        Returns:
+            What `step` returns, for these environments in the order of their numbers. These are
+            ``infos["env_id"]``. After a reset, rewards are 0.
+
+        Raises:
+            UsageError: If no environment owes a result.
+            PhysxError: If an environment raises, or a process fails.
+        """
+        self._open()
+        ids = self._take(self.batch_size)
+        if not len(ids):
+            raise UsageError("No environment owes a result: call send() or async_reset() first.")
+        observations, *results, infos = self._results(ids)
+        return observations, *results, {**infos, "env_id": ids}
+
+    def _ask(self, ids: Array) -> None:
+        """Have environments step."""
+        self._owes[ids] = True
+        workers = self._open()
+        for number, (start, stop) in enumerate(pairwise(self._starts)):
+            mine = ids[np.searchsorted(ids, start) : np.searchsorted(ids, stop)]
+            if len(mine):
+                self._owed[number].extend(mine.tolist())
+                workers.ask(number, mine - start)
+
+    def _take(self, count: int) -> Array:
+        """Wait for `count` results, or all that are owed; return their environments, in order."""
+        workers, owed = self._open(), [len(each) for each in self._owed]
+        count = min(count, sum(owed))
+        done = workers.wait(sum(workers.asked) - sum(owed) + count)
+        if count == sum(owed):
+            taken = np.flatnonzero(self._owes)
+            for each in self._owed:
+                each.clear()
+        else:
+            ready = [n - (a - d) for n, a, d in zip(owed, workers.asked, done, strict=True)]
+            found: list[int] = []
+            while len(found) < count:
+                if ready[self._next]:
+                    ready[self._next] -= 1
+                    found.append(self._owed[self._next].popleft())
+                self._next = (self._next + 1) % len(ready)
+            taken = np.array(sorted(found))
+        self._owes[taken] = False
+        if workers.messages:
+            self._infos.learn(workers.messages)
+            workers.messages.clear()
+        return taken
+
+    def _chosen(self, env_ids: Any) -> Array:
+        ids = np.asarray(env_ids)
+        if (
+            ids.ndim != 1
+            or ids.dtype.kind not in "iu"
+            or len(np.unique(ids)) < len(ids)
+            or not ((ids >= 0) & (ids < self.num_envs)).all()
+        ):
+            raise ConfigError(
+                f"env_ids is {env_ids!r} but must be an array of numbers of different "
+                f"environments, from 0 to {self.num_envs - 1}."
+            )
+        return ids
+
+    def _action_arrays(self, actions: Any, count: int) -> Batch:
+        """Return a batch of actions as arrays of shape (count, *shape)."""
         try:
-            given = self._actions.arrays(actions)
+            arrays = self._actions.arrays(actions)
         except (TypeError, ValueError, LookupError) as error:
             raise ActionError(f"The actions do not fit {self.action_space}: {error}.") from error
         for field in self._actions.fields:
-            wanted = (self.num_envs, *(field.shape or ()))
-            array = given[field.name]
-            if array.shape != wanted:
+            shape, wanted = arrays[field.name].shape, (count, *(field.shape or ()))
+            if shape != wanted:
                 raise ActionError(
-                    f"The actions have the shape {array.shape} but need {wanted}: one action of "
+                    f"The actions have the shape {shape} but need {wanted}: one action of "
                     f"{self.single_action_space} for each environment."
                 )
-            padding = self._clients * self._share - self.num_envs
-            if padding:
-                array = np.concatenate([array, np.repeat(array[-1:], padding, axis=0)])
-            shares[field.name] = array.reshape(self._clients, self._share, *wanted[1:])
-        return shares
+        return arrays
 
-    def _receive(self) -> Array:
-        """Return the results of the last actions or command as records, shape (num_envs,)."""
-        return self._row.records(self._open().batch(self._clients)[ROW])[: self.num_envs]
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        try:
+            each = range(seed, seed + self.num_envs) if isinstance(seed, int) else seed
+            return [None if one is None else operator.index(one) for one in each]
+        except TypeError as error:
+            raise ConfigError(f"The seeds are {seed!r} but must be whole numbers.") from error
 
-    def _observed(self, records: Array) -> Any:
-        names = [field.name for field in self._observations.fields]
-        return self._observations.batch(
-            {name: records[name].copy() if self._copy else records[name] for name in names}
-        )
+    # Results --------------------------------------------------------------------------------
 
-    def _infos(self, records: Array, finals: Mapping[int, Any]) -> dict[str, Any]:
-        kinds, data = records["info"], records["infos"]
-        layout = self._reports.layout
-        found = kinds.tobytes()
-        if InfoKind.PACKED not in found and not finals:
-            if InfoKind.NUMBERS not in found:
-                return {}
+    def _results(self, ids: Array | None) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
+        """Return the results of environments; None: of all."""
+        batch, chosen = self._batch, slice(None) if ids is None else ids
+        ends = batch.rewards, batch.terminated, batch.truncated
+        rewards, terminated, truncated = (np.array(array[chosen]) for array in ends)
+        infos = self._infos_of(ids, batch.kinds[chosen], terminated | truncated)
+        return self._observed(ids), rewards, terminated, truncated, infos
+
+    def _observed(self, ids: Array | None) -> Any:
+        seen = self._batch.observations
+        if ids is not None:
+            return self._observations.batch({name: array[ids] for name, array in seen.items()})
+        copied = {name: array.copy() if self._copy else array for name, array in seen.items()}
+        return self._observations.batch(copied)
+
+    def _infos_of(
+        self, ids: Array | None, kinds: Array, over: Array | None = None
+    ) -> dict[str, Any]:
+        """Return infos in the form of Gymnasium's vector environments.
+
+        Args:
+            ids: The environments; None: all.
+            kinds: The forms of their infos.
+            over: Whether their episodes are over; None: they have just begun.
+        """
+        batch, found = self._batch, set(kinds.tolist()) - {InfoKind.NONE}
+        has_finals = bool(batch.finals) and over is not None and bool(over.any())
+        if not found and not has_finals:
+            return {}
+        if len(found) == 1 and not has_finals:
+            (kind,) = found
+            layout = self._infos.common(kind)
             if layout is not None:
-                return layout.columns(layout.records(data), kinds == InfoKind.NUMBERS)
+                data = batch.infos if ids is None else batch.infos[ids, : layout.dtype.itemsize]
+                return layout.columns(layout.records(data), kinds == kind)
+        numbers = self._all if ids is None else ids
+        vector: VectorEnv[Any, Any, Any] = VectorEnv()
+        vector.num_envs = len(numbers)
         infos: dict[str, Any] = {}
-        new: list[tuple[int, dict[str, Any]]] = []
-        for i, kind in enumerate(kinds.tolist()):
-            client, place = divmod(i, self._share)
-            info: dict[str, Any] = {}
-            if kind == InfoKind.NUMBERS:
-                info = self._reports.info(client, data[i])
-            elif kind == InfoKind.PACKED:
-                report = unpack(data[i]) or self._reports.last(client)["infos"][str(place)]
-                new.append((client, report))
-                info = report["info"]
-            if i in finals:
-                info = {"final_obs": finals[i], **info}
-            if info:
-                infos = self._add_info(infos, info, i)
-        for client, report in new:  # valid from the next row on
-            self._reports.learn(client, report)
+        for place, (i, kind) in enumerate(zip(numbers.tolist(), kinds.tolist(), strict=True)):
+            info = self._infos.info(i, self._worker_of[i], kind, batch.infos[i])
+            if has_finals and over is not None and over[place]:
+                arrays = {name: array[i].copy() for name, array in batch.finals.items()}
+                info = {"final_obs": self._observations.value(arrays), **info}
+            infos = vector._add_info(infos, info, place)
         return infos
 
-    # Other methods -------------------------------------------------------------------------
+    # Other methods --------------------------------------------------------------------------
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each environment, or read an attribute; return the results.
@@ -259,10 +385,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         """
         if name in FORBIDDEN:
             raise UsageError(f'call("{name}") would bypass this object: use {name}() itself.')
-        self._command("call", [(name, list(args), kwargs)] * self._clients)
-        self._receive()
-        results = [self._reports.last(client)["results"] for client in range(self._clients)]
-        return tuple(itertools.chain.from_iterable(results))
+        arguments = [(name, list(args), kwargs)] * len(self._owed)
+        return tuple(chain.from_iterable(self._open().command("call", arguments)))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Return an attribute of each environment."""
@@ -277,8 +401,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         each = list(values) if isinstance(values, (list, tuple)) else [values] * self.num_envs
         if len(each) != self.num_envs:
             raise ConfigError(f"{len(each)} values for {self.num_envs} environments.")
-        self._command("set", [(name, share) for share in self._split(each)])
-        self._receive()
+        shares = [(name, each[start:stop]) for start, stop in pairwise(self._starts)]
+        self._open().command("set", shares)
 
     def render(self) -> tuple[Any, ...]:
         """Return the frame that each environment renders."""
@@ -286,74 +410,59 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """End the processes."""
-        source, self._source = getattr(self, "_source", None), None
-        if source is not None:
-            source.close()
+        workers = getattr(self, "_workers", None)
+        if workers is not None:
+            workers.close(orderly=True)
 
-    def _open(self) -> ClientSource:
-        if self._source is None:
-            raise UsageError("This vector environment is closed.")
-        return self._source
-
-    def _command(self, name: str, arguments: Sequence[Any]) -> None:
-        """Send each client a command instead of actions."""
-        self._open().apply({COMMAND: pack_commands(name, arguments)}, at_once=False)
-
-    def _split(self, values: Sequence[Any]) -> list[list[Any]]:
-        """Return the values of each client's environments."""
-        return [
-            list(values[first : first + self._share])
-            for first in range(0, self.num_envs, self._share)
-        ]
+    def _open(self) -> Workers:
+        if not self._workers.is_open:
+            raise UsageError("This vector environment is closed, or ended with an error.")
+        return self._workers
 
 
-class _Reports:
-    """Collects what clients report besides their rows, as the services of their run.
+class _Infos:
+    """What is needed to read infos: the layouts that workers told, and infos that did not fit."""
 
-    Attributes:
-        layout: Layout of the infos of all clients; None if they differ.
-    """
-
-    def __init__(self) -> None:
-        self.layout: InfoLayout | None = None
-        self._last: dict[int, dict[str, Any]] = {}
-        self._layouts: dict[int, InfoLayout] = {}
+    def __init__(self, workers: int) -> None:
+        self._layouts: list[dict[int, InfoLayout]] = [{} for _ in range(workers)]
+        self._common: dict[int, InfoLayout | None] = {}
+        self._sent: dict[int, dict[str, Any]] = {}
         self._left_out: set[str] = set()
 
-    def last(self, client: int) -> dict[str, Any]:
-        """Return what a client, counted from 0, reported before its last row."""
-        return self._last[client]
+    def learn(self, messages: Sequence[tuple[int, Frame]]) -> None:
+        """Take over what workers sent; warn of entries that they left out."""
+        for worker, frame in messages:
+            value = decode(frame.payload)
+            if frame.kind is Kind.FIELDS:
+                number, layout = frame.number, InfoLayout(value)
+                self._layouts[worker][number] = layout
+                known = [each[number] for each in self._layouts if number in each]
+                differ = any(other.names != layout.names for other in known)
+                self._common[number] = None if differ else layout
+            elif frame.kind is Kind.NOTES:
+                self._sent[frame.number] = value
+            else:
+                self._warn(value)
 
-    def info(self, client: int, data: Array) -> dict[str, Any]:
-        """Return an info from a record of the layout that a client announced last."""
-        layout = self._layouts[client]
-        return layout.info(layout.records(data[np.newaxis])[0])
+    def common(self, kind: int) -> InfoLayout | None:
+        """Return the layout of a number, if all workers that told it mean the same."""
+        return self._common.get(kind)
 
-    def learn(self, client: int, report: Mapping[str, Any]) -> None:
-        """Remember the layout that an info was reported with; warn of entries left out."""
-        if "layout" in report:
-            self._layouts[client] = layout = InfoLayout(report["layout"])
-            differ = any(other.names != layout.names for other in self._layouts.values())
-            self.layout = None if differ else layout
-        new = set(report.get("left_out", [])) - self._left_out
+    def info(self, env: int, worker: int, kind: int, data: Array) -> dict[str, Any]:
+        """Return the info of an environment."""
+        if kind == InfoKind.NONE:
+            return {}
+        if kind == InfoKind.SENT:
+            return self._sent.pop(env)
+        found: dict[str, Any]
+        found = unpack(data) if kind == InfoKind.PACKED else self._layouts[worker][kind].info(data)
+        return found
+
+    def _warn(self, left_out: Sequence[str]) -> None:
+        new = set(left_out) - self._left_out
         if new:
             self._left_out |= new
             _LOG.warning(
                 "Info entries are left out because they are neither plain values nor arrays: %s.",
                 ", ".join(sorted(new)),
             )
-
-    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Store what a client reports before its row."""
-        self._last[instance_id - 1] = values
-
-    def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return nothing: workers do not ask for parameters."""
-        return {}
-
-    def predict(self, fields: Sample) -> Sample:
-        """Raise an error: workers do not ask for predictions."""
-        raise UsageError("A vector environment has no network.")
-
-    def show(self, instance_id: int, step: int, events: list[Event]) -> None:
-        """Do nothing: workers do not draw."""

@@ -15,12 +15,12 @@ from physx_core.net.frames import Kind, pack
 from physx_core.net.remote_errors import encode_error
 from physx_core.net.spin_wait import has_core_for_each
 from physx_core.net.values import encode
+from physx_core.processes import CLIENT_VARIABLE
 from physx_core.typing import Sample
 from physx_core.workers.client.joining import PATIENCE, join
 from physx_core.workers.client.link import RunEnded, ServerGone, WorkerLink
 from physx_core.workers.client.producer import Producer
 from physx_core.workers.instance import Instance
-from physx_core.workers.launchers import CLIENT_VARIABLE
 
 
 def run_client(

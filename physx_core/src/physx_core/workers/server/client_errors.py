@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import signal
 import time
 
 from physx_core.components.launcher import ClientHandle
 from physx_core.errors import ClientError
 from physx_core.net.liveness import VANISHED
+from physx_core.processes import describe_exit
 from physx_core.workers.server.peer import Peer
 
 _LINES_TIME = 0.1  # for the last lines of its standard error to arrive
@@ -37,7 +37,7 @@ def exit_error(number: int, peer: Peer | None, handle: ClientHandle | None) -> C
         return ClientError(number, f"closed the connection {when}. Its own terminal may say why.")
     handle.wait(time.monotonic() + _LEAVE_TIME)
     status = handle.exit_status()
-    how = "closed the connection" if status is None else _describe_status(status)
+    how = "closed the connection" if status is None else describe_exit(status)
     return ClientError(
         number,
         f"{how} {when}. To see what it does, run with as_tcp_ip_client=False.",
@@ -73,14 +73,3 @@ def timeout_error(
         f"{how} that long, raise EnvironmentConfig.timeout.",
         stderr="" if handle is None else handle.stderr(),
     )
-
-
-def _describe_status(status: int) -> str:
-    """Describe an exit status, negative for a signal."""
-    if status >= 0:
-        return f"ended with exit status {status}"
-    try:
-        name = signal.Signals(-status).name
-    except ValueError:
-        name = "unknown"
-    return f"was killed by signal {-status} ({name})"

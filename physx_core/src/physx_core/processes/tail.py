@@ -1,0 +1,38 @@
+"""OutputTail: the last lines that a process wrote."""
+
+from __future__ import annotations
+
+import threading
+from typing import IO
+
+_BYTES = 8192
+_LINES = 60
+
+
+class OutputTail:
+    """Reads what a process writes to a pipe, and keeps the last lines of it."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        """Begin to read.
+
+        Args:
+            stream: The pipe; closed at its end.
+        """
+        self._bytes = b""
+        self._reader = threading.Thread(target=self._read, args=(stream,), daemon=True)
+        self._reader.start()
+
+    def text(self, patience: float = 0.0) -> str:
+        """Return the last lines.
+
+        Args:
+            patience: How long to wait for the rest of them, in s, if the process has ended.
+        """
+        self._reader.join(patience)
+        lines = self._bytes.decode(errors="replace").splitlines()
+        return "\n".join(lines[-_LINES:])
+
+    def _read(self, stream: IO[bytes]) -> None:
+        with stream:
+            while chunk := stream.read(_BYTES):
+                self._bytes = (self._bytes + chunk)[-_BYTES:]

@@ -1,0 +1,228 @@
+"""Share: the environments that one worker steps."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium
+from gymnasium.vector import AutoresetMode
+
+from physx_core.errors import ConfigError, EnvironmentFailedError, PhysxError, UsageError
+from physx_core.net import Kind, encode, encode_error, pack
+from physx_core.typing import Array
+from physx_gym.bridge.make_env import make_env
+from physx_gym.spaces import SpaceFields
+from physx_gym.vector.batch import SharedBatch
+from physx_gym.vector.infos import InfoKind, InfoLayout, put_packed
+
+_MOST_LAYOUTS = 100
+_FRESH = (None, None)
+
+
+class Share:
+    """Some of a vector environment's environments; their results go into the shared batch."""
+
+    def __init__(
+        self, setup: Mapping[str, Any], batch: SharedBatch, send: Callable[[bytes], None]
+    ) -> None:
+        """Keep what to run; `create` makes the environments.
+
+        Args:
+            setup: What the worker was told.
+            batch: The shared memory.
+            send: Sends a message to the process with the vector environment.
+        """
+        shares, number = setup["shares"], setup["number"]
+        self._count, self._first = shares[number], sum(shares[:number])
+        self._setup, self._send = setup, send
+        self._mode = AutoresetMode(setup["autoreset"])
+        mine = slice(self._first, self._first + self._count)
+        self._rewards, self._infos, self._kinds = (
+            array[mine] for array in (batch.rewards, batch.infos, batch.kinds)
+        )
+        self._terminated, self._truncated = batch.terminated[mine], batch.truncated[mine]
+        self._given, self._seen, self._finals = (
+            {name: array[mine] for name, array in arrays.items()}
+            for arrays in (batch.actions, batch.observations, batch.finals)
+        )
+        self._envs: list[gymnasium.Env[Any, Any]] = []
+        # Seed and options of each environment whose next step is a reset.
+        self._due: list[tuple[int | None, dict[str, Any] | None] | None] = [None] * self._count
+        self._steps = [0] * self._count
+        self._layouts: dict[str, int] = {}
+        self._layout: InfoLayout | None = None  # the one that was used last, and its number
+        self._layout_number = 0
+        self._left_out: set[str] = set()
+
+    def create(self) -> None:
+        """Make the environments."""
+        for place in range(self._count):
+            if not self._attempt("__init__", place, self._make):
+                return
+
+    def step(self, place: int) -> None:
+        """Step an environment; or reset it, if that is due."""
+        if self._due[place] is None:
+            self._attempt("step", place, self._step)
+        else:
+            self._attempt("reset", place, self._reset)
+
+    def execute(self, command: Mapping[str, Any]) -> None:
+        """Execute a command: prepare resets, call a method of each environment, or set a value."""
+        name, arguments = command["name"], command["arguments"]
+        if name == "reset":
+            options = arguments["options"]
+            for place, seed in zip(arguments["places"], arguments["seeds"], strict=True):
+                self._due[place] = (seed, None if options is None else dict(options))
+        elif name == "call":
+            results: list[Any] = []
+
+            def call(place: int) -> None:
+                results.append(_call(self._envs[place], *arguments))
+
+            if all(self._attempt(arguments[0], place, call) for place in range(self._count)):
+                self._send(pack(Kind.ANSWER, encode(results)))
+        else:
+            name, values = arguments
+
+            def assign(place: int) -> None:
+                self._envs[place].set_wrapper_attr(name, values[place])
+
+            for place in range(self._count):
+                self._attempt(f"set_wrapper_attr({name!r})", place, assign)
+
+    def close(self) -> None:
+        """Close the environments."""
+        for place in range(len(self._envs)):
+            self._attempt("close", place, lambda place: self._envs[place].close())
+
+    def _attempt(self, method: str, place: int, function: Callable[[int], None]) -> bool:
+        """Call a function of a place; return whether it succeeded, and otherwise send why not."""
+        try:
+            function(place)
+        except Exception as error:
+            env = self._first + place
+            known = error if isinstance(error, PhysxError) else self._wrap(error, method, place)
+            known.add_note(f"in {method}() of environment {env} of the vector, counted from 0")
+            self._send(pack(Kind.ERROR, encode_error(known), env))
+            return False
+        return True
+
+    def _wrap(self, error: Exception, method: str, place: int) -> EnvironmentFailedError:
+        step = self._steps[place] - 1 if method == "step" else -1
+        summary = "".join(traceback.format_exception_only(error)).strip()
+        text = "".join(traceback.format_exception(error))
+        return EnvironmentFailedError(self._first + place + 1, method, step, summary, text)
+
+    # Steps ----------------------------------------------------------------------------------
+
+    def _make(self, place: int) -> None:
+        setup = self._setup
+        env = make_env(setup["env"], setup["options"])
+        self._envs.append(env)
+        self._actions = SpaceFields(env.action_space, "action")
+        self._observations = SpaceFields(env.observation_space, "observation")
+        for name, space in (("actions", self._actions), ("observations", self._observations)):
+            if [field.to_dict() for field in space.fields] != setup[name]:
+                raise ConfigError(
+                    f"The {name} of this environment, {space.space}, differ in shape or type from "
+                    "those of another one that was made from the same arguments. A vector "
+                    "environment needs the same in all."
+                )
+
+    def _step(self, place: int) -> None:
+        action = {name: array[place].copy() for name, array in self._given.items()}
+        self._steps[place] += 1
+        env = self._envs[place]
+        observation, reward, terminated, truncated, info = env.step(self._actions.value(action))
+        if terminated or truncated:
+            if self._mode is AutoresetMode.NEXT_STEP:
+                self._due[place] = _FRESH
+            elif self._mode is AutoresetMode.SAME_STEP:
+                for name, value in self._observations.arrays(observation).items():
+                    self._finals[name][place] = value
+                observation, reset_info = env.reset()
+                info = {**reset_info, "final_info": info}
+        self._put(place, observation, reward, terminated, truncated)
+        self._put_info(place, info)
+
+    def _reset(self, place: int) -> None:
+        seed, options = self._due[place] or _FRESH
+        self._due[place] = None
+        observation, info = self._envs[place].reset(seed=seed, options=options)
+        self._put(place, observation, 0.0, False, False)
+        self._put_info(place, info)
+
+    def _put(
+        self, place: int, observation: Any, reward: Any, terminated: Any, truncated: Any
+    ) -> None:
+        for name, value in self._observations.arrays(observation).items():
+            self._seen[name][place] = value
+        self._rewards[place] = reward
+        self._terminated[place], self._truncated[place] = terminated, truncated
+
+    def _put_info(self, place: int, info: Mapping[str, Any]) -> None:
+        """Write an info; entries that cannot be sent are only named."""
+        target: Array = self._infos[place]
+        if not info:
+            self._kinds[place] = InfoKind.NONE
+        elif self._layout is not None and self._layout.put(info, target):
+            self._kinds[place] = self._layout_number
+        else:
+            plain = {str(name): value for name, value in info.items()}
+            if self._learn(plain) and self._layout is not None and self._layout.put(plain, target):
+                self._kinds[place] = self._layout_number
+                return
+            encoded = self._encode(plain)
+            self._kinds[place] = InfoKind.PACKED
+            if not put_packed(target, encoded):
+                self._kinds[place] = InfoKind.SENT
+                self._send(pack(Kind.NOTES, encoded, self._first + place))
+
+    def _learn(self, info: Mapping[str, Any]) -> bool:
+        """Find the layout of an info, and send it if it is new; return whether it has one."""
+        layout = InfoLayout.of(info)
+        if layout is None:
+            return False
+        number = self._layouts.get(str(layout.names), len(self._layouts) + 1)
+        if number > _MOST_LAYOUTS:
+            return False
+        if number > len(self._layouts):
+            self._layouts[str(layout.names)] = number
+            self._send(pack(Kind.FIELDS, encode(layout.names), number))
+        self._layout, self._layout_number = layout, number
+        return True
+
+    def _encode(self, info: Mapping[str, Any]) -> bytes:
+        """Return an info as bytes, without the entries that cannot be sent."""
+        try:
+            return encode(info, "infos")
+        except UsageError:
+            sent = {name: value for name, value in info.items() if _is_sendable(value)}
+            new = info.keys() - sent.keys() - self._left_out
+            if new:
+                self._left_out |= new
+                self._send(pack(Kind.REFUSAL, encode(sorted(new))))
+            return encode(sent, "infos")
+
+
+def _call(
+    env: gymnasium.Env[Any, Any], name: str, positional: Sequence[Any], named: Mapping[str, Any]
+) -> Any:
+    attribute = env.get_wrapper_attr(name)
+    result = attribute(*positional, **named) if callable(attribute) else attribute
+    try:
+        encode(result, name)
+    except UsageError as error:
+        raise UsageError(f'"{name}" of the environments cannot be sent: {error}') from error
+    return result
+
+
+def _is_sendable(value: Any) -> bool:
+    try:
+        encode({"": value} if isinstance(value, dict) else value, "info")
+    except UsageError:
+        return False
+    return True

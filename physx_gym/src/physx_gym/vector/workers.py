@@ -1,0 +1,316 @@
+"""Workers: the processes of a vector environment, from their start to their end."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from physx_core.errors import ClientError, PhysxError
+from physx_core.net import (
+    MAX_PAYLOAD,
+    Frame,
+    FrameReader,
+    Kind,
+    decode,
+    decode_error,
+    encode,
+    fence,
+    has_core_for_each,
+    pack,
+    spin_until,
+)
+from physx_core.processes import ChildProcess, OutputTail, describe_exit, worker_variables
+from physx_core.typing import Array
+from physx_gym.vector.batch import COMMAND, END, NEVER, SPIN_TIME, SharedBatch
+
+_BELL = pack(Kind.ACTIONS)
+_TICK = 0.1
+_LAST_WORDS_TIME = 0.3
+_EXIT_TIME = 5.0
+
+
+class Workers:
+    """Processes that execute the entries of their queues; an error ends all of them.
+
+    Attributes:
+        is_open: Whether the processes run.
+        asked: For each worker, how many entries its queue has had.
+        messages: What workers sent beside their results and errors: their numbers, and frames.
+    """
+
+    def __init__(
+        self, batch: SharedBatch, file: int, setup: Mapping[str, Any], timeout: float
+    ) -> None:
+        """Start the processes, and wait until all environments are made.
+
+        Args:
+            batch: The shared memory.
+            file: Its descriptor.
+            setup: What the workers run, with their ``shares``.
+            timeout: Longest time that an entry may take, in s.
+        """
+        self._batch, self._timeout = batch, timeout
+        self._shares: Sequence[int] = setup["shares"]
+        self._owner = os.getpid()
+        self._links: list[_Link] = []
+        self._by_file: dict[int, int] = {}
+        self._poll = select.poll()
+        self._spins = has_core_for_each(len(self._shares) + 1)  # this process is one more
+        self._errors: dict[int, PhysxError] = {}
+        self._received = 0
+        self.is_open = True
+        self.asked = [0] * len(self._shares)
+        self.messages: list[tuple[int, Frame]] = []
+        batch.awaited[0] = NEVER
+        path = [str(Path(entry).resolve()) for entry in sys.path]
+        try:
+            for number in range(len(self._shares)):
+                self._links.append(link := _Link(number, file))
+                self._by_file[link.socket.fileno()] = number
+                self._poll.register(link.socket, select.POLLIN)
+            for number in range(len(self._shares)):
+                self.ask(number, [COMMAND])  # to make the environments
+                self._send(number, {**setup, "number": number, "path": path})
+            self.wait(sum(self.asked))
+        except BaseException:
+            self.close(orderly=False)
+            raise
+
+    def ask(self, number: int, entries: Sequence[int] | Array) -> None:
+        """Add entries to the queue of a worker."""
+        batch, start = self._batch, self.asked[number] % self._batch.capacity
+        queue, count = batch.queues[number], len(entries)
+        fitting = min(count, batch.capacity - start)
+        queue[start : start + fitting] = entries[:fitting]
+        if fitting < count:
+            queue[: count - fitting] = entries[fitting:]
+        self.asked[number] += count
+        fence()
+        batch.asked[number] = self.asked[number]
+        fence()
+        if batch.idle[number]:
+            self._links[number].ring()
+
+    def command(self, name: str, arguments: Sequence[Any]) -> list[Any]:
+        """Have each worker execute a command after its other entries.
+
+        Args:
+            name: Name of the command.
+            arguments: What each worker gets with it.
+
+        Returns:
+            The answer of each worker; None if it has none.
+        """
+        self.wait(sum(self.asked))  # a worker that sends something may not receive
+        for number, each in enumerate(arguments):
+            self.ask(number, [COMMAND])
+            self._send(number, {"name": name, "arguments": each})
+        self.wait(sum(self.asked))
+        answers = {n: decode(f.payload) for n, f in self.messages if f.kind is Kind.ANSWER}
+        self.messages = [(n, f) for n, f in self.messages if f.kind is not Kind.ANSWER]
+        return [answers.get(number) for number in range(len(arguments))]
+
+    def wait(self, entries: int) -> list[int]:
+        """Wait until the workers together have finished a number of entries since the start.
+
+        Returns:
+            For each worker, how many it has finished.
+
+        Raises:
+            ClientError: If a worker ends, or an entry takes too long.
+            PhysxError: If environments raise; that of the first one.
+        """
+        batch = self._batch
+
+        def is_done() -> bool:
+            return sum(batch.done) >= entries
+
+        if not (is_done() or (self._spins and spin_until(is_done, SPIN_TIME))):
+            batch.awaited[0] = entries
+            fence()
+            try:
+                self._sleep(is_done)
+            finally:
+                batch.awaited[0] = NEVER
+        done = list(batch.done)
+        fence()
+        if sum(batch.sent) > self._received:
+            for number in range(len(self._links)):
+                if not self._receive(number) and done[number] < self.asked[number]:
+                    self._fail(self._end_of(number))
+        if self._errors:
+            self._fail(self._errors[min(self._errors)])
+        return done
+
+    def close(self, *, orderly: bool) -> None:
+        """End the processes; none is left when this returns.
+
+        Args:
+            orderly: Let them close their environments, and raise what these raise.
+        """
+        if not self.is_open:
+            return
+        self.is_open = False
+        try:
+            if os.getpid() == self._owner:  # a process forked from it leaves them alone
+                self._end(self._timeout if orderly else 0.0)
+        finally:
+            for link in self._links:
+                link.socket.close()
+        if orderly and self._errors:
+            raise self._errors[min(self._errors)]
+
+    def _sleep(self, is_done: Callable[[], bool]) -> None:
+        """Sleep until something is done; notice workers that end, or hang."""
+        batch = self._batch
+        seen, since = list(batch.done), [time.monotonic()] * len(self._links)
+        looked = since[0]
+        while not is_done():
+            for file, _ in self._poll.poll(1000 * _TICK):
+                if not self._receive(number := self._by_file[file]) and not is_done():
+                    self._fail(self._end_of(number))
+            now = time.monotonic()
+            if now - looked < _TICK:
+                continue
+            looked = now
+            for number, done in enumerate(batch.done):
+                if done != seen[number]:
+                    seen[number], since[number] = done, now
+                elif done != self.asked[number] and now - since[number] > self._timeout:
+                    self._fail(self._silence_of(number))
+
+    def _receive(self, number: int) -> bool:
+        """Read what a worker has sent; return whether the link is still open."""
+        link = self._links[number]
+        with contextlib.suppress(EOFError):
+            while (frame := link.reader.read(link.socket)) is not None:
+                if frame.kind is Kind.READY:  # it only woke this process
+                    continue
+                self._received += 1
+                if frame.kind is Kind.ERROR:
+                    self._errors.setdefault(frame.number, decode_error(frame.payload))
+                else:
+                    self.messages.append((number, frame))
+            return True
+        return False
+
+    def _send(self, number: int, value: Mapping[str, Any]) -> None:
+        """Send a worker a command, for which it waits."""
+        link, message = self._links[number], pack(Kind.REQUEST, encode(value, "The arguments"))
+        try:
+            link.socket.settimeout(self._timeout)
+            link.socket.sendall(message)
+        except TimeoutError:
+            self._fail(self._silence_of(number))
+        except OSError:
+            self._fail(self._end_of(number))
+        finally:
+            link.socket.setblocking(False)
+
+    # Ends -----------------------------------------------------------------------------------
+
+    def _fail(self, error: PhysxError) -> NoReturn:
+        self.close(orderly=False)
+        raise error
+
+    def _end(self, patience: float) -> None:
+        for number, link in enumerate(self._links):
+            self._batch.asked[number] = END
+            link.ring()
+        running, until = set(range(len(self._links))), time.monotonic() + patience
+        while running and time.monotonic() < until:
+            for file, _ in self._poll.poll(1000 * _TICK):
+                if not self._receive(number := self._by_file[file]):
+                    self._poll.unregister(file)
+                    running.discard(number)
+        try:
+            if running and patience:
+                raise self._silence_of(min(running))
+            for link in self._links:
+                link.process.wait(_EXIT_TIME if patience else 0.0)
+        finally:
+            for link in self._links:
+                link.process.send_signal(signal.SIGTERM)
+            for link in self._links:
+                link.process.close(_LAST_WORDS_TIME)
+
+    def _end_of(self, number: int) -> ClientError:
+        """Return the error for a worker that has ended."""
+        link, doing = self._links[number], self._describe_entry(number)
+        status = link.process.wait(_EXIT_TIME)
+        how = "closed its link" if status is None else describe_exit(status)
+        text = link.tail.text(_LAST_WORDS_TIME)
+        return ClientError(number + 1, f"{how} {doing}.", exit_status=status, stderr=text)
+
+    def _silence_of(self, number: int) -> ClientError:
+        """Return the error for a worker whose entry takes too long."""
+        link, doing = self._links[number], self._describe_entry(number)
+        link.process.send_signal(signal.SIGTERM)  # it writes where it was
+        link.process.wait(_LAST_WORDS_TIME)
+        text = (
+            f"sent nothing for {self._timeout:g} s {doing}. If that takes so long, raise timeout."
+        )
+        return ClientError(number + 1, text, stderr=link.tail.text(_LAST_WORDS_TIME))
+
+    def _describe_entry(self, number: int) -> str:
+        done = self._batch.done[number]
+        first, count = sum(self._shares[:number]), self._shares[number]
+        mine = (
+            f"environment {first}" if count == 1 else f"environments {first} to {first + count - 1}"
+        )
+        if not self.is_open:
+            return f"while it closed {mine}"
+        if not done:
+            return f"while it made {mine}"
+        if done == self.asked[number]:
+            return f"while it waited, with {mine}"
+        entry = int(self._batch.queues[number][done % self._batch.capacity])
+        return f"in a call of {mine}" if entry == COMMAND else f"in environment {first + entry}"
+
+
+class _Link:
+    """A worker's process, and the connection to it.
+
+    Attributes:
+        socket: The connection; non-blocking.
+        reader: Reads its frames.
+        process: The process.
+        tail: What it wrote to its standard error last.
+    """
+
+    def __init__(self, number: int, file: int) -> None:
+        """Start the process.
+
+        Args:
+            number: Number of the worker.
+            file: Descriptor of the shared memory.
+        """
+        self.socket, theirs = socket.socketpair()
+        self.socket.setblocking(False)
+        self.reader = FrameReader(MAX_PAYLOAD)
+        passed = [theirs.fileno(), file]
+        command = [sys.executable, "-P", "-m", "physx_gym.vector.worker", *map(str, passed)]
+        with theirs:
+            try:
+                self.process = ChildProcess(
+                    command, variables=worker_variables(), stderr=subprocess.PIPE, pass_fds=passed
+                )
+            except OSError as error:
+                self.socket.close()
+                raise ClientError(number + 1, f"could not be started: {error}.") from error
+        assert self.process.stderr is not None
+        self.tail = OutputTail(self.process.stderr)
+
+    def ring(self) -> None:
+        """Wake the worker if it sleeps."""
+        with contextlib.suppress(OSError):  # it is gone, or has enough to wake up for
+            self.socket.send(_BELL)
