@@ -14,7 +14,7 @@ import pytest
 OWNER = Path(__file__).parent / "programs" / "owner.py"
 KINDS = {
     "clients": b"physx_core.workers",
-    "vector": b"physx_core.workers",
+    "vector": b"physx_gym.vector.worker",
     "batches": b"physx_dart.batch.worker",
     "pictures": b"--headless",
     "headless": b"--headless",
