@@ -254,6 +254,11 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         observations, *results, infos = self._results(ids)
         return observations, *results, {**infos, "env_id": ids}
 
+    @property
+    def owing(self) -> int:
+        """How many environments owe a result."""
+        return int(self._owes.sum())
+
     def _ask(self, ids: Array) -> None:
         """Have environments step."""
         self._owes[ids] = True
