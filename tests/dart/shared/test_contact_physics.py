@@ -20,7 +20,7 @@ from physx_core import (
 
 DETECTORS = [("dart", name, None) for name in ("dart", "fcl", "bullet", "ode")]
 ENGINES = [*DETECTORS, ("pinocchio", None, "pgs"), ("pinocchio", None, "admm")]
-ISOTROPIC = [("dart", None, "nsgs"), ("dart", None, "fbf"), *ENGINES[-2:]]
+ISOTROPIC = [("dart", None, None), ("dart", None, "fbf"), *ENGINES[-2:]]
 BOTH = [("dart", None, None), ("pinocchio", None, None)]
 
 
@@ -47,12 +47,14 @@ def test_a_box_on_an_incline_holds_below_the_friction_angle_and_slides_above(eng
     gravity, _ = tilted(0.98, 0.5)
     with build(engine, cube(friction=0.5), gravity=gravity) as simulation:
         simulation.step(1000)
-        assert np.abs(simulation.positions()[:2]).max() < 1e-5
+        held = 1e-4 if engine[1] == "bullet" else 1e-5
+        assert np.abs(simulation.positions()[:2]).max() < held
     gravity, angle = tilted(1.02, 0.5)
     with build(engine, cube(friction=0.5), gravity=gravity) as simulation:
         simulation.step(1000)
         expected = 0.5 * 9.81 * (np.sin(angle) - 0.5 * np.cos(angle))
-        np.testing.assert_allclose(simulation.positions()[0], expected, rtol=0.01)
+        rtol = 0.03 if engine[1] == "bullet" else 0.01  # of a fiftieth of the friction
+        np.testing.assert_allclose(simulation.positions()[0], expected, rtol=rtol)
 
 
 @pytest.mark.parametrize("engine", ISOTROPIC, ids=str)
@@ -66,10 +68,9 @@ def test_friction_is_isotropic_with_the_feature(engine):
         np.testing.assert_allclose(slid, expected, rtol=0.005)
 
 
-@pytest.mark.parametrize("solver", ["dantzig", "pgs"])
-def test_the_friction_pyramid_is_stronger_along_its_diagonals(solver):
+def test_the_friction_pyramid_is_stronger_along_its_diagonals():
     gravity, _ = tilted(1.2, 0.5, (1.0, 1.0))
-    with build(("dart", None, solver), cube(friction=0.5), gravity=gravity) as simulation:
+    with build(("dart", None, "dantzig"), cube(friction=0.5), gravity=gravity) as simulation:
         assert "isotropic_friction" not in simulation.features
         simulation.step(1000)
         assert np.abs(simulation.positions()[:2]).max() < 1e-3
@@ -106,7 +107,7 @@ def test_the_contact_force_of_a_resting_box_is_its_weight_and_it_does_not_sink(e
         simulation.step(500)
         contacts = simulation.contacts()
         np.testing.assert_allclose(
-            contacts["force"].sum(axis=0), [0, 0, 3 * 9.81], rtol=1e-6, atol=1e-6
+            contacts["force"].sum(axis=0), [0, 0, 3 * 9.81], rtol=1e-4, atol=1e-3
         )
         np.testing.assert_allclose(contacts["normal"], [[0, 0, 1]] * len(contacts), atol=1e-6)
         assert contacts["depth"].max() < 2e-5
@@ -139,7 +140,7 @@ def test_the_ground_bears_weight_and_external_forces(engine):
         simulation.apply_wrench(Wrench("cube", force=(0, 0, -30)))
         simulation.step(300)
         force = simulation.contacts()["force"].sum(axis=0)
-        np.testing.assert_allclose(force, [0, 0, 2 * 9.81 + 30], rtol=1e-6, atol=1e-5)
+        np.testing.assert_allclose(force, [0, 0, 2 * 9.81 + 30], rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.parametrize("engine", BOTH, ids=str)
@@ -152,9 +153,7 @@ def test_a_pushed_box_accelerates_by_force_minus_friction(engine):
         before = simulation.velocities()[0]
         simulation.step(200)
         gained = (simulation.velocities()[0] - before) / 0.2
-        # DART bounds friction by a pyramid, a little wider than the cone.
-        rtol = 0.01 if engine[0] == "dart" else 1e-5
-        np.testing.assert_allclose(gained, 20 / 2 - 0.4 * 9.81, rtol=rtol)
+        np.testing.assert_allclose(gained, 20 / 2 - 0.4 * 9.81, rtol=1e-5)
         assert abs(simulation.accelerations()[0] - gained) < 0.02
 
 
@@ -164,7 +163,7 @@ def test_a_tall_box_stays_upright(engine):
     with build(engine, pole) as simulation:
         simulation.step(500)
         np.testing.assert_allclose(simulation.positions(), [0, 0, 0.5, 0, 0, 0, 1], atol=2e-5)
-        assert np.abs(simulation.velocities()).max() < 1e-5
+        assert np.abs(simulation.velocities()).max() < 1e-4
 
 
 @pytest.mark.parametrize("engine", BOTH, ids=str)

@@ -309,8 +309,8 @@ def test_a_standing_robot_carries_its_head(carrying, write_urdf):
         simulation.set_torques([3 * 9.81])
         simulation.step(1000)
         sensors.update(simulation)
-        np.testing.assert_allclose(sensors["w"]["force"], [0, 3 * 9.81, 0], atol=1e-5)
-        np.testing.assert_allclose(sensors["w"]["torque"], [0, 0, 0.1 * 3 * 9.81], atol=1e-5)
+        np.testing.assert_allclose(sensors["w"]["force"], [0, 3 * 9.81, 0], atol=3e-3)
+        np.testing.assert_allclose(sensors["w"]["torque"], [0, 0, 0.1 * 3 * 9.81], atol=3e-3)
 
 
 def test_contacts_on_the_child_link_are_carried_too(carrying, write_urdf):

@@ -187,7 +187,13 @@ class Simulation(Closeable):
 
     @abstractmethod
     def snapshot(self) -> State:
-        """Return everything that `restore` needs to continue exactly from here."""
+        """Return everything that `restore` needs to continue exactly from here.
+
+        An engine that begins each step with impulses or contacts of the last one forgets them here,
+        as it does in `restore` and `set_state`: the state alone then determines what follows, bit
+        for bit the same here and wherever the snapshot is restored. It differs from what would have
+        followed without the snapshot within the accuracy of the engine's solver.
+        """
 
     @abstractmethod
     def restore(self, state: State) -> None:

@@ -62,6 +62,10 @@ class ContactReader:
             record["fraction"] = hit.mFraction
         return records
 
+    def forget(self) -> None:
+        """Forget DART's objects, which are about to be replaced."""
+        self._places.clear()
+
     def _place(self, collision_object: Any) -> int:
         place = self._places.get(collision_object)
         if place is None:

@@ -86,6 +86,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         commands = np.zeros(self._joint_count)
         commands[self._positioned] = self.positions()[self._positioned_q]
         self._hold(commands)
+        self.forget()
 
     def _set_command_limits(self) -> None:
         layout = self.layout
@@ -114,6 +115,9 @@ class RobotSimulation(Simulation, Generic[Engine]):
     @abstractmethod
     def advance(self, n: int) -> None:
         """Simulate n physics steps."""
+
+    def forget(self) -> None:
+        """Forget what the engine remembers of earlier steps: the state determines what follows."""
 
     @property
     def frame(self) -> int:
@@ -307,6 +311,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._check_open()
         q = self._checks.positions(positions)
         self._write(q, self._checks.velocities("velocities", velocities))
+        self.forget()
 
     def _write(self, q: Vector, v: Vector) -> None:
         self._stepped = False
@@ -316,6 +321,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
     def snapshot(self) -> State:
         """Return everything that `restore` needs to continue exactly from here."""
         self._check_open()
+        self.forget()
         return State(
             self.positions(),
             self.velocities(),
@@ -341,6 +347,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._write(q, v)
         for robot, pair in zip(self._robots, native, strict=False):
             robot.set_native(*pair)
+        self.forget()
         self._release()
         self._wrenches.restore(state.wrenches)
         self._watch()

@@ -1,4 +1,8 @@
-"""Ground of a world, which never moves: a plane, stairs, or a height field."""
+"""Ground of a world, which never moves: a plane, stairs, or a height field.
+
+Of two things that touch, the smaller coefficient of friction counts, and the product of their
+coefficients of restitution: by default, things bounce from the ground by their own.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +21,13 @@ class Ground:
 
     Attributes:
         friction: Coefficient of friction.
-        restitution: Coefficient of restitution.
+        restitution: Coefficient of restitution; 1: that of the other thing counts.
         height: Height of the plane above the world's origin along the normal, in m.
         normal: Direction away from the ground, of any length.
     """
 
     friction: float = 1.0
-    restitution: float = 0.0
+    restitution: float = 1.0
     height: float = 0.0
     normal: tuple[float, ...] = (0.0, 0.0, 1.0)
 
@@ -49,7 +53,7 @@ class Stairs:
         begin: Position of the first step along x, in m.
         landing: Length of the last step beyond `run`, in m.
         friction: Coefficient of friction.
-        restitution: Coefficient of restitution.
+        restitution: Coefficient of restitution; 1: that of the other thing counts.
     """
 
     steps: int = 5
@@ -59,7 +63,7 @@ class Stairs:
     begin: float = 1.0
     landing: float = 2.0
     friction: float = 1.0
-    restitution: float = 0.0
+    restitution: float = 1.0
 
     def __post_init__(self) -> None:
         checks.options(checks.not_negative, "Stairs.", self, "friction", "restitution")
@@ -92,14 +96,14 @@ class HeightField:
         spacing: Distance of neighboring points along x and along y, in m.
         origin: x and y of the point ``heights[0, 0]``, in m; None: the grid's middle is at 0, 0.
         friction: Coefficient of friction.
-        restitution: Coefficient of restitution.
+        restitution: Coefficient of restitution; 1: that of the other thing counts.
     """
 
     heights: NDArray[np.float64]
     spacing: tuple[float, ...] = (0.1, 0.1)
     origin: tuple[float, ...] | None = None
     friction: float = 1.0
-    restitution: float = 0.0
+    restitution: float = 1.0
 
     def __post_init__(self) -> None:
         checks.options(checks.not_negative, "HeightField.", self, "friction", "restitution")

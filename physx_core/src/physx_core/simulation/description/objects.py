@@ -20,8 +20,8 @@ class WorldObject:
         static: Whether it never moves; then its mass has no effect.
         position: Initial position of its center, in m.
         orientation: Initial orientation: quaternion x, y, z, w.
-        friction: Coefficient of friction.
-        restitution: Coefficient of restitution.
+        friction: Coefficient of friction; the smaller one of a pair counts.
+        restitution: Coefficient of restitution; the product of a pair counts.
     """
 
     lengths: ClassVar[tuple[str, ...]] = ()

@@ -68,8 +68,8 @@ class Robot:
         self_collisions: Whether links that are not connected by a joint collide with each other.
         feet: Links that collide as a sphere around their origin instead of with their own shapes:
             the radius of each, in m.
-        friction: Coefficient of friction of all links.
-        restitution: Coefficient of restitution of all links.
+        friction: Coefficient of friction of all links; the smaller one of a pair counts.
+        restitution: Coefficient of restitution of all links; the product of a pair counts.
         joints: Settings of joints, by their name in the URDF file.
     """
 
