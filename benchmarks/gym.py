@@ -236,7 +236,7 @@ def against_jiminy(python: str) -> list[bool]:
     return met
 
 
-# Telemetry, start-up, memory, processes -----------------------------------------------------------
+# Telemetry, start-up, memory ----------------------------------------------------------------------
 
 
 def telemetry() -> list[bool]:
@@ -341,45 +341,87 @@ def memory() -> list[bool]:
     return met
 
 
-def processes() -> bool:
-    """Compare two processes of environments with one.
+# Vector environments ------------------------------------------------------------------------------
+
+
+def vectors() -> list[bool]:
+    """Compare two processes of ants with one, and cartpoles with Gymnasium's vector environments.
 
     All take turns in short slices, since the machine's other work comes and goes. A vector
-    environment over bare sockets, which does nothing but what a step needs, shows how far two
+    environment over bare shared memory, which does nothing but what a step needs, shows how far two
     processes that wait for each other in each step get on this machine.
     """
     name, count = "physx/Ant-v0", 8
-    candidates: dict[str, Any] = {}
+    ants: dict[str, Any] = {}
     for number in (1, 2):
-        candidates[f"physx, {number}"] = gymnasium.make_vec(name, count, processes=number)
-        candidates[f"bare sockets, {number}"] = RawVectorEnv(name, count, number)
-    space = candidates["physx, 1"].action_space
-    space.seed(0)
-    actions = [space.sample() for _ in range(ACTIONS)]
+        ants[f"bare, {number}"] = RawVectorEnv(name, count, number)
+        ants[f"physx, {number}"] = gymnasium.make_vec(name, count, num_processes=number)
+    ants["halves"] = gymnasium.make_vec(name, count, num_processes=2, batch_size=count // 2)
+    measured = compare(ants)
+    print(f"{count} ants in a vector environment, by number of processes, steps/s:")
+    one = measured["physx, 1"]
+    for kind in ("bare", "physx"):
+        first, second = (measured[f"{kind}, {number}"] for number in (1, 2))
+        print(f"  {kind}: {np.median(first):,.0f}, {np.median(second):,.0f}", end="; ")
+        print(f"2 processes against 1: {np.median(second / first):.2f}")
+    halves = measured["halves"]
+    print(f"  physx, 2 with send and recv, batch_size={count // 2}: {np.median(halves):,.0f}")
+    met = [
+        claim("2 processes against 1", float(np.median(measured["physx, 2"] / one)), at_least=1.75),
+        claim("with send and recv", float(np.median(halves / one)), at_least=1.9),
+    ]
+    name, count = "physx/Cartpole-v0", 64
+    measured = compare(
+        {
+            "AsyncVectorEnv": gymnasium.make_vec(name, count, vectorization_mode="async"),
+            "SyncVectorEnv": gymnasium.make_vec(name, count, vectorization_mode="sync"),
+            "physx": gymnasium.make_vec(name, count, num_processes=2),
+        }
+    )
+    print(f"{count} cartpoles in a vector environment, steps/s:")
+    for kind, rate in measured.items():
+        print(f"  {kind}: {np.median(rate):,.0f}")
+    for kind, target in (("AsyncVectorEnv", 5.0), ("SyncVectorEnv", 1.5)):
+        ratio = float(np.median(measured["physx"] / measured[kind]))
+        met.append(claim(f"physx against {kind}", ratio, at_least=target))
+    return met
 
-    def steps(env: Any) -> int:
-        done, begin = 0, clock()
+
+def compare(candidates: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Return steps per second of vector environments in each round, and close them."""
+    turns = {name: functools.partial(turn, env, draw(env)) for name, env in candidates.items()}
+    for name, env in candidates.items():
+        if not isinstance(env, RawVectorEnv):
+            env.reset(seed=0)
+        turns[name]()
+    measured = {name: np.array(found) for name, found in rates(turns, 10 * ROUNDS).items()}
+    for env in candidates.values():
+        env.close()
+    return measured
+
+
+def draw(env: Any) -> list[np.ndarray]:
+    """Return actions for some steps of a vector environment."""
+    env.action_space.seed(0)
+    return [env.action_space.sample() for _ in range(ACTIONS)]
+
+
+def turn(env: Any, actions: list[np.ndarray]) -> int:
+    """Step a vector environment for a moment; return how many steps its environments made."""
+    done, begin = 0, clock()
+    if getattr(env, "batch_size", None) in (None, getattr(env, "num_envs", None)):
         while clock() - begin < 0.1:
             env.step(actions[done % ACTIONS])
             done += 1
-        return done * count
-
-    for env in candidates.values():
-        if not isinstance(env, RawVectorEnv):
-            env.reset(seed=0)
-        steps(env)
-    turns = {each: functools.partial(steps, env) for each, env in candidates.items()}
-    measured = {each: np.array(found) for each, found in rates(turns, 10 * ROUNDS).items()}
-    for env in candidates.values():
-        env.close()
-    print(f"{count} ants in a vector environment, by number of processes, steps/s:")
-    ratios = {}
-    for kind in ("bare sockets", "physx"):
-        one, two = measured[f"{kind}, 1"], measured[f"{kind}, 2"]
-        ratios[kind] = float(np.median(two / one))
-        print(f"  {kind}: {np.median(one):,.0f}, {np.median(two):,.0f}", end="; ")
-        print(f"2 processes against 1: {ratios[kind]:.2f}")
-    return claim("2 processes against 1", ratios["physx"], at_least=1.7)
+        return done * len(actions[0])
+    env.send(actions[0])
+    while clock() - begin < 0.1:
+        ids = env.recv()[4]["env_id"]
+        env.send(actions[done % ACTIONS][ids], ids)
+        done += 1
+    while env.owing:
+        env.recv()
+    return done * env.batch_size + len(actions[0])
 
 
 def main() -> None:
@@ -392,7 +434,7 @@ def main() -> None:
     met = overheads()
     if chosen.jiminy:
         met += against_jiminy(chosen.jiminy)
-    met += [*telemetry(), start_up(), *memory(), processes()]
+    met += [*telemetry(), start_up(), *memory(), *vectors()]
     finish(met)
 
 

@@ -1,78 +1,103 @@
-"""A vector environment over bare sockets: what gym.py compares `gymnasium.make_vec` with.
+"""A vector environment over bare shared memory: what gym.py compares `gymnasium.make_vec` with.
 
-It does what a step needs and nothing else: no checks, no infos, no faults, Box spaces alone.
+It does what a step needs and nothing else: no checks, no infos, no faults, Box spaces alone, and
+whoever waits looks at a number again and again.
 """
 
 from __future__ import annotations
 
-import socket
-import subprocess
-import sys
+import multiprocessing
+import os
+from multiprocessing.shared_memory import SharedMemory
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.vector.utils import batch_space
+
+END = -1
+
+
+class Memory:
+    """Arrays in shared memory.
+
+    Attributes:
+        actions: Shape (environments, width of an action).
+        results: Observation, reward, terminated and truncated of each environment.
+        counters: For this process and each other one, how many steps it has begun or done.
+    """
+
+    def __init__(self, block: SharedMemory, count: int, width: int, others: int) -> None:
+        numbers = np.frombuffer(block.buf)
+        self.actions = numbers[: count * width].reshape(count, width)
+        self.counters = numbers[count * width :][: 8 * (others + 1)].view(np.int64)[::8]
+        rest = numbers[count * width + 8 * (others + 1) :]
+        self.results = rest[: len(rest) // count * count].reshape(count, -1)
 
 
 class RawVectorEnv:
-    """Environments that are stepped in processes, over a socket each."""
+    """Environments that are stepped in processes."""
 
     def __init__(self, name: str, num_envs: int, processes: int) -> None:
         """Start the processes."""
-        self._processes, self._connections = [], []
-        with gymnasium.make(name) as env, socket.create_server(("127.0.0.1", 0)) as listener:
-            self._width = env.observation_space.shape[0]
-            port, share = listener.getsockname()[1], num_envs // processes
-            command = [sys.executable, __file__, name, str(share), str(port)]
-            for _ in range(processes):
-                self._processes.append(subprocess.Popen(command))
-                connection, _ = listener.accept()
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._connections.append(connection)
+        with gymnasium.make(name) as env:
+            self.action_space = batch_space(env.action_space, num_envs)
+            width, seen = env.action_space.shape[0], env.observation_space.shape[0]
+        size = num_envs * (width + seen + 3) + 8 * (processes + 1)
+        self._block = SharedMemory(create=True, size=8 * size)
+        self._sizes = num_envs, width, processes
+        self._memory = Memory(self._block, *self._sizes)
+        self._memory.counters[:] = 0
+        context = multiprocessing.get_context("spawn")
+        self._processes = [
+            context.Process(target=serve, args=(name, self._block, self._sizes, number))
+            for number in range(processes)
+        ]
+        for process in self._processes:
+            process.start()
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, ...]:
         """Step all environments; return observations, rewards, terminations, truncations."""
-        parts = np.split(actions, len(self._connections))
-        for connection, part in zip(self._connections, parts, strict=True):
-            connection.sendall(part)
-        size = 8 * len(parts[0]) * (self._width + 3)
-        answers = [c.recv(size, socket.MSG_WAITALL) for c in self._connections]
-        table = np.frombuffer(b"".join(answers)).reshape(len(actions), -1)
-        observations, rewards, over, cut = np.split(table, [self._width, -2, -1], axis=1)
+        memory = self._memory
+        memory.actions[:] = actions
+        memory.counters[0] += 1
+        while memory.counters[1:].min() < memory.counters[0]:
+            os.sched_yield()
+        observations, rewards, over, cut = np.split(memory.results, [-3, -2, -1], axis=1)
         return observations.copy(), rewards[:, 0].copy(), over[:, 0] != 0, cut[:, 0] != 0
 
     def close(self) -> None:
         """End the processes."""
-        for connection in self._connections:
-            connection.close()
+        self._memory.counters[0] = END
         for process in self._processes:
-            process.wait()
+            process.join()
+        del self._memory
+        self._block.close()
+        self._block.unlink()
 
 
-def serve(name: str, count: int, port: int) -> None:
-    """Step some environments as long as actions come; an episode that is over begins again."""
+def serve(name: str, block: SharedMemory, sizes: tuple[int, int, int], number: int) -> None:
+    """Step some environments until the end; an episode that is over begins again."""
     import physx_gym  # noqa: F401 - registers the environments
 
-    envs: list[Any] = [gymnasium.make(name, disable_env_checker=True) for _ in range(count)]
-    answers = np.zeros((count, envs[0].observation_space.shape[0] + 3))
-    space = envs[0].action_space
-    size = count * space.dtype.itemsize * space.shape[0]
-    over = [True] * count
-    with socket.create_connection(("127.0.0.1", port)) as connection:
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        while len(data := connection.recv(size, socket.MSG_WAITALL)) == size:
-            actions = np.frombuffer(data, space.dtype).reshape(count, -1)
-            for place, env in enumerate(envs):
-                if over[place]:
-                    answers[place, :-3], _ = env.reset()
-                    answers[place, -3:] = 0.0
-                    over[place] = False
-                else:
-                    answers[place, :-3], *ends, _ = env.step(actions[place])
-                    answers[place, -3:] = ends
-                    over[place] = any(ends[1:])
-            connection.sendall(answers)
-
-
-if __name__ == "__main__":
-    serve(sys.argv[1], *map(int, sys.argv[2:]))
+    memory = Memory(block, *sizes)
+    count, _, processes = sizes
+    mine = range(count * number // processes, count * (number + 1) // processes)
+    envs: list[Any] = [gymnasium.make(name, disable_env_checker=True) for _ in mine]
+    kind = envs[0].action_space.dtype
+    over, done, counters = [True] * count, 0, memory.counters
+    while True:
+        while counters[0] == done:
+            os.sched_yield()
+        if counters[0] == END:
+            return
+        for place, env in zip(mine, envs, strict=True):
+            row = memory.results[place]
+            if over[place]:
+                row[:-3], _ = env.reset()
+                row[-3:], over[place] = 0.0, False
+            else:
+                row[:-3], *ends, _ = env.step(memory.actions[place].astype(kind))
+                row[-3:], over[place] = ends, any(ends[1:])
+        done += 1
+        counters[number + 1] = done

@@ -176,8 +176,6 @@ class SpaceFields:
 
     def arrays(self, value: Any) -> dict[str, Array]:
         """Return an element of the space, or a batch of them, as an array for each field."""
-        if self._only is not None:
-            return {self._only: np.asarray(value, self.space.dtype)}
         found = {}
         for name, (path, dtype) in self._places.items():
             found[name] = np.asarray(value_at(value, path), dtype)
@@ -185,14 +183,26 @@ class SpaceFields:
 
     def value(self, arrays: Mapping[str, Any]) -> Any:
         """Return the element of the space that the arrays of its fields stand for."""
-        if self._only is not None and not isinstance(self.space, spaces.Discrete):
-            return arrays[self._only]
 
         def take(path: Path, leaf: Any) -> Any:
             array = arrays[self._names[path]]
             return leaf.dtype.type(array) if isinstance(leaf, spaces.Discrete) else array
 
         return map_leaves(take, self.space)
+
+    def put(self, arrays: Mapping[str, Array], place: int, value: Any) -> None:
+        """Write an element of the space to a place of arrays with a leading axis."""
+        if self._only is not None:
+            arrays[self._only][place] = value
+            return
+        for name, array in self.arrays(value).items():
+            arrays[name][place] = array
+
+    def copy(self, arrays: Mapping[str, Array], place: int) -> Any:
+        """Return the element that stands at a place of arrays with a leading axis."""
+        if self._only is not None:
+            return arrays[self._only][place].copy()
+        return self.value({name: array[place].copy() for name, array in arrays.items()})
 
     def batch(self, arrays: Mapping[str, Any]) -> Any:
         """Return the batch of elements that arrays with a leading axis stand for."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 from gymnasium.vector import AutoresetMode
@@ -39,10 +39,12 @@ class Share:
         self._setup, self._send = setup, send
         self._mode = AutoresetMode(setup["autoreset"])
         mine = slice(self._first, self._first + self._count)
-        self._rewards, self._infos, self._kinds = (
-            array[mine] for array in (batch.rewards, batch.infos, batch.kinds)
+        self._infos = batch.infos[mine]
+        # A memoryview writes a number in half the time that an array takes.
+        self._rewards, self._terminated, self._truncated, self._kinds = (
+            memoryview(cast(Any, array[mine]))
+            for array in (batch.rewards, batch.terminated, batch.truncated, batch.kinds)
         )
-        self._terminated, self._truncated = batch.terminated[mine], batch.truncated[mine]
         self._given, self._seen, self._finals = (
             {name: array[mine] for name, array in arrays.items()}
             for arrays in (batch.actions, batch.observations, batch.finals)
@@ -133,16 +135,14 @@ class Share:
                 )
 
     def _step(self, place: int) -> None:
-        action = {name: array[place].copy() for name, array in self._given.items()}
+        env, action = self._envs[place], self._actions.copy(self._given, place)
         self._steps[place] += 1
-        env = self._envs[place]
-        observation, reward, terminated, truncated, info = env.step(self._actions.value(action))
+        observation, reward, terminated, truncated, info = env.step(action)
         if terminated or truncated:
             if self._mode is AutoresetMode.NEXT_STEP:
                 self._due[place] = _FRESH
             elif self._mode is AutoresetMode.SAME_STEP:
-                for name, value in self._observations.arrays(observation).items():
-                    self._finals[name][place] = value
+                self._observations.put(self._finals, place, observation)
                 observation, reset_info = env.reset()
                 info = {**reset_info, "final_info": info}
         self._put(place, observation, reward, terminated, truncated)
@@ -158,8 +158,7 @@ class Share:
     def _put(
         self, place: int, observation: Any, reward: Any, terminated: Any, truncated: Any
     ) -> None:
-        for name, value in self._observations.arrays(observation).items():
-            self._seen[name][place] = value
+        self._observations.put(self._seen, place, observation)
         self._rewards[place] = reward
         self._terminated[place], self._truncated[place] = terminated, truncated
 

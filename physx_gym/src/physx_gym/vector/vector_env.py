@@ -18,7 +18,7 @@ from gymnasium.vector.utils import batch_space
 from physx_core.config import reference_of
 from physx_core.errors import ActionError, ConfigError, UnknownOptionError, UsageError
 from physx_core.net import Frame, Kind, decode
-from physx_core.processes import anonymous_file
+from physx_core.processes import CLIENT_VARIABLE, anonymous_file
 from physx_core.typing import Array, Batch
 from physx_gym.bridge.make_env import make_env
 from physx_gym.spaces import SpaceFields
@@ -80,8 +80,14 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             ConfigError: If a value is out of range, or values of a space do not have a fixed shape.
             UnknownOptionError: If the autoreset mode is unknown.
+            UsageError: If a worker runs a script without ``if __name__ == "__main__":``.
             PhysxError: If an environment or a process fails.
         """
+        if os.environ.get(CLIENT_VARIABLE):
+            raise UsageError(
+                "A worker imported the script that defines its environment, and the script made a "
+                'vector environment. Put that under  if __name__ == "__main__":'
+            )
         if min(num_envs, num_processes or 1) < 1 or not 1 <= (batch_size or 1) <= num_envs:
             raise ConfigError(
                 "num_envs and num_processes must be at least 1, and batch_size between 1 and "
