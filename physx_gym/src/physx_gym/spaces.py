@@ -206,4 +206,6 @@ class SpaceFields:
 
     def batch(self, arrays: Mapping[str, Any]) -> Any:
         """Return the batch of elements that arrays with a leading axis stand for."""
+        if self._only is not None:
+            return arrays[self._only]
         return map_leaves(lambda path, _: arrays[self._names[path]], self.space)

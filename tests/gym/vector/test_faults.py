@@ -123,6 +123,12 @@ def test_calls_that_make_no_sense_are_refused(nothing_stays_behind):
         for wrong in ([1, 1], [4], [-1], [0.5], [[0]], []):
             with pytest.raises((ConfigError, UsageError)):
                 vector.send(actions(faults=(0,) * len(wrong), pauses=(0,) * len(wrong)), wrong)
+        with pytest.raises(UsageError, match="lock"):
+            vector.set_attr("gift", threading.Lock())
+        with pytest.raises(UsageError, match='"np_random" of the environments cannot be sent'):
+            vector.get_attr("np_random")
+        with pytest.raises(EnvironmentFailedError, match="Instance 1 raised in fly.*no attribute"):
+            vector.call("fly")
         assert vector.call("n") == (0, 1, 1, 0)
         assert vector.recv()[4]["env_id"].tolist() == [1, 2]
         vector.step(actions())

@@ -269,3 +269,18 @@ def test_it_closes_while_a_forked_process_lives():
     finally:
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
+def test_torchrl_takes_it(mode, nothing_stays_behind):
+    libs = pytest.importorskip("torchrl.envs")
+    utils = pytest.importorskip("torchrl.envs.utils")
+    many = gymnasium.make_vec(
+        "physx_gym:physx/Cartpole-v0", 3, num_processes=2, autoreset_mode=mode
+    )
+    env = libs.GymWrapper(many)
+    utils.check_env_specs(env)
+    found = env.rollout(60, break_when_any_done=False)
+    assert found.shape == (3, 60)
+    assert found["next", "done"].any()
+    env.close()

@@ -237,7 +237,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             )
         for name, array in self._action_arrays(actions, len(ids)).items():
             self._batch.actions[name][slice(None) if ids is self._all else ids] = array
-        self._ask(np.sort(ids))
+        self._ask(ids if ids is self._all else np.sort(ids))
 
     def recv(self) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Wait for the results of `batch_size` environments, or of all that owe some, if fewer.
@@ -269,18 +269,19 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         """Have environments step."""
         self._owes[ids] = True
         workers = self._open()
-        for number, (start, stop) in enumerate(pairwise(self._starts)):
-            mine = ids[np.searchsorted(ids, start) : np.searchsorted(ids, stop)]
-            if len(mine):
+        ends = ids.searchsorted(self._starts).tolist()  # where each worker's environments end
+        for number, (first, last) in enumerate(pairwise(ends)):
+            if first < last:
+                mine = ids[first:last]
                 self._owed[number].extend(mine.tolist())
-                workers.ask(number, mine - start)
+                workers.ask(number, mine - self._starts[number])
 
     def _take(self, count: int) -> Array:
         """Wait for `count` results, or all that are owed; return their environments, in order."""
         workers, owed = self._open(), [len(each) for each in self._owed]
         count = min(count, sum(owed))
         done = workers.wait(sum(workers.asked) - sum(owed) + count)
-        if count == sum(owed):
+        if count == sum(owed):  # no need to know whose come first
             taken = np.flatnonzero(self._owes)
             for each in self._owed:
                 each.clear()
@@ -304,7 +305,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         if (
             ids.ndim != 1
             or ids.dtype.kind not in "iu"
-            or len(np.unique(ids)) < len(ids)
+            or len(set(ids.tolist())) < len(ids)
             or not ((ids >= 0) & (ids < self.num_envs)).all()
         ):
             raise ConfigError(

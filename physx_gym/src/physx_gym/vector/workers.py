@@ -36,10 +36,11 @@ _BELL = pack(Kind.ACTIONS)
 _TICK = 0.1
 _LAST_WORDS_TIME = 0.3
 _EXIT_TIME = 5.0
+_GRACE = 0.5
 
 
 class Workers:
-    """Processes that execute the entries of their queues; an error ends all of them.
+    """Processes that execute the entries of their queues; one that fails ends all of them.
 
     Attributes:
         is_open: Whether the processes run.
@@ -72,14 +73,18 @@ class Workers:
         self.messages: list[tuple[int, Frame]] = []
         batch.awaited[0] = NEVER
         path = [str(Path(entry).resolve()) for entry in sys.path]
+        shared = {**setup, "path": path}
+        messages = [
+            _message({**shared, "number": n}, "env_kwargs") for n in range(len(self._shares))
+        ]
         try:
             for number in range(len(self._shares)):
                 self._links.append(link := _Link(number, file))
                 self._by_file[link.socket.fileno()] = number
                 self._poll.register(link.socket, select.POLLIN)
-            for number in range(len(self._shares)):
+            for number, message in enumerate(messages):
                 self.ask(number, [COMMAND])  # to make the environments
-                self._send(number, {**setup, "number": number, "path": path})
+                self._send(number, message)
             self.wait(sum(self.asked))
         except BaseException:
             self.close(orderly=False)
@@ -109,18 +114,28 @@ class Workers:
 
         Returns:
             The answer of each worker; None if it has none.
+
+        Raises:
+            UsageError: If the arguments cannot be sent.
         """
+        messages = [_message({"name": name, "arguments": each}, name) for each in arguments]
         self.wait(sum(self.asked))  # a worker that sends something may not receive
-        for number, each in enumerate(arguments):
+        for number, message in enumerate(messages):
             self.ask(number, [COMMAND])
-            self._send(number, {"name": name, "arguments": each})
-        self.wait(sum(self.asked))
-        answers = {n: decode(f.payload) for n, f in self.messages if f.kind is Kind.ANSWER}
-        self.messages = [(n, f) for n, f in self.messages if f.kind is not Kind.ANSWER]
+            self._send(number, message)
+        try:
+            self.wait(sum(self.asked), is_step=False)
+        finally:
+            answers = {n: decode(f.payload) for n, f in self.messages if f.kind is Kind.ANSWER}
+            self.messages = [(n, f) for n, f in self.messages if f.kind is not Kind.ANSWER]
         return [answers.get(number) for number in range(len(arguments))]
 
-    def wait(self, entries: int) -> list[int]:
+    def wait(self, entries: int, *, is_step: bool = True) -> list[int]:
         """Wait until the workers together have finished a number of entries since the start.
+
+        Args:
+            entries: The number.
+            is_step: Whether an environment that raises ends the processes.
 
         Returns:
             For each worker, how many it has finished.
@@ -148,21 +163,26 @@ class Workers:
                 if not self._receive(number) and done[number] < self.asked[number]:
                     self._fail(self._end_of(number))
         if self._errors:
-            self._fail(self._errors[min(self._errors)])
+            error = self._errors[min(self._errors)]
+            self._errors.clear()
+            if is_step:
+                self._fail(error)
+            raise error
         return done
 
     def close(self, *, orderly: bool) -> None:
         """End the processes; none is left when this returns.
 
         Args:
-            orderly: Let them close their environments, and raise what these raise.
+            orderly: Wait until they have closed their environments, and raise what these raise;
+                otherwise they get a moment for it.
         """
         if not self.is_open:
             return
         self.is_open = False
         try:
             if os.getpid() == self._owner:  # a process forked from it leaves them alone
-                self._end(self._timeout if orderly else 0.0)
+                self._end(orderly)
         finally:
             for link in self._links:
                 link.socket.close()
@@ -203,18 +223,17 @@ class Workers:
             return True
         return False
 
-    def _send(self, number: int, value: Mapping[str, Any]) -> None:
-        """Send a worker a command, for which it waits."""
-        link, message = self._links[number], pack(Kind.REQUEST, encode(value, "The arguments"))
+    def _send(self, number: int, message: bytes) -> None:
+        """Send a worker a message for which it waits."""
+        link = self._links[number]
+        link.socket.settimeout(self._timeout)
         try:
-            link.socket.settimeout(self._timeout)
             link.socket.sendall(message)
         except TimeoutError:
             self._fail(self._silence_of(number))
         except OSError:
             self._fail(self._end_of(number))
-        finally:
-            link.socket.setblocking(False)
+        link.socket.setblocking(False)
 
     # Ends -----------------------------------------------------------------------------------
 
@@ -222,21 +241,23 @@ class Workers:
         self.close(orderly=False)
         raise error
 
-    def _end(self, patience: float) -> None:
-        for number, link in enumerate(self._links):
-            self._batch.asked[number] = END
-            link.ring()
-        running, until = set(range(len(self._links))), time.monotonic() + patience
-        while running and time.monotonic() < until:
-            for file, _ in self._poll.poll(1000 * _TICK):
-                if not self._receive(number := self._by_file[file]):
-                    self._poll.unregister(file)
-                    running.discard(number)
+    def _end(self, orderly: bool) -> None:
+        """Have the processes end, and kill those that do not."""
+        running = set(range(len(self._links)))
+        until = time.monotonic() + (self._timeout if orderly else _GRACE)
         try:
-            if running and patience:
+            for number, link in enumerate(self._links):
+                self._batch.asked[number] = END
+                link.ring()
+            while running and time.monotonic() < until:
+                for file, _ in self._poll.poll(1000 * _TICK):
+                    if not self._receive(number := self._by_file[file]):
+                        self._poll.unregister(file)
+                        running.discard(number)
+            if running and orderly:
                 raise self._silence_of(min(running))
             for link in self._links:
-                link.process.wait(_EXIT_TIME if patience else 0.0)
+                link.process.wait(_EXIT_TIME if orderly else 0.0)
         finally:
             for link in self._links:
                 link.process.send_signal(signal.SIGTERM)
@@ -275,6 +296,10 @@ class Workers:
             return f"while it waited, with {mine}"
         entry = int(self._batch.queues[number][done % self._batch.capacity])
         return f"in a call of {mine}" if entry == COMMAND else f"in environment {first + entry}"
+
+
+def _message(value: Mapping[str, Any], what: str) -> bytes:
+    return pack(Kind.REQUEST, encode(value, what))
 
 
 class _Link:
