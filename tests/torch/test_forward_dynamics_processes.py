@@ -133,7 +133,7 @@ def test_a_process_that_is_killed_is_an_error_and_replaced(build, draw):
     started = workers()
     killed = started[0]
     os.kill(killed, signal.SIGKILL)
-    with pytest.raises(SimulationError, match=rf"pid {killed}.* signal 9 \(Killed\)"):
+    with pytest.raises(SimulationError, match=rf"pid {killed}.* signal 9 \(SIGKILL\)"):
         found.sum().backward()
     assert not any(map(there, started)) and not shared_memory()
     assert torch.equal(dynamics(*states), ForwardDynamics(simulation)(*states))
