@@ -132,8 +132,9 @@ def test_calls_that_make_no_sense_are_refused(nothing_stays_behind):
         assert vector.call("n") == (0, 1, 1, 0)
         assert vector.recv()[4]["env_id"].tolist() == [1, 2]
         vector.step(actions())
-    with pytest.raises(ConfigError, match="batch_size between 1 and"):
-        ParallelVectorEnv("CartPole-v1", 2, batch_size=3)
+    for wrong in ({"batch_size": 3}, {"batch_size": 0}, {"num_processes": 0}):
+        with pytest.raises(ConfigError, match="batch_size between 1 and"):
+            ParallelVectorEnv("CartPole-v1", 2, **wrong)
 
 
 def test_large_values_travel_both_ways(nothing_stays_behind):

@@ -25,6 +25,7 @@ from .liveness import poll_peer as poll_peer
 from .liveness import prepare_connection as prepare_connection
 from .remote_errors import decode_error as decode_error
 from .remote_errors import encode_error as encode_error
+from .spin_wait import count_cores as count_cores
 from .spin_wait import fence as fence
 from .spin_wait import has_core_for_each as has_core_for_each
 from .spin_wait import spin_until as spin_until

@@ -31,11 +31,16 @@ def fence() -> None:
         yield_core()  # a scheduler's is one everywhere
 
 
+def count_cores() -> int:
+    """Return how many processor cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def has_core_for_each(clients: int) -> bool:
     """Return whether spinning takes no core from a client that could compute."""
-    if hasattr(os, "sched_getaffinity"):
-        return clients <= len(os.sched_getaffinity(0))
-    return clients <= (os.cpu_count() or 1)
+    return clients <= count_cores()
 
 
 def spin_until(look: Callable[[], Found], seconds: float) -> Found:

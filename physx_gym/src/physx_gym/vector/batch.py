@@ -35,8 +35,8 @@ class SharedBatch:
 
     The rows of an environment belong to its worker from when it is asked for a step until that is
     done, and otherwise to the process with the vector environment. A queue is a ring: the entry of
-    number n, counted from 0 since the start, stands at ``n % capacity``. It is the number of an
-    environment to step, or `COMMAND`.
+    number n, counted from 0 since the start, stands at ``n % capacity``. It is the place of an
+    environment among the worker's own, which is to be stepped, or `COMMAND`.
 
     Attributes:
         actions: For each field of an action, an array of shape (environments, *shape).

@@ -27,7 +27,7 @@ class InfoKind(enum.IntEnum):
     PACKED = -1
     """An encoded value."""
     SENT = -2
-    """The worker sent it as a message, as it did not fit."""
+    """The worker sent it as a message: it did not fit, or something in it cannot be sent."""
 
 
 _CODES: dict[type[Any], str] = {

@@ -173,12 +173,8 @@ class Share:
             plain = {str(name): value for name, value in info.items()}
             if self._learn(plain) and self._layout is not None and self._layout.put(plain, target):
                 self._kinds[place] = self._layout_number
-                return
-            encoded = self._encode(plain)
-            self._kinds[place] = InfoKind.PACKED
-            if not put_packed(target, encoded):
-                self._kinds[place] = InfoKind.SENT
-                self._send(pack(Kind.NOTES, encoded, self._first + place))
+            else:
+                self._pack_info(place, plain)
 
     def _learn(self, info: Mapping[str, Any]) -> bool:
         """Find the layout of an info, and send it if it is new; return whether it has one."""
@@ -194,17 +190,22 @@ class Share:
         self._layout, self._layout_number = layout, number
         return True
 
-    def _encode(self, info: Mapping[str, Any]) -> bytes:
-        """Return an info as bytes, without the entries that cannot be sent."""
+    def _pack_info(self, place: int, info: dict[str, Any]) -> None:
+        """Write an info of any kind; send it, if it does not fit or there is more to say."""
+        left_out: list[str] = []
         try:
-            return encode(info, "infos")
+            encoded = encode(info)
         except UsageError:
             sent = {name: value for name, value in info.items() if _is_sendable(value)}
-            new = info.keys() - sent.keys() - self._left_out
-            if new:
-                self._left_out |= new
-                self._send(pack(Kind.REFUSAL, encode(sorted(new))))
-            return encode(sent, "infos")
+            left_out = sorted(info.keys() - sent.keys() - self._left_out)
+            self._left_out |= set(left_out)
+            info, encoded = sent, encode(sent)
+        if not left_out and put_packed(self._infos[place], encoded):
+            self._kinds[place] = InfoKind.PACKED
+        else:
+            self._kinds[place] = InfoKind.SENT
+            message = encode({"info": info, "left_out": left_out})
+            self._send(pack(Kind.NOTES, message, self._first + place))
 
 
 def _call(

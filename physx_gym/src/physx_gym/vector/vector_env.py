@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 
 from physx_core.config import reference_of
 from physx_core.errors import ActionError, ConfigError, UnknownOptionError, UsageError
-from physx_core.net import Frame, Kind, decode
+from physx_core.net import Frame, Kind, count_cores, decode
 from physx_core.processes import CLIENT_VARIABLE, anonymous_file
 from physx_core.typing import Array, Batch
 from physx_gym.bridge.make_env import make_env
@@ -88,7 +88,9 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
                 "A worker imported the script that defines its environment, and the script made a "
                 'vector environment. Put that under  if __name__ == "__main__":'
             )
-        if min(num_envs, num_processes or 1) < 1 or not 1 <= (batch_size or 1) <= num_envs:
+        workers = min(count_cores() if num_processes is None else num_processes, num_envs)
+        batch_size = num_envs if batch_size is None else batch_size
+        if workers < 1 or not 1 <= batch_size <= num_envs:
             raise ConfigError(
                 "num_envs and num_processes must be at least 1, and batch_size between 1 and "
                 f"num_envs: {num_envs}, {num_processes} and {batch_size} were given."
@@ -99,11 +101,10 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         if not isinstance(autoreset_mode, AutoresetMode) and autoreset_mode not in modes:
             raise UnknownOptionError("autoreset_mode", [str(autoreset_mode)], modes)
         name, options = reference_of(env), dict(env_kwargs or {})
-        self.num_envs, self.batch_size = num_envs, batch_size or num_envs
+        self.num_envs, self.batch_size = num_envs, batch_size
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self._copy = copy
         self._describe(name, options)
-        workers = min(num_processes or len(os.sched_getaffinity(0)), num_envs)
         starts = [num_envs * number // workers for number in range(workers + 1)]
         self._starts, shares = starts, [stop - start for start, stop in pairwise(starts)]
         self._worker_of = np.repeat(np.arange(workers), shares).tolist()
@@ -451,10 +452,9 @@ class _Infos:
                 known = [each[number] for each in self._layouts if number in each]
                 differ = any(other.names != layout.names for other in known)
                 self._common[number] = None if differ else layout
-            elif frame.kind is Kind.NOTES:
-                self._sent[frame.number] = value
             else:
-                self._warn(value)
+                self._sent[frame.number] = value["info"]
+                self._warn(value["left_out"])
 
     def common(self, kind: int) -> InfoLayout | None:
         """Return the layout of a number, if all workers that told it mean the same."""
