@@ -148,17 +148,17 @@ class Arrival(RuleBasedStateMachine):
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-@pytest.mark.parametrize("processes", [2, pytest.param(5, marks=pytest.mark.faults)])
+@pytest.mark.parametrize(
+    ("processes", "examples"), [(2, 15), pytest.param(5, 300, marks=pytest.mark.faults)]
+)
 def test_each_goes_its_way_under_any_order_of_calls_and_arrivals(
-    mode, processes, request, nothing_stays_behind
+    mode, processes, examples, nothing_stays_behind
 ):
-    is_campaign = "faults" in (request.config.option.markexpr or "") and processes == 5
     vector = ParallelVectorEnv(
         ENV, COUNT, num_processes=processes, batch_size=BATCH, autoreset_mode=mode
     )
     machine = type("Arrival", (Arrival,), {"vector": vector})
     with contextlib.closing(vector):
-        examples = 400 if is_campaign else 15
         run_state_machine_as_test(
             machine,
             settings=settings(max_examples=examples, stateful_step_count=25, derandomize=True),
