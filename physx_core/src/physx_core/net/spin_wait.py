@@ -16,19 +16,25 @@ yield_core: Callable[[], None] = getattr(os, "sched_yield", lambda: None)
 
 
 _LOCK = threading.Lock()
-_LOCKING_ORDERS = platform.machine() in ("x86_64", "AMD64", "i386", "i686")
+_IS_X86 = platform.machine() in ("x86_64", "AMD64", "i386", "i686")
+
+
+def order() -> None:
+    """Keep writes to shared memory before this call before those after it, and reads as well."""
+    if not _IS_X86:  # whose processors do so anyway
+        yield_core()
 
 
 def fence() -> None:
-    """Have other cores see what was written to shared memory before this call before what follows.
+    """Have other processes see what was written before this call before anything is read after it.
 
-    Nor are values that are read after it older than it.
+    It orders writes and reads as `order` does, too.
     """
-    if _LOCKING_ORDERS:
-        with _LOCK:  # its atomic instruction is a full barrier there
+    if _IS_X86:
+        with _LOCK:  # its atomic instruction is a full barrier
             pass
     else:
-        yield_core()  # a scheduler's is one everywhere
+        yield_core()  # a scheduler passes a full barrier
 
 
 def count_cores() -> int:

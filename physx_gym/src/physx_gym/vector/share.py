@@ -19,6 +19,7 @@ from physx_gym.vector.infos import InfoKind, InfoLayout, put_packed
 
 _MOST_LAYOUTS = 100
 _FRESH = (None, None)
+_NO_INFO = int(InfoKind.NONE)
 
 
 class Share:
@@ -66,10 +67,14 @@ class Share:
 
     def step(self, place: int) -> None:
         """Step an environment; or reset it, if that is due."""
-        if self._due[place] is None:
-            self._attempt("step", place, self._step)
-        else:
-            self._attempt("reset", place, self._reset)
+        is_due = self._due[place] is not None
+        try:
+            if is_due:
+                self._reset(place)
+            else:
+                self._step(place)
+        except Exception as error:
+            self._report(error, "reset" if is_due else "step", place)
 
     def execute(self, command: Mapping[str, Any]) -> None:
         """Execute a command: prepare resets, call a method of each environment, or set a value."""
@@ -105,12 +110,15 @@ class Share:
         try:
             function(place)
         except Exception as error:
-            env = self._first + place
-            known = error if isinstance(error, PhysxError) else self._wrap(error, method, place)
-            known.add_note(f"in {method}() of environment {env} of the vector, counted from 0")
-            self._send(pack(Kind.ERROR, encode_error(known), env))
+            self._report(error, method, place)
             return False
         return True
+
+    def _report(self, error: Exception, method: str, place: int) -> None:
+        env = self._first + place
+        known = error if isinstance(error, PhysxError) else self._wrap(error, method, place)
+        known.add_note(f"in {method}() of environment {env} of the vector, counted from 0")
+        self._send(pack(Kind.ERROR, encode_error(known), env))
 
     def _wrap(self, error: Exception, method: str, place: int) -> EnvironmentFailedError:
         step = self._steps[place] - 1 if method == "step" else -1
@@ -164,10 +172,11 @@ class Share:
 
     def _put_info(self, place: int, info: Mapping[str, Any]) -> None:
         """Write an info; entries that cannot be sent are only named."""
-        target: Array = self._infos[place]
         if not info:
-            self._kinds[place] = InfoKind.NONE
-        elif self._layout is not None and self._layout.put(info, target):
+            self._kinds[place] = _NO_INFO
+            return
+        target: Array = self._infos[place]
+        if self._layout is not None and self._layout.put(info, target):
             self._kinds[place] = self._layout_number
         else:
             plain = {str(name): value for name, value in info.items()}

@@ -25,6 +25,7 @@ from physx_core.net import (
     decode,
     fence,
     has_core_for_each,
+    order,
     pack,
     spin_until,
 )
@@ -78,28 +79,35 @@ class Worker:
 
     def _next(self) -> int | None:
         """Wait for the next entry, and return it; None at the end."""
+        asked = self._batch.asked[self._number]
+        if asked == self._done:
+            asked = self._wait()
+        if asked == END:
+            return None
+        order()
+        return int(self._queue[self._done % self._batch.capacity])
+
+    def _wait(self) -> int:
+        """Wait until there are entries to execute; return how many there have been in all."""
         asked, number, done = self._batch.asked, self._number, self._done
 
         def has_more() -> bool:
             return bool(asked[number] != done)
 
-        if not (has_more() or (self._spins and spin_until(has_more, SPIN_TIME))):
+        if not (self._spins and spin_until(has_more, SPIN_TIME)):
             self._batch.idle[number] = 1
             fence()
             while not has_more():
                 if self._poll.poll(_LOOK_EVERY):
                     self._receive()
             self._batch.idle[number] = 0
-        if asked[number] == END:
-            return None
-        fence()
-        return self._queue[done % self._batch.capacity]
+        return int(asked[number])
 
     def _finish(self) -> None:
         """Say that an entry is done."""
         batch = self._batch
         self._done += 1
-        fence()
+        order()
         batch.done[self._number] = self._done
         fence()
         if sum(batch.done) >= batch.awaited[0]:

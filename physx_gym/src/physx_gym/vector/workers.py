@@ -25,6 +25,7 @@ from physx_core.net import (
     encode,
     fence,
     has_core_for_each,
+    order,
     pack,
     spin_until,
 )
@@ -99,7 +100,7 @@ class Workers:
         if fitting < count:
             queue[: count - fitting] = entries[fitting:]
         self.asked[number] += count
-        fence()
+        order()
         batch.asked[number] = self.asked[number]
         fence()
         if batch.idle[number]:
@@ -157,7 +158,7 @@ class Workers:
             finally:
                 batch.awaited[0] = NEVER
         done = list(batch.done)
-        fence()
+        order()
         if sum(batch.sent) > self._received:
             for number in range(len(self._links)):
                 if not self._receive(number) and done[number] < self.asked[number]:
