@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import eigenpy
 import numpy as np
 
 from physx_core.typing import Vector
@@ -47,84 +48,69 @@ class ContactProblem:
         diagonal = (1 + _REGULARIZATION) * response.diagonal()
         largest = float(diagonal.max(initial=0.0)) or 1.0
         stuck = diagonal <= _STUCK * largest
+        if stuck.any():
+            diagonal, free = np.where(stuck, largest, diagonal), np.where(stuck, 0.0, free)
         self.matrix = response.copy()
-        self.matrix.flat[:: len(free) + 1] = np.where(stuck, largest, diagonal)
-        self.free = np.where(stuck, 0.0, free)
+        self.matrix.flat[:: len(free) + 1] = diagonal
+        self.free = free
         self.friction, self.least, self.most = friction, least, most
-        steps = 1 / self.matrix.diagonal()
+        self._unit = np.eye(len(free))
         self._size = 3 * len(friction)
-        blocks = steps[: self._size].reshape(-1, 3)
-        blocks[:] = blocks.min(axis=1, keepdims=True)
-        self._steps = steps
-        self._scaled = steps[:, None] * self.matrix
+        blocks = diagonal[: self._size].reshape(-1, 3)
+        blocks[:] = blocks.max(axis=1, keepdims=True)
+        self._rates = diagonal
+        self._shifted = self.matrix / diagonal[:, None] - self._unit
+        self._shift = free / diagonal
         self._coefficients = friction.tolist()
+        self._bounds = list(zip(least.tolist(), most.tolist(), strict=True))
         self.accuracy = _ACCURACY * max(1.0, float(np.abs(free).max()))
 
     def error(self, impulses: Vector) -> float:
         """Return the distance of impulses from a solution, as a velocity."""
-        moved = impulses - self._steps * (self.matrix @ impulses + self.free)
-        return self._error(impulses - self._project(moved))
+        projected, _ = self._project(-(self._shifted @ impulses + self._shift))
+        return self._error(projected - impulses)
 
     def newton(self, impulses: Vector, most: int) -> tuple[Vector, float]:
         """Return the best impulses of at most `most` steps from given ones, and their error."""
         best, least_error = impulses, math.inf
         for _ in range(most):
-            moved = impulses - self._steps * (self.matrix @ impulses + self.free)
-            change = self._project(moved)
-            change -= impulses
+            # A step against the velocities, scaled row by row.
+            projected, slope = self._project(-(self._shifted @ impulses + self._shift))
+            change = projected - impulses
             error = self._error(change)
             if error < least_error:
-                best, least_error = impulses, error
+                best, least_error = projected, error
                 if error < self.accuracy:
                     break
-            try:
-                impulses = impulses + np.linalg.solve(self._slope(moved), change)
-            except np.linalg.LinAlgError:
+            elif not error < math.inf:
                 break
+            lower_upper = eigenpy.PartialPivLU(self._unit + slope @ self._shifted)
+            impulses = impulses + lower_upper.solve(change)
         return best, least_error
 
     def _error(self, change: Vector) -> float:
-        return float(np.abs(change / self._steps).max())
+        return float((abs(change) * self._rates).max())
 
-    def _project(self, moved: Vector) -> Vector:
-        """Return impulses, shape (3 k + m,), projected onto cones and bounds."""
-        found = moved.copy()
-        values = moved[: self._size].tolist()
-        for place, friction in zip(range(0, self._size, 3), self._coefficients, strict=True):
+    def _project(self, moved: Vector) -> tuple[Vector, Vector]:
+        """Return impulses, shape (n,), projected onto cones and bounds, and the derivative (n, n)."""
+        slope, values, place = self._unit.copy(), moved.tolist(), 0
+        for friction in self._coefficients:
             x, y, normal = values[place : place + 3]
             if normal <= 0:
-                found[place : place + 3] = 0.0
-                continue
-            across = math.hypot(x, y)
-            if across > friction * normal:
-                found[place : place + 2] *= friction * normal / across
-        if len(self.least):
-            found[self._size :] = np.clip(moved[self._size :], self.least, self.most)
-        return found
-
-    def _slope(self, moved: Vector) -> Vector:
-        """Return the derivative of impulses minus their projections `_project`, shape (n, n)."""
-        slope, unit = self._scaled.copy(), np.eye(len(moved))
-        values = moved[: self._size].tolist()
-        for place, friction in zip(range(0, self._size, 3), self._coefficients, strict=True):
-            x, y, normal = values[place : place + 3]
-            rows = slice(place, place + 3)
-            if normal <= 0:
-                slope[rows] = unit[rows]
-                continue
-            across = math.hypot(x, y)
-            if across > friction * normal:
-                x, y, share = x / across, y / across, friction * normal / across
-                turn = np.array(
-                    [
-                        [share * y * y, -share * x * y, friction * x],
-                        [-share * x * y, share * x * x, friction * y],
-                        [0.0, 0.0, 1.0],
-                    ]
+                values[place : place + 3] = 0.0, 0.0, 0.0
+                slope[place : place + 3] = 0.0
+            elif (across := math.hypot(x, y)) > (bound := friction * normal):
+                share, x, y = bound / across, x / across, y / across
+                values[place], values[place + 1] = bound * x, bound * y
+                slope[place : place + 2, place : place + 3] = (
+                    (share * y * y, -share * x * y, friction * x),
+                    (-share * x * y, share * x * x, friction * y),
                 )
-                slope[rows] = unit[rows] + turn @ (slope[rows] - unit[rows])
-        if len(self.least):
-            rest = moved[self._size :]
-            fixed = self._size + np.flatnonzero((rest <= self.least) | (rest >= self.most))
-            slope[fixed] = unit[fixed]
-        return slope
+            place += 3
+        for least, most in self._bounds:
+            value = values[place]
+            if value <= least or value >= most:
+                values[place] = least if value <= least else most
+                slope[place, place] = 0.0
+            place += 1
+        return np.array(values), slope

@@ -47,6 +47,7 @@ class ContactPoints:
     Attributes:
         links: Index of each point's link in the robot, shape (k,).
         statics: Index of the static thing that it touches, shape (k,).
+        numbers: Number of each, by which it is found again in the next step, shape (k,).
         points: In the world frame, in m, shape (k, 3).
         axes: Two tangents and the outward normal of each, as rows, shape (k, 3, 3).
         gaps: Distances, negative inside, in m, shape (k,).
@@ -57,6 +58,7 @@ class ContactPoints:
 
     links: Indices
     statics: Indices
+    numbers: Indices
     points: Vector
     axes: Vector
     gaps: Vector
@@ -87,6 +89,7 @@ class _NearPoints:
     """Points near a surface: as `ContactPoints`, with their rows in the finder and their radii."""
 
     statics: Indices
+    numbers: Indices
     rows: Indices
     gaps: Vector
     normals: Vector
@@ -99,6 +102,7 @@ class _NearPoints:
         cls,
         place: int,
         surface: Surface,
+        numbers: Indices,
         rows: Indices,
         gaps: Vector,
         normals: Vector,
@@ -110,7 +114,7 @@ class _NearPoints:
             axes = np.ones((len(rows), 1, 1)) * np.array(axes_of(*surface.normal.tolist()))
         else:
             axes = np.array([axes_of(*normal) for normal in normals.tolist()])
-        return cls(np.full(len(rows), place), rows, gaps, normals, axes, points, radii)
+        return cls(np.full(len(rows), place), numbers, rows, gaps, normals, axes, points, radii)
 
 
 class ContactFinder:
@@ -188,6 +192,10 @@ class ContactFinder:
         """Return whether anything can ever touch."""
         return len(self._joints) > 0
 
+    def __len__(self) -> int:
+        """Return an upper bound of `ContactPoints.numbers`."""
+        return 3 * len(self._links) * len(self._friction)
+
     def find(self, q: Vector, v: Vector, period: float) -> ContactPoints | None:
         """Return the points that touch, or may within the next step; None if there are none.
 
@@ -223,7 +231,7 @@ class ContactFinder:
                 radii = self._radii[rows]
                 gaps, normals = gaps[rows] - radii, normals[rows]
                 found.append(
-                    _NearPoints.at(place, surface, rows, gaps, normals, points[rows], radii)
+                    _NearPoints.at(place, surface, rows, rows, gaps, normals, points[rows], radii)
                 )
         return self._touching(motions, found) if found else None
 
@@ -238,13 +246,15 @@ class ContactFinder:
     ) -> list[_NearPoints]:
         """Return the points of rims that touch, or may within the next step."""
         rows, around = np.repeat(rims, 3), self._rims(rims, turns, points)
+        numbers = 3 * rows + np.tile([0, 1, 2], len(rims))
         gaps, normals = surface.distances(around)
         steps = _displacements(twists[self._joints[rows]], around)
         close = np.minimum(gaps, gaps + np.einsum("ij,ij->i", normals, steps)) < _MARGIN
         if not close.any():
             return []
         rows, gaps, normals, around = rows[close], gaps[close], normals[close], around[close]
-        return [_NearPoints.at(place, surface, rows, gaps, normals, around, np.zeros(len(rows)))]
+        numbers, radii = numbers[close], np.zeros(len(rows))
+        return [_NearPoints.at(place, surface, numbers, rows, gaps, normals, around, radii)]
 
     def _rims(self, rows: Indices, turns: Vector, points: Vector) -> Vector:
         """Return three points of each rim, one of them the deepest, shape (3 rows, 3)."""
@@ -268,6 +278,7 @@ class ContactFinder:
         return ContactPoints(
             links=self._links[rows],
             statics=statics,
+            numbers=3 * len(self._links) * statics + _concatenate(found, "numbers"),
             points=points,
             axes=axes,
             gaps=gaps,

@@ -83,6 +83,8 @@ class PinocchioRobot(RobotEngine):
         self._smooth = bool(resists.damping.any() or resists.stiffness.any())
         self._touching: ContactPoints | None = None
         self._impulses = np.zeros(0)
+        # Impulses of the last step, with which the next one begins.
+        self._warm = np.zeros((len(self._contacts), 3)), np.zeros(len(self._joints.joints))
         # Pinocchio computes the upper half of the inverse mass matrix.
         self._upper = np.triu(np.ones((self.nv, self.nv)), 1) + 0.5 * np.eye(self.nv)
         self._unit = np.eye(self.nv)
@@ -218,16 +220,25 @@ class PinocchioRobot(RobotEngine):
         if len(rows):
             jacobian = np.concatenate([jacobian, self._unit[joints.joints[rows] + self.base]])
             wanted = np.concatenate([wanted, aims[rows]])
-        spread = inverse @ jacobian.T
+        spread, (of_points, of_rows) = inverse @ jacobian.T, self._warm
         impulses = self._solver.solve(
             jacobian @ spread,
             jacobian @ v - wanted,
             touching.friction,
             joints.least[rows],
             joints.most[rows],
+            np.concatenate([of_points[touching.numbers].ravel(), of_rows[rows]]),
         )
+        self.forget()
         self._impulses = impulses[: 3 * len(touching.gaps)]
+        of_points[touching.numbers] = self._impulses.reshape(-1, 3)
+        of_rows[rows] = impulses[len(self._impulses) :]
         return v + spread @ impulses
+
+    def forget(self) -> None:
+        """Forget the impulses of the last step."""
+        for impulses in self._warm:
+            impulses.fill(0.0)
 
     def _step_rk4(self) -> None:
         """Simulate one step with the classic Runge-Kutta method of fourth order."""

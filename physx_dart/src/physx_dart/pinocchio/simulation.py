@@ -99,6 +99,11 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
         for robot in self._robots:
             robot.run(n)
 
+    def forget(self) -> None:
+        """Make the state alone determine what follows: forget the impulses of the last step."""
+        for robot in self._robots:
+            robot.forget()
+
     def read_contacts(self) -> Records:
         """Return the contacts of the last physics step."""
         first, statics = 0, len(self.layout.bodies)

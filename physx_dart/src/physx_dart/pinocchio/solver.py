@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -26,9 +27,10 @@ _ENDLESS = 1e6
 class ImpulseSolver:
     """Solves for the impulses of points with friction cones, and of rows with bounds.
 
-    Newton's method mostly finds them exactly in a few steps. If it cycles, it continues from the
-    results of Pinocchio's solvers, one after the other: projected Gauss-Seidel fails for impacts of
-    light links on heavy ones and for jammed joints, ADMM for some problems that the former solves.
+    Newton's method mostly finds them exactly in a few steps, from the impulses of the last step in
+    one or two. If it cycles, it continues from the results of Pinocchio's solvers, one after the
+    other: projected Gauss-Seidel fails for impacts of light links on heavy ones and for jammed
+    joints, ADMM for some problems that the former solves.
 
     Args:
         name: The solver to try first: ``"pgs"`` (projected Gauss-Seidel) or ``"admm"``.
@@ -55,7 +57,13 @@ class ImpulseSolver:
         self._chains: dict[int, Any] = {}
 
     def solve(
-        self, response: Vector, free: Vector, friction: Vector, least: Vector, most: Vector
+        self,
+        response: Vector,
+        free: Vector,
+        friction: Vector,
+        least: Vector,
+        most: Vector,
+        guess: Vector | None = None,
     ) -> Vector:
         """Return the impulses, shape (3 k + m,).
 
@@ -66,12 +74,17 @@ class ImpulseSolver:
             friction: Coefficients of the points, shape (k,).
             least: Smallest impulses of the rows, shape (m,); rows with one bound come first.
             most: Largest impulses, likewise.
+            guess: Impulses to begin with, shape (3 k + m,).
         """
-        if not np.isfinite(free).all() or not np.isfinite(response).all():
+        if not math.isfinite(free.sum() + response.sum()):
             raise SimulationError("The state is no longer finite. Use a smaller period.")
         problem = ContactProblem(response, free, friction, least, most)
-        best, least_error = problem.newton(np.zeros(len(free)), _NEWTON_STEPS)
         good = problem.accuracy
+        if guess is not None and guess.any():
+            best, least_error = problem.newton(guess, _NEWTON_STEPS)
+            if least_error < good:
+                return best
+        best, least_error = problem.newton(np.zeros(len(free)), _NEWTON_STEPS)
         for name in self._order:
             if least_error < good:
                 break
