@@ -36,7 +36,7 @@ _SOLVERS = ("nsgs", "fbf", "dantzig")
 _ISOTROPIC = ("nsgs", "fbf")
 _STATELESS = ("dart", "dantzig")
 """The detector and the solver that keep nothing between steps."""
-_SWEEPS, _TOLERANCE = 20, 1e-6
+_SWEEPS, _TOLERANCE = 10, 1e-6
 """Most iterations of ``nsgs`` in a step, and the error in m/s that ends them. As it starts from the
 impulses of the last step, more of them only sharpen impacts (docs/contacts.md)."""
 _RAYS = ("dart", "bullet")

@@ -13,7 +13,7 @@ _REGULARIZATION = 1e-9
 """Relative addition to the diagonal, as in DART's solver."""
 _STUCK = 1e-14
 """Response, relative to the largest, below which nothing can move in a direction."""
-_ACCURACY = 1e-11
+_ACCURACY = 1e-9
 """Of velocities, in m/s, for free velocities of 1 m/s or less."""
 
 

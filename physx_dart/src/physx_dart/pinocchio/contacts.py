@@ -6,7 +6,6 @@ points of each rim, one of them the deepest; edges and faces do not collide with
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +18,7 @@ from physx_core.errors import FeatureNotSupportedError
 from physx_core.typing import Vector
 from physx_dart.models.parts import Mover, Static
 from physx_dart.models.shapes import CollisionShape
-from physx_dart.pinocchio.surfaces import Plane, Surface, surfaces_of
+from physx_dart.pinocchio.surfaces import Plane, surfaces_of
 
 _MARGIN = 1e-4
 """Distance, in m, below which a point counts as touching."""
@@ -33,14 +32,15 @@ _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z i
 _THIRDS = np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
 """Cosines and sines of three directions around a rim."""
 _CROSS = np.zeros((3, 9))
-_CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = 1.0, -1.0, 1.0, -1.0, 1.0, -1.0
-"""Maps a vector to its cross-product matrix, flattened by rows."""
+_CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = -1.0, 1.0, -1.0, 1.0, -1.0, 1.0
+"""Maps a vector to its cross-product matrix, flattened by columns: times a row, it is the cross
+product of the vector and the row."""
 
 
 Indices = NDArray[np.intp]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False, slots=True)
 class ContactPoints:
     """Points that touch, or may touch within the next step.
 
@@ -74,7 +74,8 @@ class ContactPoints:
             period: Length of the step, in s.
         """
         pace = self.gaps / period
-        along = np.where(self.gaps > 0, pace, np.maximum(_RETURN * pace, -_FASTEST_RETURN))
+        along = np.maximum(pace, np.minimum(_RETURN * pace, 0.0))
+        np.maximum(along, -_FASTEST_RETURN, out=along)
         if self.restitution.any():
             approach = self.jacobian[2::3] @ before
             bounces = (self.restitution > 0) & (approach < -_BOUNCE)
@@ -82,39 +83,6 @@ class ContactPoints:
         found = np.zeros(3 * len(along))
         found[2::3] = along
         return found
-
-
-@dataclass(frozen=True, eq=False)
-class _NearPoints:
-    """Points near a surface: as `ContactPoints`, with their rows in the finder and their radii."""
-
-    statics: Indices
-    numbers: Indices
-    rows: Indices
-    gaps: Vector
-    normals: Vector
-    axes: Vector
-    points: Vector
-    radii: Vector
-
-    @classmethod
-    def at(
-        cls,
-        place: int,
-        surface: Surface,
-        numbers: Indices,
-        rows: Indices,
-        gaps: Vector,
-        normals: Vector,
-        points: Vector,
-        radii: Vector,
-    ) -> _NearPoints:
-        """Add the tangents at the surface of the static thing with that index."""
-        if isinstance(surface, Plane):
-            axes = np.ones((len(rows), 1, 1)) * np.array(axes_of(*surface.normal.tolist()))
-        else:
-            axes = np.array([axes_of(*normal) for normal in normals.tolist()])
-        return cls(np.full(len(rows), place), numbers, rows, gaps, normals, axes, points, radii)
 
 
 class ContactFinder:
@@ -160,8 +128,8 @@ class ContactFinder:
             for offset in offsets:
                 spot = center + rotation @ offset
                 points.append((frame.parentJoint, spot, radius, link, shape))
-        anchors: list[Any] = [*points, *rims]
-        self._arrange(anchors, len(points))
+        self._arrange(points, rims)
+        anchors = [*points, *(rim[:5] for rim in rims for _ in _THIRDS)]
         materials, shapes = [static.what for static in statics], [row[4] for row in anchors]
         of_materials = np.array([(each.friction, each.restitution) for each in materials])
         of_shapes = np.array([(shape.friction, shape.restitution) for shape in shapes])
@@ -169,24 +137,25 @@ class ContactFinder:
         self._friction = np.minimum(first[:, :, 0], second[:, :, 0])
         self._restitution = first[:, :, 1] * second[:, :, 1]
 
-    def _arrange(self, anchors: list[Any], points: int) -> None:
+    def _arrange(self, points: list[Any], rims: list[Any]) -> None:
         """Collect points, then the centers of rims, in arrays."""
-        used = sorted({row[0] for row in anchors})
-        model, data = self._model, self._data
-        # Views of Pinocchio's memory, which change with each `find`.
-        self._turns = [data.oMi[joint].rotation for joint in used]
-        self._places = [data.oMi[joint].translation for joint in used]
-        self._moved = np.zeros((len(used), model.nv))
-        for row, joint in enumerate(used):
+        model, anchors, around = self._model, [*points, *rims], len(_THIRDS)
+        self._turns, self._places = joint_poses(self._data)
+        moved = np.zeros((model.njoints, model.nv))
+        for joint in range(1, model.njoints):
             for each in (each for each in model.supports[joint] if each > 0):
                 first = model.idx_vs[each]
-                self._moved[row, first : first + model.nvs[each]] = 1.0
-        self._joints = np.array([used.index(row[0]) for row in anchors], np.intp)
-        self._links = np.array([row[3] for row in anchors], np.intp)
-        self._centers = np.array([row[1] for row in anchors]).reshape(-1, 3)
-        self._radii = np.array([row[2] for row in anchors])
-        self._first_rim = points
-        self._rim_axes = np.array([row[5] for row in anchors[points:]]).reshape(-1, 3, 3)
+                moved[joint, first : first + model.nvs[each]] = 1.0
+        joints = np.array([row[0] for row in anchors], np.intp)
+        self._joints, self._first_rim = joints, len(points)
+        self._centers = np.array([row[1] for row in anchors]).reshape(-1, 3, 1)
+        self._rim_radii = np.array([row[2] for row in rims])
+        self._rim_axes = np.array([row[5] for row in rims]).reshape(-1, 3, 3)
+        spread = np.repeat(np.arange(len(anchors)), [1] * len(points) + [around] * len(rims))
+        self._links = np.array([row[3] for row in anchors], np.intp)[spread]
+        self._radii = np.array([row[2] for row in points] + [0.0] * (around * len(rims)))
+        self._moved = np.repeat(moved[joints[spread]], 3, axis=0)
+        self._frames = np.zeros((len(spread), 3, 6))
 
     def __bool__(self) -> bool:
         """Return whether anything can ever touch."""
@@ -194,7 +163,7 @@ class ContactFinder:
 
     def __len__(self) -> int:
         """Return an upper bound of `ContactPoints.numbers`."""
-        return 3 * len(self._links) * len(self._friction)
+        return self._friction.size
 
     def find(self, q: Vector, v: Vector, period: float) -> ContactPoints | None:
         """Return the points that touch, or may within the next step; None if there are none.
@@ -205,116 +174,72 @@ class ContactFinder:
             period: Length of the step, in s.
         """
         motions = pinocchio.computeJointJacobians(self._model, self._data, q)
-        joints, turns = self._joints, np.array(self._turns)
-        points = np.einsum("nij,nj->ni", turns[joints], self._centers)
-        points += np.array(self._places)[joints]
-        # Motion of each joint in the step: rotation, and translation at the world's origin.
-        twists = period * ((self._moved * v) @ motions.T)
-        steps = _displacements(twists[joints], points)
-        reach, first = self._radii, self._first_rim
-        if first < len(points):
-            # A point of a rim moves no further than its center plus the effect of its rotation.
-            spins, reach = _lengths(twists[:, 3:])[joints[first:]], reach.copy()
-            reach[first:] += _lengths(steps[first:]) + reach[first:] * spins
-        found: list[_NearPoints] = []
+        points = (self._turns[self._joints] @ self._centers)[:, :, 0] + self._places[self._joints]
+        if self._first_rim < len(points):
+            points = np.concatenate([points[: self._first_rim], self._rims(points)])
+        found = []
         for place, surface in self._surfaces:
-            gaps, normals = surface.distances(points)
-            ahead = gaps + np.einsum("ij,ij->i", normals, steps)
-            close = np.minimum(gaps, ahead) < reach + _MARGIN
-            if not surface.even:
-                close[first:] = True
-            rows = np.flatnonzero(close)
-            if len(rows) and rows[-1] >= first:
-                rows, rims = rows[rows < first], rows[rows >= first]
-                found += self._near_rims(place, surface, rims, turns, points, twists)
-            if len(rows):
-                radii = self._radii[rows]
-                gaps, normals = gaps[rows] - radii, normals[rows]
-                found.append(
-                    _NearPoints.at(place, surface, rows, rows, gaps, normals, points[rows], radii)
+            gaps, axes = surface.distances(points)
+            gaps -= self._radii
+            depths = self._radii + 0.5 * np.minimum(gaps, 0.0)
+            touched = points - depths[:, None] * axes[:, 2]
+            frames = self._frames
+            frames[:, :, :3] = axes
+            frames[:, :, 3:] = axes @ (touched @ _CROSS).reshape(-1, 3, 3)
+            jacobian = frames.reshape(-1, 6) @ motions
+            jacobian *= self._moved
+            ahead = gaps + period * (jacobian[2::3] @ v)
+            rows = (np.minimum(gaps, ahead) < _MARGIN).nonzero()[0]
+            if not len(rows):
+                continue
+            found.append(
+                ContactPoints(
+                    self._links[rows],
+                    np.full(len(rows), place),
+                    place * len(points) + rows,
+                    touched[rows],
+                    axes[rows],
+                    gaps[rows],
+                    self._friction[place, rows],
+                    self._restitution[place, rows],
+                    jacobian.reshape(len(points), 3, -1)[rows].reshape(3 * len(rows), -1),
                 )
-        return self._touching(motions, found) if found else None
+            )
+        return _together(found) if found else None
 
-    def _near_rims(
-        self,
-        place: int,
-        surface: Surface,
-        rims: Indices,
-        turns: Vector,
-        points: Vector,
-        twists: Vector,
-    ) -> list[_NearPoints]:
-        """Return the points of rims that touch, or may within the next step."""
-        rows, around = np.repeat(rims, 3), self._rims(rims, turns, points)
-        numbers = 3 * rows + np.tile([0, 1, 2], len(rims))
-        gaps, normals = surface.distances(around)
-        steps = _displacements(twists[self._joints[rows]], around)
-        close = np.minimum(gaps, gaps + np.einsum("ij,ij->i", normals, steps)) < _MARGIN
-        if not close.any():
-            return []
-        rows, gaps, normals, around = rows[close], gaps[close], normals[close], around[close]
-        numbers, radii = numbers[close], np.zeros(len(rows))
-        return [_NearPoints.at(place, surface, numbers, rows, gaps, normals, around, radii)]
-
-    def _rims(self, rows: Indices, turns: Vector, points: Vector) -> Vector:
-        """Return three points of each rim, one of them the deepest, shape (3 rows, 3)."""
-        axes = turns[self._joints[rows]] @ self._rim_axes[rows - self._first_rim]
+    def _rims(self, points: Vector) -> Vector:
+        """Return three points of each rim, one of them the deepest, shape (3 rims, 3)."""
+        first = self._first_rim
+        axes = self._turns[self._joints[first:]] @ self._rim_axes
         along = axes[:, :, 2]
         downward = (along @ self._up)[:, None] * along - self._up
-        lengths = _lengths(downward)[:, None]
+        lengths = np.sqrt(np.einsum("ij,ij->i", downward, downward))[:, None]
         upright = lengths <= 1e-9
-        first = np.where(upright, axes[:, :, 0], downward / np.where(upright, 1.0, lengths))
-        around = _THIRDS @ np.stack([first, np.cross(along, first)], axis=1)
-        return (points[rows][:, None] + self._radii[rows][:, None, None] * around).reshape(-1, 3)
-
-    def _touching(self, motions: Vector, found: list[_NearPoints]) -> ContactPoints:
-        rows, statics = _concatenate(found, "rows"), _concatenate(found, "statics")
-        gaps, normals = _concatenate(found, "gaps"), _concatenate(found, "normals")
-        depths = _concatenate(found, "radii") + 0.5 * np.minimum(gaps, 0.0)
-        points = _concatenate(found, "points") - depths[:, None] * normals
-        axes = _concatenate(found, "axes")
-        turned = (points @ _CROSS).reshape(-1, 3, 3) @ motions[3:]
-        jacobian = axes @ ((motions[:3] - turned) * self._moved[self._joints[rows], None])
-        return ContactPoints(
-            links=self._links[rows],
-            statics=statics,
-            numbers=3 * len(self._links) * statics + _concatenate(found, "numbers"),
-            points=points,
-            axes=axes,
-            gaps=gaps,
-            friction=self._friction[statics, rows],
-            restitution=self._restitution[statics, rows],
-            jacobian=jacobian.reshape(-1, jacobian.shape[2]),
-        )
+        beside = np.where(upright, axes[:, :, 0], downward / np.where(upright, 1.0, lengths))
+        around = _THIRDS @ np.stack([beside, np.cross(along, beside)], axis=1)
+        return (points[first:, None] + self._rim_radii[:, None, None] * around).reshape(-1, 3)
 
 
-def axes_of(x: float, y: float, z: float) -> tuple[tuple[float, float, float], ...]:
-    """Return two tangents and the normal (x, y, z) itself."""
-    if abs(z) > 0.5:
-        length = math.hypot(x, z)
-        a, b, c = z / length, 0.0, -x / length
-    else:
-        length = math.hypot(x, y)
-        a, b, c = y / length, -x / length, 0.0
-    return (a, b, c), (y * c - z * b, z * a - x * c, x * b - y * a), (x, y, z)
+def joint_poses(data: Any) -> tuple[Vector, Vector]:
+    """Return views of the joints' rotations (n, 3, 3) and positions (n, 3) in Pinocchio's memory.
+
+    They change with each algorithm that places joints, and live as long as the data.
+    """
+    first, second = data.oMi[0].rotation, data.oMi[1].rotation
+    pace = second.__array_interface__["data"][0] - first.__array_interface__["data"][0]
+    count, place = len(data.oMi), data.oMi[0].translation
+    turns = np.lib.stride_tricks.as_strided(first, (count, 3, 3), (pace, *first.strides))
+    return turns, np.lib.stride_tricks.as_strided(place, (count, 3), (pace, *place.strides))
 
 
-def _displacements(twists: Vector, points: Vector) -> Vector:
-    """Return the displacements of points (n, 3) by translations and rotations (n, 6)."""
-    return twists[:, :3] + np.einsum(
-        "nij,nj->ni", (twists[:, 3:] @ _CROSS).reshape(-1, 3, 3), points
+def _together(found: list[ContactPoints]) -> ContactPoints:
+    """Return all points of several surfaces."""
+    if len(found) == 1:
+        return found[0]
+    names = ContactPoints.__slots__
+    return ContactPoints(
+        *(np.concatenate([getattr(each, name) for each in found]) for name in names)
     )
-
-
-def _lengths(vectors: Vector) -> Vector:
-    """Return the lengths of rows."""
-    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
-
-
-def _concatenate(found: list[_NearPoints], name: str) -> Any:
-    """Return an attribute of all near points as one array."""
-    parts = [getattr(each, name) for each in found]
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _points(shape: CollisionShape) -> tuple[Vector, float]:

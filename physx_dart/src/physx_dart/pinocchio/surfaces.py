@@ -1,11 +1,11 @@
-"""Surfaces of static things: distances of points and outward normals."""
+"""Surfaces of static things: distances of points, with tangents and outward normals."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import cached_property
 
 import numpy as np
 
@@ -18,17 +18,15 @@ from physx_dart.models.shapes import CollisionShape
 
 
 class Surface(ABC):
-    """A surface.
-
-    Attributes:
-        even: Whether distances of two points differ by no more than the distance between them.
-    """
-
-    even: ClassVar[bool] = True
+    """A surface."""
 
     @abstractmethod
     def distances(self, points: Vector) -> tuple[Vector, Vector]:
-        """Return distances of points (n, 3), negative inside, and normals outward, (n,), (n, 3)."""
+        """Return distances of points (n, 3), negative inside, and the axes of the surface there.
+
+        Returns:
+            Distances in m, shape (n,); two tangents and the outward normal as rows, (n, 3, 3).
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +36,15 @@ class Plane(Surface):
     normal: Vector
     height: float
 
+    @cached_property
+    def axes(self) -> Vector:
+        """Two tangents and the normal, as rows."""
+        return axes_of(self.normal[None])[0]
+
     def distances(self, points: Vector) -> tuple[Vector, Vector]:
-        """Return distances and normals."""
-        return points @ self.normal - self.height, np.ones((len(points), 1)) * self.normal
+        """Return distances and axes."""
+        axes = np.broadcast_to(self.axes, (len(points), 3, 3))
+        return points @ self.normal - self.height, axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +56,7 @@ class Solid(Surface):
     rotation: Vector
 
     def distances(self, points: Vector) -> tuple[Vector, Vector]:
-        """Return distances and normals."""
+        """Return distances and axes."""
         local = (points - self.center) @ self.rotation
         size = self.shape.size
         if self.shape.kind == "box":
@@ -65,18 +69,17 @@ class Solid(Surface):
             axis[:, 2] = np.clip(local[:, 2], -half, half)
             lengths, normals = _directions(local - axis)
             found = lengths - size[0]
-        return found, normals @ self.rotation.T
+        return found, axes_of(normals @ self.rotation.T)
 
 
 @dataclass(frozen=True, eq=False)
 class Heights(Surface):
     """A height field; distances are to the plane of the triangle below or above."""
 
-    even: ClassVar[bool] = False
     field: HeightField
 
     def distances(self, points: Vector) -> tuple[Vector, Vector]:
-        """Return distances and normals."""
+        """Return distances and axes."""
         heights, spacing = self.field.heights, np.array(self.field.spacing)
         grid = (points[:, :2] - self.field.corner()) / spacing
         last = np.array(heights.shape) - 1
@@ -96,7 +99,7 @@ class Heights(Surface):
         lengths = np.linalg.norm(upward, axis=1)
         found = (points[:, 2] - height) / lengths
         found[outside] = np.inf
-        return found, upward / lengths[:, None]
+        return found, axes_of(upward / lengths[:, None])
 
 
 def surfaces_of(static: Static, engine: str, features: Sequence[str]) -> list[Surface]:
@@ -116,6 +119,15 @@ def surfaces_of(static: Static, engine: str, features: Sequence[str]) -> list[Su
         raise FeatureNotSupportedError(engine, "mesh_contacts", features, "Use a box instead.")
     rotation = to_matrix(static.orientation)
     return [Solid(what, np.array(static.position), rotation)]
+
+
+def axes_of(normals: Vector) -> Vector:
+    """Return two tangents and the normal itself for each normal (n, 3), as rows (n, 3, 3)."""
+    x, y, z = normals.T
+    steep, nothing = np.abs(z) > 0.5, np.zeros(len(x))
+    first = np.where(steep, [z, nothing, -x], [y, -x, nothing]).T
+    first /= np.sqrt(np.einsum("ij,ij->i", first, first))[:, None]
+    return np.stack([first, np.cross(normals, first), normals], axis=1)
 
 
 def _directions(vectors: Vector) -> tuple[Vector, Vector]:
