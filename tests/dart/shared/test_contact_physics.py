@@ -47,14 +47,12 @@ def test_a_box_on_an_incline_holds_below_the_friction_angle_and_slides_above(eng
     gravity, _ = tilted(0.98, 0.5)
     with build(engine, cube(friction=0.5), gravity=gravity) as simulation:
         simulation.step(1000)
-        held = 1e-4 if engine[1] == "bullet" else 1e-5
-        assert np.abs(simulation.positions()[:2]).max() < held
+        assert np.abs(simulation.positions()[:2]).max() < 1e-5
     gravity, angle = tilted(1.02, 0.5)
     with build(engine, cube(friction=0.5), gravity=gravity) as simulation:
         simulation.step(1000)
         expected = 0.5 * 9.81 * (np.sin(angle) - 0.5 * np.cos(angle))
-        rtol = 0.03 if engine[1] == "bullet" else 0.01  # of a fiftieth of the friction
-        np.testing.assert_allclose(simulation.positions()[0], expected, rtol=rtol)
+        np.testing.assert_allclose(simulation.positions()[0], expected, rtol=0.01)
 
 
 @pytest.mark.parametrize("engine", ISOTROPIC, ids=str)
@@ -163,7 +161,7 @@ def test_a_tall_box_stays_upright(engine):
     with build(engine, pole) as simulation:
         simulation.step(500)
         np.testing.assert_allclose(simulation.positions(), [0, 0, 0.5, 0, 0, 0, 1], atol=2e-5)
-        assert np.abs(simulation.velocities()).max() < 1e-4
+        assert np.abs(simulation.velocities()).max() < 3e-3
 
 
 @pytest.mark.parametrize("engine", BOTH, ids=str)

@@ -22,7 +22,7 @@ BALL = Sphere(name="ball", radius=0.1, mass=2.0)
 CALM = {"gravity": (0.0, 0.0, 0.0)}
 
 
-def test_contacts_of_two_moving_things_name_both_bodies(dart):
+def test_contacts_of_two_moving_things_name_both_bodies(backend):
     world = World(
         objects=[
             Box(name="low", size=(0.4, 0.4, 0.1), position=(0, 0, 0.05)),
@@ -31,7 +31,7 @@ def test_contacts_of_two_moving_things_name_both_bodies(dart):
         ],
         ground=Ground(),
     )
-    with dart.build(world) as simulation:
+    with backend.build(world) as simulation:
         assert simulation.contacts().dtype == CONTACT
         assert len(simulation.contacts()) == 0
         simulation.step(300)
@@ -39,8 +39,8 @@ def test_contacts_of_two_moving_things_name_both_bodies(dart):
         assert names == ("low", "high", "ground", "table")
         between = contacts[contacts["body_b"] == 1]
         force = between["force"].sum(axis=0)  # on the lower one
-        np.testing.assert_allclose(force, [0, 0, -3 * 9.81], atol=3e-3)
-        np.testing.assert_allclose(between["normal"], [[0, 0, -1]] * len(between), atol=1e-5)
+        np.testing.assert_allclose(force, [0, 0, -3 * 9.81], atol=0.1)
+        np.testing.assert_allclose(between["normal"], [[0, 0, -1]] * len(between), atol=1e-4)
         np.testing.assert_allclose(between["point"][:, 2], 0.1, atol=1e-4)
         assert (contacts["body_a"] < contacts["body_b"]).all()
         simulation.set_state(simulation.positions(), simulation.velocities())
@@ -66,7 +66,7 @@ def test_the_option_contacts_disables_collisions(backend, contacts):
             assert heights[0] < -0.5
 
 
-def test_links_collide_with_each_other_if_asked(dart, write_urdf):
+def test_links_collide_with_each_other_if_asked(backend, write_urdf):
     ball = '<collision><geometry><sphere radius="0.3"/></geometry></collision>'
     mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
     link = f'<link name="{{}}">{mass}</inertial>{ball}</link>'
@@ -79,7 +79,7 @@ def test_links_collide_with_each_other_if_asked(dart, write_urdf):
     path = write_urdf(text)
     for collide in (False, True):
         world = World([Robot(path, self_collisions=collide)], **CALM)
-        with dart.build(world) as simulation:
+        with backend.build(world) as simulation:
             simulation.set_state([0, 0.1, 0.5], [0, 0, -1.0])
             simulation.step(1000)
             gap = simulation.positions()[1] + simulation.positions()[2]
@@ -113,7 +113,6 @@ def test_rays_hit_the_nearest_body(dart):
 @pytest.mark.parametrize(
     ("engine", "options", "feature"),
     [
-        ("pinocchio", {"objects": [BALL, Sphere(name="two", radius=0.1)]}, "body_contacts"),
         ("pinocchio", {"objects": [BALL], "detector": "fcl"}, "detector fcl"),
         ("dart", {"objects": [Capsule(name="c", radius=1, length=1)], "detector": "fcl"}, "caps"),
     ],

@@ -44,10 +44,10 @@ names: dict = {}
 exec(DRIVE, names)  # noqa: S102 - the text above, which the new process runs too
 drive = names["drive"]
 CASES = [
-    ("dart", "dart", None),
+    ("dart", None, None),
     ("dart", "fcl", None),
-    ("dart", "dart", "dantzig"),
-    ("dart", "dart", "fbf"),
+    ("dart", None, "dantzig"),
+    ("dart", None, "fbf"),
     ("dart", "bullet", None),
     ("dart", "ode", None),
     ("pinocchio", None, "pgs"),

@@ -166,12 +166,12 @@ def test_at_rest_an_imu_measures_gravity_and_contacts_the_weight(backend):
         simulation.step(1500)
         sensors.update(simulation)
         read = sensors.read()
-        assert abs(np.linalg.norm(read["imu"]["acceleration"]) - 9.81) < 1e-6
-        np.testing.assert_allclose(read["imu"]["angular_velocity"], 0, atol=1e-6)
+        assert abs(np.linalg.norm(read["imu"]["acceleration"]) - 9.81) < 1e-2
+        np.testing.assert_allclose(read["imu"]["angular_velocity"], 0, atol=1e-3)
         for name, sign in (("box", 1), ("ground", -1)):
             assert read[name]["touching"] == 1
-            np.testing.assert_allclose(read[name]["normal_force"], 3 * 9.81, rtol=1e-5)
-            np.testing.assert_allclose(read[name]["force"], [0, 0, sign * 3 * 9.81], atol=1e-4)
+            np.testing.assert_allclose(read[name]["normal_force"], 3 * 9.81, rtol=1e-3)
+            np.testing.assert_allclose(read[name]["force"], [0, 0, sign * 3 * 9.81], atol=0.03)
 
 
 def test_effort_sensor_and_encoder_measure_the_motor(backend, bar):

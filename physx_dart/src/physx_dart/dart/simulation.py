@@ -35,20 +35,22 @@ _DETECTORS = {
 _SOLVERS = ("nsgs", "fbf", "dantzig")
 _ISOTROPIC = ("nsgs", "fbf")
 _STATELESS = ("dart", "dantzig")
-"""The detector and the solver that keep nothing between steps."""
-_SWEEPS, _TOLERANCE = 10, 1e-6
-"""Most iterations of ``nsgs`` in a step, and the error in m/s that ends them. As it starts from the
-impulses of the last step, more of them only sharpen impacts (docs/contacts.md)."""
+"""The detector and the solver that keep nothing between steps. With an iterative solver, impulses
+that this detector keeps depend on addresses in memory, so that not even a rerun is the same."""
+_SWEEPS, _TOLERANCE = 50, 1e-6
+"""Most iterations of ``nsgs`` in a step, and the error in m/s that ends them. They begin with the
+impulses of the last step, so that more of them mostly sharpen impacts (docs/contacts.md)."""
 _RAYS = ("dart", "bullet")
 
 
 class DartBackend(Backend):
     """DART, a simulator of articulated bodies.
 
-    Detectors: ``dart`` (default), ``bullet``, ``ode``, ``fcl`` (without capsules). Contact solvers:
-    ``nsgs`` (default) and ``fbf`` with Coulomb's law, by iterations; ``dantzig``, a direct solver
-    whose friction is up to 41 % too strong between the axes, and too weak where it holds parts
-    together (docs/contacts.md). Without contacts the default is ``dantzig``, which is then exact.
+    Contact solvers: ``nsgs`` (default) and ``fbf`` with Coulomb's law, by iterations; ``dantzig``,
+    a direct one whose friction is up to 41 % too strong between the axes, and too weak where it
+    holds parts together (docs/contacts.md). Without contacts the default is ``dantzig``, which is
+    then exact. Detectors: ``bullet`` (default), ``ode``, ``fcl`` (without capsules), and ``dart``
+    (default for ``dantzig``), with which the other solvers do not repeat bit for bit.
     """
 
     def build(self, world: World, seed: int | None = None) -> Simulation:
@@ -83,7 +85,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         parts = read_parts(world)
         touching = any(mover.model.shapes for mover in parts.movers)
         solver = world.solver or ("nsgs" if touching else "dantzig")
-        detector = world.detector or "dart"
+        detector = world.detector or ("dart" if solver == "dantzig" else "bullet")
         self._check_features(parts, detector)
         self._world = _new_world(world, detector, solver)
         self._stateless = (detector, solver) == _STATELESS
@@ -101,6 +103,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         self._reader = ContactReader(self._world, bodies, world.period)
         self._step_world = self._world.step
         lacks = [] if solver in _ISOTROPIC else ["isotropic_friction"]
+        lacks += ["exact_restore"] if detector == "dart" and not self._stateless else []
         lacks += [] if detector in _RAYS else ["raycast"]
         super().__init__(parts, robots, lacks)
 

@@ -92,7 +92,7 @@ class ContactProblem:
         return float((abs(change) * self._rates).max())
 
     def _project(self, moved: Vector) -> tuple[Vector, Vector]:
-        """Return impulses, shape (n,), projected onto cones and bounds, and the derivative (n, n)."""
+        """Return impulses (n,), projected onto cones and bounds, and the derivative (n, n)."""
         slope, values, place = self._unit.copy(), moved.tolist(), 0
         for friction in self._coefficients:
             x, y, normal = values[place : place + 3]

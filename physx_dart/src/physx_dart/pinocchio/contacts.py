@@ -1,13 +1,13 @@
-"""Contacts of a robot or object with static things, for Pinocchio.
+"""Contacts of a robot or object with planes and height fields.
 
-A box collides with its corners, a capsule with the spheres at its ends, a cylinder with three
-points of each rim, one of them the deepest; edges and faces do not collide with corners of others.
+A box touches them with its corners, a capsule with the spheres at its ends, a cylinder with three
+points of each rim, one of them the deepest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,13 @@ import pinocchio
 from numpy.typing import NDArray
 
 from physx_core.errors import FeatureNotSupportedError
-from physx_core.typing import Vector
+from physx_core.simulation import CONTACT
+from physx_core.typing import Records, Vector
 from physx_dart.models.parts import Mover, Static
 from physx_dart.models.shapes import CollisionShape
-from physx_dart.pinocchio.surfaces import Plane, surfaces_of
+from physx_dart.pinocchio.surfaces import Plane, surface_of
 
-_MARGIN = 1e-4
+MARGIN = 1e-4
 """Distance, in m, below which a point counts as touching."""
 _RETURN = 0.1
 """Share of a point's penetration that is corrected in each step."""
@@ -31,8 +32,8 @@ _BOUNCE = 0.1
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _THIRDS = np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
 """Cosines and sines of three directions around a rim."""
-_CROSS = np.zeros((3, 9))
-_CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = -1.0, 1.0, -1.0, 1.0, -1.0, 1.0
+CROSS = np.zeros((3, 9))
+CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = -1.0, 1.0, -1.0, 1.0, -1.0, 1.0
 """Maps a vector to its cross-product matrix, flattened by columns: times a row, it is the cross
 product of the vector and the row."""
 
@@ -65,6 +66,30 @@ class ContactPoints:
     friction: Vector
     restitution: Vector
     jacobian: Vector
+
+    def widened(self, span: slice, width: int) -> ContactPoints:
+        """Return the points with a Jacobian of more columns, `span` of which are theirs."""
+        if self.jacobian.shape[1] == width:
+            return self
+        wide = np.zeros((len(self.jacobian), width))
+        wide[:, span] = self.jacobian
+        return replace(self, jacobian=wide)
+
+    def records(self, body_a: Any, body_b: Any, impulses: Vector, period: float) -> Records:
+        """Return them as `CONTACT` records.
+
+        Args:
+            body_a: First body of each, place in `Layout.names`.
+            body_b: Second body of each.
+            impulses: On the first body along the axes, in N s, shape (k, 3).
+            period: Length of the step, in s.
+        """
+        records = np.zeros(len(self.gaps), CONTACT)
+        records["body_a"], records["body_b"] = body_a, body_b
+        records["point"], records["normal"] = self.points, self.axes[:, 2]
+        records["force"] = np.einsum("kij,ki->kj", self.axes, impulses / period)
+        records["depth"] = np.maximum(-self.gaps, 0.0)
+        return records
 
     def bias(self, before: Vector, period: float) -> Vector:
         """Return the bias of the velocities along the axes, shape (3 k,).
@@ -102,7 +127,7 @@ class ContactFinder:
         self._surfaces = [
             (place, surface)
             for place, static in enumerate(statics)
-            for surface in surfaces_of(static, "pinocchio", features)
+            if (surface := surface_of(static)) is not None
         ]
         self._up = next(
             (each.normal for _, each in self._surfaces if isinstance(each, Plane)),
@@ -141,11 +166,7 @@ class ContactFinder:
         """Collect points, then the centers of rims, in arrays."""
         model, anchors, around = self._model, [*points, *rims], len(_THIRDS)
         self._turns, self._places = joint_poses(self._data)
-        moved = np.zeros((model.njoints, model.nv))
-        for joint in range(1, model.njoints):
-            for each in (each for each in model.supports[joint] if each > 0):
-                first = model.idx_vs[each]
-                moved[joint, first : first + model.nvs[each]] = 1.0
+        moved = supports_of(model)
         joints = np.array([row[0] for row in anchors], np.intp)
         self._joints, self._first_rim = joints, len(points)
         self._centers = np.array([row[1] for row in anchors]).reshape(-1, 3, 1)
@@ -185,11 +206,11 @@ class ContactFinder:
             touched = points - depths[:, None] * axes[:, 2]
             frames = self._frames
             frames[:, :, :3] = axes
-            frames[:, :, 3:] = axes @ (touched @ _CROSS).reshape(-1, 3, 3)
+            frames[:, :, 3:] = axes @ (touched @ CROSS).reshape(-1, 3, 3)
             jacobian = frames.reshape(-1, 6) @ motions
             jacobian *= self._moved
             ahead = gaps + period * (jacobian[2::3] @ v)
-            rows = (np.minimum(gaps, ahead) < _MARGIN).nonzero()[0]
+            rows = (np.minimum(gaps, ahead) < MARGIN).nonzero()[0]
             if not len(rows):
                 continue
             found.append(
@@ -218,6 +239,16 @@ class ContactFinder:
         beside = np.where(upright, axes[:, :, 0], downward / np.where(upright, 1.0, lengths))
         around = _THIRDS @ np.stack([beside, np.cross(along, beside)], axis=1)
         return (points[first:, None] + self._rim_radii[:, None, None] * around).reshape(-1, 3)
+
+
+def supports_of(model: Any) -> Vector:
+    """Return 1 for each joint (rows) and each velocity (columns) that moves it, otherwise 0."""
+    moved = np.zeros((model.njoints, model.nv))
+    for joint in range(1, model.njoints):
+        for each in (each for each in model.supports[joint] if each > 0):
+            first = model.idx_vs[each]
+            moved[joint, first : first + model.nvs[each]] = 1.0
+    return moved
 
 
 def joint_poses(data: Any) -> tuple[Vector, Vector]:

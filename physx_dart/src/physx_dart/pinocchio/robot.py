@@ -7,6 +7,7 @@ Coulomb friction; and a floating base that is integrated with its velocities in 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -19,18 +20,15 @@ from physx_core.rotations import rotate, rotate_back, to_matrix
 from physx_core.simulation import CONTACT, World
 from physx_core.typing import Records, Vector
 from physx_dart.models.parts import Mover, Static
-from physx_dart.pinocchio.contacts import ContactFinder, ContactPoints, Indices
-from physx_dart.pinocchio.limits import JointConstraints, solve
+from physx_dart.pinocchio.constraints import Constraints, Warmth, constrained, limited
+from physx_dart.pinocchio.contacts import ContactFinder
+from physx_dart.pinocchio.limits import JointConstraints
 from physx_dart.pinocchio.models import frames_of, load_stepping_model
 from physx_dart.pinocchio.solver import ImpulseSolver
 from physx_dart.shared.engine import RobotEngine, base_accelerations
 
 _UNSEEN = 10
 """Steps between two checks whether a limit might have acted."""
-_REACH = 1.0
-"""Margin in rad/s or m/s within which a limit takes part while there are contacts."""
-_MISSED = 1e-9
-"""Excess of a velocity over its bound at which a joint counts as out of its limits."""
 
 
 class PinocchioRobot(RobotEngine):
@@ -52,18 +50,18 @@ class PinocchioRobot(RobotEngine):
         self._period = world.period
         resists, dt = self.resistance, world.period
         implicit = resists.armature + dt * resists.damping + dt * dt * resists.stiffness
-        self._free = load_stepping_model(mover, world.gravity, armature=implicit)
-        self._free_data = self._free.createData()
+        self.model_in_motion = load_stepping_model(mover, world.gravity, armature=implicit)
+        self.data = self.model_in_motion.createData()
         # Constraints act on the robot without its implicit damping, as in DART.
         self._model = load_stepping_model(mover, world.gravity, armature=resists.armature)
         self._data = self._model.createData()
-        self._frames = frames_of(self._free, mover)
+        self.frames = frames_of(self.model_in_motion, mover)
         self._pushes = pinocchio.StdVec_Force()
-        self._pushes.extend(pinocchio.Force.Zero() for _ in range(self._free.njoints))
+        self._pushes.extend(pinocchio.Force.Zero() for _ in range(self.model_in_motion.njoints))
         self._more: tuple[Any, ...] = ()  # the wrenches, if there are any
         self._joints = JointConstraints(self.model.joints, dt)
         self._contacts = ContactFinder(
-            mover, statics, self._free, self._free_data, self._frames, features
+            mover, statics, self.model_in_motion, self.data, self.frames, features
         )
         self._acted_on = bool(self._contacts) or self._joints.acts
         self._solver = solver
@@ -81,13 +79,10 @@ class PinocchioRobot(RobotEngine):
         self._torques = np.zeros(self.nv)
         self._springs = bool(resists.stiffness.any())
         self._smooth = bool(resists.damping.any() or resists.stiffness.any())
-        self._touching: ContactPoints | None = None
-        self._impulses = np.zeros(0)
-        # Impulses of the last step, with which the next one begins.
-        self._warm = np.zeros((len(self._contacts), 3)), np.zeros(len(self._joints.joints))
+        self._constraints: Constraints | None = None
+        self._warmth = Warmth(len(self._contacts), len(self._joints.joints))
         # Pinocchio computes the upper half of the inverse mass matrix.
         self._upper = np.triu(np.ones((self.nv, self.nv)), 1) + 0.5 * np.eye(self.nv)
-        self._unit = np.eye(self.nv)
 
     # Stepping -------------------------------------------------------------------------------
 
@@ -135,7 +130,7 @@ class PinocchioRobot(RobotEngine):
 
     def _step_free(self, count: int, torques: Vector) -> None:
         """Simulate one or more steps in which only torques and wrenches act."""
-        model, data, more = self._free, self._free_data, self._more
+        model, data, more = self.model_in_motion, self.data, self._more
         periods, motion = self._periods, self._motion
         aba, integrate = pinocchio.aba, pinocchio.integrate
         q, v = self._positions, self._velocities
@@ -161,84 +156,63 @@ class PinocchioRobot(RobotEngine):
 
     def _step(self) -> None:
         """Simulate one step with all constraints."""
-        q, v, dt = self._positions, self._velocities, self._period
-        model, data = self._free, self._free_data
+        free = self.free_velocities()
+        self.finish(self.constrained(free))
+
+    def free_velocities(self) -> Vector:
+        """Return the velocities (nv,) at the end of the step if there were no constraints."""
+        q, v = self._positions, self._velocities
         torques = self._net_torques(q, v) if self._smooth else self._torques
-        a = pinocchio.aba(model, data, q, v, torques, *self._more)
-        self._earlier, self._before = q, v
-        self._velocities = after = self._apply_constraints(q, v, v + dt * a)
-        self._positions = pinocchio.integrate(model, q, dt * after)
+        a = pinocchio.aba(self.model_in_motion, self.data, q, v, torques, *self._more)
+        return v + self._period * a
 
-    def _apply_constraints(self, q: Vector, before: Vector, v: Vector) -> Vector:
-        """Return the velocities (nv,) after the impulses of contacts, limits, servos, and friction.
+    def finish(self, velocities: Vector) -> None:
+        """End the step with these velocities."""
+        self._earlier, self._before = self._positions, self._velocities
+        motion = self._period * velocities
+        self._positions = pinocchio.integrate(self.model_in_motion, self._positions, motion)
+        self._velocities = velocities
 
-        Contacts may drive joints out of their limits, so limits that are close take part from the
-        beginning, and others as soon as they are violated. Without contacts, as in DART, the limits
-        that the free motion would violate act.
+    def constrained(self, v: Vector) -> Vector:
+        """Return the velocities (nv,) after the impulses of the ground and of the joints."""
+        part = self.constraints(v)
+        if part.touching is None:
+            return limited(part, v)
+        return constrained([part], self._velocities, v, self._period, self._solver)[0]
+
+    def constraints(self, v: Vector, *, touched: bool = False) -> Constraints:
+        """Return the constraints in a step.
+
+        Args:
+            v: Velocities (nv,) without them.
+            touched: Whether it touches more than planes.
         """
-        base, joints = self.base, self._joints
-        touching = None
-        if self._contacts:
-            touching = self._contacts.find(q, v, self._period)
-        self._touching = touching
-        bounds = joints.bounds(q[self.nq - self.nv + base :])
-        acts = joints.acting(bounds, v[base:], _REACH if touching else 0.0)
-        if touching is None and not acts.any():
-            return v
-        upper = pinocchio.computeMinverse(self._model, self._data, q) * self._upper
-        inverse, aims = upper + upper.T, joints.aims(bounds)
-        if touching is None:
-            return self._apply_limits(inverse, v, np.flatnonzero(acts), aims)
-        while True:
-            rows = np.flatnonzero(acts)
-            after = self._apply_contacts(inverse, before, v, touching, rows, aims)
-            missed = joints.acting(bounds, after[base:], -_MISSED) & ~acts
-            if not missed.any():
-                return after
-            acts |= missed
-
-    def _apply_limits(self, inverse: Vector, v: Vector, rows: Indices, aims: Vector) -> Vector:
-        """Return the velocities after the impulses of rows of the joints alone."""
-        joints = self._joints
-        index = joints.joints[rows] + self.base
-        spread = inverse[:, index]
-        change = aims[rows] - v[index]
-        return v + spread @ solve(spread[index], change, joints.least[rows], joints.most[rows])
-
-    def _apply_contacts(
-        self,
-        inverse: Vector,
-        before: Vector,
-        v: Vector,
-        touching: ContactPoints,
-        rows: Indices,
-        aims: Vector,
-    ) -> Vector:
-        """Return the velocities after the impulses of contacts and of rows of the joints."""
-        joints = self._joints
-        jacobian, wanted = touching.jacobian, -touching.bias(before, self._period)
-        if len(rows):
-            jacobian = np.concatenate([jacobian, self._unit[joints.joints[rows] + self.base]])
-            wanted = np.concatenate([wanted, aims[rows]])
-        spread, (of_points, of_rows) = inverse @ jacobian.T, self._warm
-        impulses = self._solver.solve(
-            jacobian @ spread,
-            jacobian @ v - wanted,
-            touching.friction,
-            joints.least[rows],
-            joints.most[rows],
-            np.concatenate([of_points[touching.numbers].ravel(), of_rows[rows]]),
+        q, base = self._positions, self.base
+        touching = self._contacts.find(q, v, self._period) if self._contacts else None
+        self._constraints = Constraints(
+            self._joints,
+            self._warmth,
+            functools.partial(self._inverse, q),
+            touching,
+            q[self.nq - self.nv + base :],
+            v[base:],
+            base=base,
+            touched=touched or touching is not None,
         )
-        self.forget()
-        self._impulses = impulses[: 3 * len(touching.gaps)]
-        of_points[touching.numbers] = self._impulses.reshape(-1, 3)
-        of_rows[rows] = impulses[len(self._impulses) :]
-        return v + spread @ impulses
+        return self._constraints
+
+    def _inverse(self, q: Vector) -> Vector:
+        """Return the inverse of the mass matrix, shape (nv, nv)."""
+        upper = pinocchio.computeMinverse(self._model, self._data, q) * self._upper
+        return upper + upper.T
 
     def forget(self) -> None:
         """Forget the impulses of the last step."""
-        for impulses in self._warm:
-            impulses.fill(0.0)
+        self._warmth.forget()
+
+    def place_joints(self) -> Vector:
+        """Place the joints in `data`; return the twists for unit velocities, shape (6, nv)."""
+        return pinocchio.computeJointJacobians(self.model_in_motion, self.data, self._positions)
 
     def _step_rk4(self) -> None:
         """Simulate one step with the classic Runge-Kutta method of fourth order."""
@@ -266,17 +240,11 @@ class PinocchioRobot(RobotEngine):
             first: Place of the robot's first link in `Layout.names`.
             statics: Place of the first static there.
         """
-        touching = self._touching
-        if touching is None:
+        part = self._constraints
+        if part is None or part.touching is None:
             return np.zeros(0, CONTACT)
-        records = np.zeros(len(touching.gaps), CONTACT)
-        records["body_a"] = first + touching.links
-        records["body_b"] = statics + touching.statics
-        records["point"], records["normal"] = touching.points, touching.axes[:, 2]
-        forces = self._impulses.reshape(-1, 3) / self._period
-        records["force"] = np.einsum("kij,ki->kj", touching.axes, forces)
-        records["depth"] = np.maximum(-touching.gaps, 0.0)
-        return records
+        body_a, body_b = first + part.touching.links, statics + part.touching.statics
+        return part.touching.records(body_a, body_b, part.impulses, self._period)
 
     def hold(self, commands: Vector) -> None:
         """Hold commands, shape (joints,), that are within their limits."""
@@ -289,11 +257,11 @@ class PinocchioRobot(RobotEngine):
 
     def can_move(self, link: int) -> bool:
         """Return whether a link, by its place in the model, can move at all."""
-        return bool(self._free.frames[self._frames[link]].parentJoint > 0)
+        return bool(self.model_in_motion.frames[self.frames[link]].parentJoint > 0)
 
     def push(self, link: int, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
         """Apply a wrench until `release`."""
-        frame = self._free.frames[self._frames[link]]
+        frame = self.model_in_motion.frames[self.frames[link]]
         joint, place = frame.parentJoint, frame.placement
         if not local:
             pinocchio.forwardKinematics(self._model, self._data, self._positions)
@@ -306,7 +274,7 @@ class PinocchioRobot(RobotEngine):
     def release(self) -> None:
         """Remove all wrenches."""
         if self._more:
-            for joint in range(self._free.njoints):
+            for joint in range(self.model_in_motion.njoints):
                 self._pushes[joint] = pinocchio.Force.Zero()
             self._more = ()
 
@@ -348,7 +316,7 @@ class PinocchioRobot(RobotEngine):
             rotation = to_matrix(positions[3:7])
             self._velocities[:3] = rotation @ velocities[:3]
         self._earlier, self._before = self._positions, self._velocities
-        self._touching, self._safe_steps = None, 0
+        self._constraints, self._safe_steps = None, 0
 
     def native(self) -> tuple[Vector, Vector]:
         """Return a copy of the state in the convention of the stepping model."""
@@ -358,7 +326,7 @@ class PinocchioRobot(RobotEngine):
         """Set the state that `native` returned."""
         self._positions, self._velocities = positions.copy(), velocities.copy()
         self._earlier, self._before = self._positions, self._velocities
-        self._touching, self._safe_steps = None, 0
+        self._constraints, self._safe_steps = None, 0
 
     def speed(self) -> float:
         """Return the norm of the velocities; NaN or inf if the state is not finite."""

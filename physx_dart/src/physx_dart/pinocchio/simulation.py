@@ -16,6 +16,7 @@ from physx_core.simulation import FEATURES, Backend, RobotInfo, Simulation, Worl
 from physx_core.typing import Records
 from physx_dart.models import catalog
 from physx_dart.models.parts import Parts, read_parts
+from physx_dart.pinocchio.coupling import Coupling
 from physx_dart.pinocchio.robot import PinocchioRobot
 from physx_dart.pinocchio.solver import ImpulseSolver
 from physx_dart.shared.robot_simulation import RobotSimulation
@@ -26,9 +27,10 @@ _WITHOUT_RK4 = ("actuators", "contacts", "isotropic_friction", "joint_friction",
 class PinocchioBackend(Backend):
     """Pinocchio, a library of rigid-body algorithms.
 
-    Robots and objects collide with static things, but not with each other. Contact solvers: ``pgs``
-    (default) and ``admm``, both with a friction cone. Contacts are found with points and spheres,
-    see `physx_dart.pinocchio.contacts`; there is no choice of detectors.
+    Contact solvers: ``pgs`` (default) and ``admm``, both with a friction cone, for problems that
+    Newton's method does not solve. Contacts with planes and height fields are found with points and
+    spheres (`physx_dart.pinocchio.contacts`), those of shapes with shapes by coal
+    (`physx_dart.pinocchio.pairs`); there is no choice of detectors.
     """
 
     def build(self, world: World, seed: int | None = None) -> Simulation:
@@ -50,9 +52,7 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
     """A world of Pinocchio."""
 
     engine = "pinocchio"
-    lacks: ClassVar[frozenset[str]] = frozenset(
-        {"body_contacts", "mesh_contacts", "raycast", "self_collisions"}
-    )
+    lacks: ClassVar[frozenset[str]] = frozenset({"mesh_contacts", "raycast"})
 
     def __init__(self, world: World) -> None:
         """Build the world; errors are those of the backend's `build`."""
@@ -62,6 +62,7 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
         statics = [] if world.contacts == "none" else parts.statics
         features = sorted(frozenset(FEATURES) - self.lacks)
         robots = [PinocchioRobot(mover, world, statics, solver, features) for mover in parts.movers]
+        self._coupling = Coupling(parts, robots, solver, features)
         lacks = () if world.integrator == "euler" else (*_WITHOUT_RK4, "restitution")
         super().__init__(parts, robots, lacks)
 
@@ -69,19 +70,12 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
         world, features = parts.world, frozenset(FEATURES) - self.lacks
         if world.detector is not None:
             raise FeatureNotSupportedError(self.engine, f"detector {world.detector}", features)
-        touching = [mover for mover in parts.movers if mover.model.shapes]
-        if world.contacts == "all":
-            if len(touching) > 1:
-                advice = 'Use World(contacts="static").'
-                raise FeatureNotSupportedError(self.engine, "body_contacts", features, advice)
-            if any(mover.self_collisions for mover in touching):
-                raise FeatureNotSupportedError(self.engine, "self_collisions", features)
         if world.integrator == "rk4":
             self._check_rk4(parts, features)
 
     def _check_rk4(self, parts: Parts, features: frozenset[str]) -> None:
         advice = 'Use World(integrator="euler").'
-        if parts.statics and parts.world.contacts != "none":
+        if any(mover.model.shapes for mover in parts.movers):
             raise FeatureNotSupportedError(self.engine, "contacts in rk4", features, advice)
         for joint in (joint for mover in parts.movers for joint in mover.model.joints):
             limits = [joint.lower, joint.upper, joint.max_velocity]
@@ -96,18 +90,23 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
 
     def advance(self, n: int) -> None:
         """Simulate n physics steps."""
+        if self._coupling:
+            for _ in range(n):
+                self._coupling.step()
+            return
         for robot in self._robots:
             robot.run(n)
 
     def forget(self) -> None:
         """Make the state alone determine what follows: forget the impulses of the last step."""
+        self._coupling.forget()
         for robot in self._robots:
             robot.forget()
 
     def read_contacts(self) -> Records:
         """Return the contacts of the last physics step."""
         first, statics = 0, len(self.layout.bodies)
-        found = []
+        found = [self._coupling.contacts()]
         for robot in self._robots:
             found.append(robot.contacts(first, statics))
             first += len(robot.model.links)

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from physx_core.errors import FeatureNotSupportedError
-from physx_core.rotations import to_matrix
 from physx_core.simulation import Ground, HeightField, Stairs
 from physx_core.typing import Vector
 from physx_dart.models.parts import Static
-from physx_dart.models.shapes import CollisionShape
 
 
 class Surface(ABC):
@@ -48,31 +44,6 @@ class Plane(Surface):
 
 
 @dataclass(frozen=True, eq=False)
-class Solid(Surface):
-    """A shape at a place: center (3,), rotation matrix (3, 3)."""
-
-    shape: CollisionShape
-    center: Vector
-    rotation: Vector
-
-    def distances(self, points: Vector) -> tuple[Vector, Vector]:
-        """Return distances and axes."""
-        local = (points - self.center) @ self.rotation
-        size = self.shape.size
-        if self.shape.kind == "box":
-            found, normals = _box(local, 0.5 * np.array(size))
-        elif self.shape.kind == "cylinder":
-            found, normals = _cylinder(local, *size)
-        else:
-            half = 0.5 * size[1] if self.shape.kind == "capsule" else 0.0
-            axis = np.zeros_like(local)
-            axis[:, 2] = np.clip(local[:, 2], -half, half)
-            lengths, normals = _directions(local - axis)
-            found = lengths - size[0]
-        return found, axes_of(normals @ self.rotation.T)
-
-
-@dataclass(frozen=True, eq=False)
 class Heights(Surface):
     """A height field; distances are to the plane of the triangle below or above."""
 
@@ -102,23 +73,14 @@ class Heights(Surface):
         return found, axes_of(upward / lengths[:, None])
 
 
-def surfaces_of(static: Static, engine: str, features: Sequence[str]) -> list[Surface]:
-    """Return the surfaces of something static."""
+def surface_of(static: Static) -> Surface | None:
+    """Return the surface of the ground; None for shapes, and for steps on it."""
     what = static.what
     if isinstance(what, HeightField):
-        return [Heights(what)]
+        return Heights(what)
     if isinstance(what, Ground):
-        return [Plane(np.array(what.normal), float(what.height))]
-    if isinstance(what, Stairs):
-        found: list[Surface] = [Plane(np.array([0.0, 0.0, 1.0]), 0.0)]
-        for center, size in what.boxes():
-            box = CollisionShape("box", size, np.zeros(3), np.eye(3), "ground", 1.0, 0.0)
-            found.append(Solid(box, np.array(center), np.eye(3)))
-        return found
-    if what.kind == "mesh":
-        raise FeatureNotSupportedError(engine, "mesh_contacts", features, "Use a box instead.")
-    rotation = to_matrix(static.orientation)
-    return [Solid(what, np.array(static.position), rotation)]
+        return Plane(np.array(what.normal), float(what.height))
+    return Plane(np.array([0.0, 0.0, 1.0]), 0.0) if isinstance(what, Stairs) else None
 
 
 def axes_of(normals: Vector) -> Vector:
@@ -128,34 +90,3 @@ def axes_of(normals: Vector) -> Vector:
     first = np.where(steep, [z, nothing, -x], [y, -x, nothing]).T
     first /= np.sqrt(np.einsum("ij,ij->i", first, first))[:, None]
     return np.stack([first, np.cross(normals, first), normals], axis=1)
-
-
-def _directions(vectors: Vector) -> tuple[Vector, Vector]:
-    """Return lengths and directions of vectors; the direction of a zero vector is upward."""
-    lengths = np.linalg.norm(vectors, axis=1)
-    upward = np.array([0.0, 0.0, 1.0])
-    safe = np.where(lengths > 1e-12, lengths, 1.0)[:, None]
-    return lengths, np.where(lengths[:, None] > 1e-12, vectors / safe, upward)
-
-
-def _box(local: Vector, half: Vector) -> tuple[Vector, Vector]:
-    beyond = np.abs(local) - half
-    lengths, outward = _directions(local - np.clip(local, -half, half))
-    nearest = np.argmax(beyond, axis=1)
-    rows = np.arange(len(local))
-    inward = np.zeros_like(local)
-    inward[rows, nearest] = np.where(local[rows, nearest] < 0, -1.0, 1.0)
-    inside = beyond[rows, nearest] <= 0
-    found = np.where(inside, beyond[rows, nearest], lengths)
-    return found, np.where(inside[:, None], inward, outward)
-
-
-def _cylinder(local: Vector, radius: float, length: float) -> tuple[Vector, Vector]:
-    flat = local.copy()
-    flat[:, 2] = 0.0
-    radial, outward = _directions(flat)
-    profile = np.column_stack([radial, np.zeros(len(local)), local[:, 2]])
-    found, normals = _box(profile, np.array([radius, 1.0, 0.5 * length]))
-    along = np.array([0.0, 0.0, 1.0])
-    outward = np.where(radial[:, None] > 1e-12, outward, np.array([1.0, 0.0, 0.0]))
-    return found, normals[:, :1] * outward + normals[:, 2:] * along

@@ -28,7 +28,7 @@ class PushBoxEnv(RobotEnv):
     """Push a box of 0.5 kg over the ground to a goal: ``physx/PushBox-v0``.
 
     The robot is a gantry that moves a stick over the ground. It needs an engine with contacts
-    between moving bodies: DART. Action, shape (2,): forces along x and y, as fractions of 20 N.
+    between moving bodies. Action, shape (2,): forces along x and y, as fractions of 20 N.
     Observation, shape (15,): position and velocity of the stick; position of the box, cosine and
     sine of its heading, its linear and angular velocity; vectors from the stick to the box and from
     the box to the goal; in m, m/s and rad/s. Reward: minus the box's distance from the goal and a

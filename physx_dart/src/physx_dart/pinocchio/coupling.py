@@ -1,0 +1,84 @@
+"""Steps of robots and objects that may touch each other, or static shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from physx_core.simulation import CONTACT
+from physx_core.typing import Records
+from physx_dart.models.parts import Parts
+from physx_dart.pinocchio.constraints import constrained
+from physx_dart.pinocchio.pairs import PairFinder, PairPoints
+from physx_dart.pinocchio.robot import PinocchioRobot
+from physx_dart.pinocchio.solver import ImpulseSolver
+
+
+class Coupling:
+    """Steps robots whose shapes may touch other shapes; those that do are solved for together."""
+
+    def __init__(
+        self,
+        parts: Parts,
+        robots: Sequence[PinocchioRobot],
+        solver: ImpulseSolver,
+        features: Sequence[str],
+    ) -> None:
+        """Find what may touch."""
+        self._robots, self._solver, self._period = robots, solver, parts.world.period
+        self._finder = PairFinder(parts, robots, features)
+        self._touching: PairPoints | None = None
+        self._impulses = np.zeros((0, 3))
+        # Impulses of pairs in the last step, in the world frame, with which the next one begins.
+        self._warmth = np.zeros((len(self._finder), 3))
+
+    def __bool__(self) -> bool:
+        """Return whether any pair of shapes may touch."""
+        return len(self._finder) > 0
+
+    def forget(self) -> None:
+        """Forget the impulses of the last step."""
+        self._warmth.fill(0.0)
+
+    def step(self) -> None:
+        """Simulate one step of all robots."""
+        free = [robot.free_velocities() for robot in self._robots]
+        self._touching = touching = self._finder.find(free, self._period)
+        coupled = [] if touching is None else sorted(touching.robots)
+        for place, robot in enumerate(self._robots):
+            if place not in coupled:
+                robot.finish(robot.constrained(free[place]))
+        if touching is None:
+            self.forget()
+            return
+        group = [self._robots[place] for place in coupled]
+        contacts = touching.contacts
+        wide = [contacts.jacobian[:, self._finder.columns[place]] for place in coupled]
+        contacts.jacobian = np.concatenate(wide, axis=1)
+        share = self._warmth[touching.pairs] / np.bincount(touching.pairs)[touching.pairs, None]
+        parts = [self._robots[place].constraints(free[place], touched=True) for place in coupled]
+        after, self._impulses = constrained(
+            parts,
+            np.concatenate([robot.native()[1] for robot in group]),
+            np.concatenate([free[place] for place in coupled]),
+            self._period,
+            self._solver,
+            contacts,
+            np.einsum("kij,kj->ki", contacts.axes, share),
+        )
+        self.forget()
+        along = np.einsum("kij,ki->kj", contacts.axes, self._impulses)
+        np.add.at(self._warmth, touching.pairs, along)
+        first = 0
+        for robot in group:
+            robot.finish(after[first : first + robot.nv])
+            first += robot.nv
+
+    def contacts(self) -> Records:
+        """Return the contacts of shapes with shapes in the last step."""
+        touching = self._touching
+        if touching is None:
+            return np.zeros(0, CONTACT)
+        first, second = touching.bodies.T
+        return touching.contacts.records(first, second, self._impulses, self._period)

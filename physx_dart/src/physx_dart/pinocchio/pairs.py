@@ -1,0 +1,268 @@
+"""Contacts of shapes with shapes, found by coal: of bodies, links, and static objects.
+
+coal finds the patch in which two shapes touch: the points of faces, edges, and corners that lie in
+one plane.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import coal
+import numpy as np
+from numpy.typing import NDArray
+
+from physx_core.errors import FeatureNotSupportedError
+from physx_core.rotations import to_matrix
+from physx_core.simulation import Stairs
+from physx_core.typing import Vector
+from physx_dart.models.parts import Parts
+from physx_dart.models.shapes import CollisionShape
+from physx_dart.pinocchio.contacts import CROSS, MARGIN, ContactPoints, joint_poses, supports_of
+from physx_dart.pinocchio.robot import PinocchioRobot
+from physx_dart.pinocchio.surfaces import axes_of
+
+_TOLERANCE = 1e-4
+"""Distance, in m, from the plane of a patch within which a point belongs to it."""
+
+
+@dataclass(eq=False, slots=True)
+class _Solid:
+    """A collision shape: place of its robot (None: static), joint, link, body, and pose there."""
+
+    owner: int | None
+    joint: int
+    link: int
+    body: int
+    shape: CollisionShape
+    rotation: Vector
+    position: Vector
+
+
+@dataclass(eq=False, slots=True)
+class PairPoints:
+    """Points in which shapes touch, or may touch within the next step.
+
+    Attributes:
+        pairs: The pair of shapes of each, shape (k,).
+        bodies: Its two bodies, places in `Layout.names`, shape (k, 2).
+        robots: Places of all robots that touch.
+        contacts: The points; the Jacobian has a column for each velocity of all robots.
+    """
+
+    pairs: NDArray[np.intp]
+    bodies: NDArray[np.intp]
+    robots: set[int]
+    contacts: ContactPoints
+
+
+class PairFinder:
+    """Finds contacts between the shapes of robots and objects, and with static shapes."""
+
+    def __init__(
+        self, parts: Parts, robots: Sequence[PinocchioRobot], features: Sequence[str]
+    ) -> None:
+        """Prepare all pairs that may touch."""
+        self._robots, self._parts = robots, parts
+        solids = [*self._moving(), *self._static()]
+        self._pairs = list(self._possible(solids))
+        if any(solids[place].shape.kind == "mesh" for pair in self._pairs for place in pair):
+            advice = 'Use Robot(collisions="boxes") or "capsules", or a box as an object.'
+            raise FeatureNotSupportedError("pinocchio", "mesh_contacts", features, advice)
+        self._solids = solids
+        self._poses = [joint_poses(robot.data) for robot in robots]
+        self._supports = [supports_of(robot.model_in_motion) for robot in robots]
+        ends = [1, *(1 + np.cumsum([len(turns) for turns, _ in self._poses])).tolist()]
+        self._rows = [slice(*pair) for pair in itertools.pairwise(ends)]
+        widths = np.cumsum([0, *(robot.nv for robot in robots)]).tolist()
+        self.columns = [slice(*pair) for pair in itertools.pairwise(widths)]
+        # Poses and twists of all joints; the first row is that of static things.
+        self._turns, self._places = np.zeros((ends[-1], 3, 3)), np.zeros((ends[-1], 3))
+        self._twists, self._turns[0] = np.zeros((ends[-1], 6)), np.eye(3)
+        joints = [0 if s.owner is None else ends[s.owner] + s.joint for s in solids]
+        self._joints = np.array(joints, np.intp)
+        self._rotations = np.array([solid.rotation for solid in solids]).reshape(-1, 3, 3)
+        self._positions = np.array([solid.position for solid in solids]).reshape(-1, 3, 1)
+        self._radii = np.array([_radius(solid.shape) for solid in solids])
+        self._first, self._second = np.array(self._pairs, np.intp).reshape(-1, 2).T
+        self._transforms = [coal.Transform3s() for _ in solids]
+        shapes = [_geometry(solid.shape) for solid in solids]
+        self._queries = [
+            (coal.ComputeCollision(a, b), coal.ComputeContactPatch(a, b))
+            for a, b in ((shapes[i], shapes[j]) for i, j in self._pairs)
+        ]
+        self._geometries = shapes  # the queries do not keep them alive
+        self._request, self._patch_request = coal.CollisionRequest(), coal.ContactPatchRequest()
+        self._request.enable_contact, self._request.num_max_contacts = True, 1
+        self._patch_request.setPatchTolerance(_TOLERANCE)
+
+    def __len__(self) -> int:
+        """Return the number of pairs."""
+        return len(self._pairs)
+
+    def _moving(self) -> Iterator[_Solid]:
+        first = 0
+        for owner, (mover, robot) in enumerate(zip(self._parts.movers, self._robots, strict=True)):
+            links = {name: i for i, name in enumerate(mover.model.links)}
+            for shape in mover.model.shapes:
+                link = links.get(shape.body, 0)
+                frame = robot.model_in_motion.frames[robot.frames[link]]
+                turn, place = frame.placement.rotation, frame.placement.translation
+                pose = turn @ shape.rotation, turn @ shape.position + place
+                yield _Solid(owner, frame.parentJoint, link, first + link, shape, *pose)
+            first += len(mover.model.links)
+        self.statics = first
+
+    def _static(self) -> Iterator[_Solid]:
+        for place, static in enumerate(self._parts.statics):
+            what, body = static.what, self.statics + place
+            if isinstance(what, Stairs):
+                for center, size in what.boxes():
+                    material = what.friction, what.restitution
+                    box = CollisionShape("box", size, np.zeros(3), np.eye(3), "ground", *material)
+                    yield _Solid(None, 0, 0, body, box, np.eye(3), np.array(center))
+            elif isinstance(what, CollisionShape):
+                turn = to_matrix(static.orientation)
+                yield _Solid(None, 0, 0, body, what, turn, np.array(static.position))
+
+    def _possible(self, solids: Sequence[_Solid]) -> Iterator[tuple[int, int]]:
+        """Yield the pairs of shapes that may touch: those that can move against each other."""
+        for (i, a), (j, b) in itertools.combinations(enumerate(solids), 2):
+            if a.owner is None or not (b.owner is None or self._parts.world.contacts == "all"):
+                continue
+            if a.joint == 0 and (b.owner is None or b.joint == 0):
+                continue
+            if a.owner == b.owner:
+                parents = self._robots[a.owner].model_in_motion.parents
+                near = (
+                    a.joint == b.joint or parents[a.joint] == b.joint or parents[b.joint] == a.joint
+                )
+                if near:
+                    continue
+                if not self._parts.movers[a.owner].self_collisions:
+                    continue
+            yield i, j
+
+    def find(self, velocities: Sequence[Vector], period: float) -> PairPoints | None:
+        """Return the points that touch, or may within the next step; None if there are none.
+
+        Args:
+            velocities: That each robot would have without contacts.
+            period: Length of the step, in s.
+        """
+        self._move(velocities)
+        turns, twists = self._turns[self._joints], self._twists[self._joints]
+        centers = (turns @ self._positions)[:, :, 0] + self._places[self._joints]
+        speeds = np.linalg.norm(twists[:, :3] + np.cross(twists[:, 3:], centers), axis=1)
+        reach = self._radii + period * (
+            speeds + self._radii * np.linalg.norm(twists[:, 3:], axis=1)
+        )
+        first, second = self._first, self._second
+        apart = np.linalg.norm(centers[first] - centers[second], axis=1)
+        near = (apart < reach[first] + reach[second] + MARGIN).nonzero()[0].tolist()
+        if not near:
+            return None
+        rotations, placed = turns @ self._rotations, set[int]()
+        found: list[tuple[int, Vector, Vector, float]] = []
+        margins = MARGIN + reach - self._radii
+        for pair in near:
+            i, j = self._pairs[pair]
+            for solid in {i, j} - placed:
+                self._transforms[solid].setRotation(rotations[solid])
+                self._transforms[solid].setTranslation(centers[solid])
+                placed.add(solid)
+            found += self._touch(pair, float(margins[i] + margins[j]))
+        return self._together(found, velocities, period) if found else None
+
+    def _move(self, velocities: Sequence[Vector]) -> None:
+        """Update poses and twists of all joints."""
+        self._motions: list[Vector] = []
+        for robot, velocity, (turns, places), supports, rows in zip(
+            self._robots, velocities, self._poses, self._supports, self._rows, strict=True
+        ):
+            motions = robot.place_joints()
+            self._turns[rows], self._places[rows] = turns, places
+            self._twists[rows] = (supports * velocity) @ motions.T
+            self._motions.append(motions)
+
+    def _touch(self, pair: int, margin: float) -> list[tuple[int, Vector, Vector, float]]:
+        """Return pair, point, normal from the second to the first shape, and gap of each point."""
+        i, j = self._pairs[pair]
+        poses, (collide, patch_of) = (self._transforms[i], self._transforms[j]), self._queries[pair]
+        self._request.security_margin = margin
+        result, patches = coal.CollisionResult(), coal.ContactPatchResult()
+        if not collide(*poses, self._request, result):
+            return []
+        contact = result.getContact(0)
+        normal, gap = -contact.normal, contact.penetration_depth
+        patch_of(*poses, result, self._patch_request, patches)
+        points = [contact.pos]
+        if patches.numContactPatches():
+            patch = patches.getContactPatch(0)
+            points = [patch.getPoint(k) for k in range(patch.size())] or points
+        return [(pair, point, normal, gap) for point in points]
+
+    def _together(
+        self, found: list[tuple[int, Vector, Vector, float]], velocities: Any, period: float
+    ) -> PairPoints | None:
+        """Return the points that touch within the step, with their Jacobian."""
+        pairs = np.array([each[0] for each in found], np.intp)
+        points = np.array([each[1] for each in found])
+        axes = axes_of(np.array([each[2] for each in found]))
+        gaps = np.array([each[3] for each in found])
+        frames = np.concatenate([axes, axes @ (points @ CROSS).reshape(-1, 3, 3)], axis=2)
+        jacobian = np.zeros((3 * len(pairs), self.columns[-1].stop))
+        sides = (self._first[pairs], 1.0), (self._second[pairs], -1.0)
+        for motions, supports, rows, columns in zip(
+            self._motions, self._supports, self._rows, self.columns, strict=True
+        ):
+            moved = np.zeros((len(pairs), supports.shape[1]))
+            for solids, sign in sides:
+                joints = self._joints[solids] - rows.start
+                own = (joints >= 0) & (joints < len(supports))
+                moved[own] += sign * supports[joints[own]]
+            if moved.any():
+                jacobian[:, columns] = frames.reshape(-1, 6) @ motions * np.repeat(moved, 3, axis=0)
+        ahead = gaps + period * (jacobian[2::3] @ np.concatenate(velocities))
+        close = (np.minimum(gaps, ahead) < MARGIN).nonzero()[0]
+        if not len(close):
+            return None
+        pairs = pairs[close]
+        places = (self._pairs[pair] for pair in pairs)
+        touching = [(self._solids[i], self._solids[j]) for i, j in places]
+        contacts = ContactPoints(
+            np.array([a.link for a, _ in touching], np.intp),
+            pairs,
+            pairs,
+            points[close],
+            axes[close],
+            gaps[close],
+            np.array([min(a.shape.friction, b.shape.friction) for a, b in touching]),
+            np.array([a.shape.restitution * b.shape.restitution for a, b in touching]),
+            jacobian.reshape(len(gaps), 3, -1)[close].reshape(3 * len(close), -1),
+        )
+        owners = {solid.owner for both in touching for solid in both if solid.owner is not None}
+        bodies = np.array([(a.body, b.body) for a, b in touching], np.intp)
+        return PairPoints(pairs, bodies, owners, contacts)
+
+
+def _radius(shape: CollisionShape) -> float:
+    """Return the radius of a sphere around a shape, in m."""
+    if shape.kind in ("box", "mesh"):
+        return 0.5 * math.hypot(*shape.size)
+    if shape.kind == "sphere":
+        return shape.size[0]
+    radius, length = shape.size
+    return radius + 0.5 * length if shape.kind == "capsule" else math.hypot(radius, 0.5 * length)
+
+
+def _geometry(shape: CollisionShape) -> Any:
+    """Return a shape for coal; None: a mesh, which touches nothing."""
+    if shape.kind == "mesh":
+        return None
+    kinds = {"box": coal.Box, "sphere": coal.Sphere, "capsule": coal.Capsule}
+    return kinds.get(shape.kind, coal.Cylinder)(*map(float, shape.size))
