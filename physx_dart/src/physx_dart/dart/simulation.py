@@ -1,8 +1,8 @@
 """The engine DART. All calls of dartpy are in `physx_dart.dart`.
 
-DART integrates with semi-implicit Euler: velocities first, then positions with the new velocities.
-Damping and springs are implicit; contacts, position and velocity limits, servos, and Coulomb
-friction are constraints of its solver.
+DART integrates with semi-implicit Euler: velocities first, then positions with the new velocities;
+the integrator ``rk4`` uses its forward dynamics alone. Damping and springs are implicit; contacts,
+position and velocity limits, servos, and Coulomb friction are constraints of its solver.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from physx_dart.dart.skeleton import DartRobot
 from physx_dart.models import catalog
 from physx_dart.models.parts import Parts, read_parts
 from physx_dart.models.shapes import CollisionShape
+from physx_dart.shared import rk4
 from physx_dart.shared.robot_simulation import RobotSimulation
 
 _DETECTORS = {
@@ -72,7 +73,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
     """A world of DART."""
 
     engine = "dart"
-    lacks: ClassVar[frozenset[str]] = frozenset({"armature", "rk4"})
+    lacks: ClassVar[frozenset[str]] = frozenset({"armature"})
 
     def __init__(self, world: World) -> None:
         """Build the world; errors are those of the backend's `build`."""
@@ -90,6 +91,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         self._world = _new_world(world, detector, solver)
         self._stateless = (detector, solver) == _STATELESS
         self._kept: Records | None = None
+        self._rk4 = world.integrator == "rk4"
         robots = [self._add(parts, place) for place in range(len(parts.movers))]
         statics = [] if world.contacts == "none" else parts.statics
         self._statics = [static_skeleton(static) for static in statics]
@@ -105,12 +107,13 @@ class DartSimulation(RobotSimulation[DartRobot]):
         lacks = [] if solver in _ISOTROPIC else ["isotropic_friction"]
         lacks += ["exact_restore"] if detector == "dart" and not self._stateless else []
         lacks += [] if detector in _RAYS else ["raycast"]
+        lacks += rk4.LACKS if self._rk4 else []
         super().__init__(parts, robots, lacks)
 
     def _check_features(self, parts: Parts, detector: str) -> None:
         features = frozenset(FEATURES) - self.lacks
-        if parts.world.integrator != "euler":
-            raise FeatureNotSupportedError(self.engine, "rk4", features)
+        if parts.world.integrator == "rk4":
+            rk4.check(parts, self.engine, features)
         if any(joint.settings.armature for each in parts.movers for joint in each.model.joints):
             raise FeatureNotSupportedError(self.engine, "armature", features)
         shapes = [shape for each in parts.movers for shape in each.model.shapes]
@@ -131,6 +134,10 @@ class DartSimulation(RobotSimulation[DartRobot]):
 
     def advance(self, n: int) -> None:
         """Simulate n physics steps."""
+        if self._rk4:
+            for robot in self._robots:
+                robot.run_rk4(n, self.period)
+            return
         self._kept, step = None, self._step_world
         for _ in range(n):
             step(False)

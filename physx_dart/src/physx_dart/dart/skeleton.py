@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
@@ -10,6 +11,7 @@ from dartpy import dynamics
 
 from physx_core.rotations import (
     from_rotation_vector,
+    multiply,
     rotate_back,
     to_matrix,
     to_rotation_vector,
@@ -18,6 +20,7 @@ from physx_core.typing import Vector
 from physx_dart.dart.loading import link_name, load_skeleton
 from physx_dart.models.parts import Mover
 from physx_dart.models.urdf import Joint
+from physx_dart.shared import rk4
 from physx_dart.shared.engine import RobotEngine, base_accelerations
 
 _ACTUATORS = {
@@ -48,11 +51,14 @@ class DartRobot(RobotEngine):
         self.bodies = [self.skeleton.getBodyNode(link_name(link)) for link in self.model.links]
         for joint, native in zip(self.model.joints, joints, strict=True):
             _configure(joint, native)
-        self._held = np.zeros(self.nv)
+        self._held, self._commands = np.zeros(self.nv), np.zeros(self.nv - self.base)
+        self._pushes: list[tuple[int, Vector, Vector, Vector, bool]] = []
+        self._change: Vector | None = None
         self._read()
 
     def hold(self, commands: Vector) -> None:
         """Hold commands, shape (joints,), that are within their limits."""
+        self._commands = commands
         if self.base or not self._sorted:
             if self._sorted:
                 self._held[self.base :] = commands
@@ -92,6 +98,8 @@ class DartRobot(RobotEngine):
 
     def accelerations(self) -> Vector:
         """Return the accelerations of the last step, shape (nv,)."""
+        if self._change is not None:
+            return self._change.copy()
         a = self._to_layout(self.skeleton.getAccelerations())
         if not self.base:
             return a
@@ -110,6 +118,7 @@ class DartRobot(RobotEngine):
 
     def write(self, positions: Vector, velocities: Vector) -> None:
         """Set the state."""
+        self._change = None
         self._place(self.skeleton, positions, velocities)
         self._read()
 
@@ -119,6 +128,7 @@ class DartRobot(RobotEngine):
 
     def set_native(self, positions: Vector, velocities: Vector) -> None:
         """Set the state that `native` returned."""
+        self._change = None
         self.skeleton.setPositions(positions)
         self.skeleton.setVelocities(velocities)
         self._read()
@@ -135,13 +145,54 @@ class DartRobot(RobotEngine):
 
     def push(self, link: int, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
         """Apply a wrench until `release`."""
-        body = self.bodies[link]
-        body.addExtForce(force, point, local, True)
-        body.addExtTorque(torque, local)
+        self._pushes.append((link, force, torque, point, local))
+        _push(self.bodies[link], force, torque, point, local)
 
     def release(self) -> None:
         """Remove all wrenches."""
+        self._pushes.clear()
         self.skeleton.clearExternalForces()
+
+    def run_rk4(self, n: int, period: float) -> None:
+        """Simulate n steps with the classic Runge-Kutta method of fourth order."""
+        torques = np.concatenate([np.zeros(self.base), self._commands])
+        for _ in range(n):
+            q, twist = self.positions(), self.velocities()
+            q, v = rk4.step(
+                q,
+                self._with_world(q, twist),
+                period,
+                functools.partial(self._rk4_acceleration, torques),
+                self._moved,
+            )
+            self.write(q, self._with_base(q, v))
+            self._change = (self.velocities() - twist) / period
+
+    def _rk4_acceleration(self, torques: Vector, q: Vector, v: Vector) -> Vector:
+        """Return the derivative of velocities whose linear part is along the world's axes."""
+        twist = self._with_base(q, v)
+        a = self.forward(q, twist, torques, pushed=True)
+        if self.base:
+            a[:3] += np.cross(twist[3:6], twist[:3])
+        return self._with_world(q, a)
+
+    def _with_world(self, q: Vector, twist: Vector) -> Vector:
+        """Return velocities or the like with the linear part along the world's axes."""
+        if not self.base:
+            return twist
+        return np.concatenate([to_matrix(q[3:7]) @ twist[:3], twist[3:]])
+
+    def _with_base(self, q: Vector, v: Vector) -> Vector:
+        """Return the opposite of `_with_world`."""
+        return np.concatenate([v[:3] @ to_matrix(q[3:7]), v[3:]]) if self.base else v
+
+    def _moved(self, q: Vector, motion: Vector) -> Vector:
+        """Return positions after a motion: rotations are about the base's own axes."""
+        if not self.base:
+            return q + motion
+        turn = from_rotation_vector(*motion[3:6].tolist())
+        quaternion = multiply(q[3:7].tolist(), turn)
+        return np.concatenate([q[:3] + motion[:3], quaternion, q[7:] + motion[6:]])
 
     @property
     def _shadow(self) -> Any:
@@ -150,9 +201,22 @@ class DartRobot(RobotEngine):
             self._made_shadow.setGravity(list(self._gravity))
         return self._made_shadow
 
-    def forward(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
-        """Return the accelerations that torques cause, with joint resistance."""
+    def forward(
+        self, positions: Vector, velocities: Vector, torques: Vector, *, pushed: bool = False
+    ) -> Vector:
+        """Return the accelerations that torques cause, with joint resistance.
+
+        Args:
+            positions: Shape (nq,).
+            velocities: Shape (nv,).
+            torques: Shape (nv,).
+            pushed: Whether the present wrenches act, too.
+        """
         rotation = self._place(self._shadow, positions, velocities)
+        self._shadow.clearExternalForces()
+        for link, force, torque, point, local in self._pushes if pushed else ():
+            body = self._shadow.getBodyNode(link_name(self.model.links[link]))
+            _push(body, force, torque, point, local)
         forces = torques - self.resistance.torques(positions, velocities)
         if rotation is not None:
             forces = np.concatenate([rotation @ forces[3:6], rotation @ forces[:3], forces[6:]])
@@ -201,6 +265,12 @@ class DartRobot(RobotEngine):
         native = np.empty(self.nv)
         native[self._native] = vector
         return native
+
+
+def _push(body: Any, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
+    """Apply a wrench to a body in DART."""
+    body.addExtForce(force, point, local, True)
+    body.addExtTorque(torque, local)
 
 
 def _configure(joint: Joint, native: Any) -> None:

@@ -25,6 +25,7 @@ from physx_dart.pinocchio.contacts import ContactFinder
 from physx_dart.pinocchio.limits import JointConstraints
 from physx_dart.pinocchio.models import frames_of, load_stepping_model
 from physx_dart.pinocchio.solver import ImpulseSolver
+from physx_dart.shared import rk4
 from physx_dart.shared.engine import RobotEngine, base_accelerations
 
 _UNSEEN = 10
@@ -216,18 +217,11 @@ class PinocchioRobot(RobotEngine):
 
     def _step_rk4(self) -> None:
         """Simulate one step with the classic Runge-Kutta method of fourth order."""
-        q, v, dt, model = self._positions, self._velocities, self._period, self._model
-        half = 0.5 * dt
-        a1 = self._acceleration(q, v)
-        v2 = v + half * a1
-        a2 = self._acceleration(pinocchio.integrate(model, q, half * v), v2)
-        v3 = v + half * a2
-        a3 = self._acceleration(pinocchio.integrate(model, q, half * v2), v3)
-        v4 = v + dt * a3
-        a4 = self._acceleration(pinocchio.integrate(model, q, dt * v3), v4)
-        self._earlier, self._before = q, v
-        self._positions = pinocchio.integrate(model, q, dt / 6 * (v + 2 * v2 + 2 * v3 + v4))
-        self._velocities = v + dt / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        integrate = functools.partial(pinocchio.integrate, self._model)
+        state = self._positions, self._velocities
+        self._earlier, self._before = state
+        found = rk4.step(*state, self._period, self._acceleration, integrate)
+        self._positions, self._velocities = found
 
     def _acceleration(self, q: Vector, v: Vector) -> Vector:
         torques = self._torques - self.resistance.smooth(q, v)

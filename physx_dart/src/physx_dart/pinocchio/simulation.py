@@ -19,9 +19,8 @@ from physx_dart.models.parts import Parts, read_parts
 from physx_dart.pinocchio.coupling import Coupling
 from physx_dart.pinocchio.robot import PinocchioRobot
 from physx_dart.pinocchio.solver import ImpulseSolver
+from physx_dart.shared import rk4
 from physx_dart.shared.robot_simulation import RobotSimulation
-
-_WITHOUT_RK4 = ("actuators", "contacts", "isotropic_friction", "joint_friction", "limits")
 
 
 class PinocchioBackend(Backend):
@@ -63,30 +62,14 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
         features = sorted(frozenset(FEATURES) - self.lacks)
         robots = [PinocchioRobot(mover, world, statics, solver, features) for mover in parts.movers]
         self._coupling = Coupling(parts, robots, solver, features)
-        lacks = () if world.integrator == "euler" else (*_WITHOUT_RK4, "restitution")
-        super().__init__(parts, robots, lacks)
+        super().__init__(parts, robots, () if world.integrator == "euler" else rk4.LACKS)
 
     def _check_features(self, parts: Parts) -> None:
         world, features = parts.world, frozenset(FEATURES) - self.lacks
         if world.detector is not None:
             raise FeatureNotSupportedError(self.engine, f"detector {world.detector}", features)
         if world.integrator == "rk4":
-            self._check_rk4(parts, features)
-
-    def _check_rk4(self, parts: Parts, features: frozenset[str]) -> None:
-        advice = 'Use World(integrator="euler").'
-        if any(mover.model.shapes for mover in parts.movers):
-            raise FeatureNotSupportedError(self.engine, "contacts in rk4", features, advice)
-        for joint in (joint for mover in parts.movers for joint in mover.model.joints):
-            limits = [joint.lower, joint.upper, joint.max_velocity]
-            for name, asked in (
-                ("limits", np.isfinite(limits).any()),
-                ("joint_friction", joint.friction > 0),
-                ("actuators", joint.settings.mode != "force"),
-            ):
-                if asked:
-                    what = f'{name} in rk4, of the joint "{joint.name}"'
-                    raise FeatureNotSupportedError(self.engine, what, features, advice)
+            rk4.check(parts, self.engine, features)
 
     def advance(self, n: int) -> None:
         """Simulate n physics steps."""
