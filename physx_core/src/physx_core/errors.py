@@ -73,6 +73,33 @@ class UnknownOptionError(ConfigError):
         )
 
 
+class UnknownArgumentError(UnknownOptionError, TypeError):
+    """A constructor does not have an argument of this name.
+
+    It is a `TypeError` too, in Python's words: Gymnasium and TorchRL offer an environment arguments
+    that it may lack, and look for these words to go on without them.
+    """
+
+    def __init__(self, owner: str, unknown: Iterable[str] = (), known: Iterable[str] = ()) -> None:
+        """Describe the error.
+
+        Args:
+            owner: Name of the class; or, without unknown arguments, the whole message, as Gymnasium
+                raises an error again with its text extended.
+            unknown: Names of the unknown arguments.
+            known: Names of its arguments.
+        """
+        self.owner, self.unknown, self.known = owner, sorted(unknown), sorted(known)
+        message = owner
+        if self.unknown:
+            name = self.unknown[0]
+            message = (
+                f"{owner}.__init__() got an unexpected keyword argument '{name}'."
+                f"{nearest(name, self.known)} Options: {listed(self.known)}."
+            )
+        ConfigError.__init__(self, message)
+
+
 class ConfigFileError(ConfigError):
     """A configuration file is missing or is not valid TOML."""
 

@@ -10,6 +10,7 @@ from .blocks import PDAdapter as PDAdapter
 from .blocks import PDController as PDController
 from .blocks import QuantityObserver as QuantityObserver
 from .bridge.gym_environment import GymEnvironment as GymEnvironment
+from .bridge.plain import plain as plain
 from .bridge.policy import Policy as Policy
 from .env.layers.block_layers import ControlledEnv as ControlledEnv
 from .env.layers.block_layers import ObservedEnv as ObservedEnv

@@ -64,6 +64,16 @@ class Part:
     joints: slice
     bodies: slice
 
+    @property
+    def nq(self) -> int:
+        """Length of its positions."""
+        return int(self.positions.stop - self.positions.start)
+
+    @property
+    def nv(self) -> int:
+        """Length of its velocities."""
+        return int(self.velocities.stop - self.velocities.start)
+
 
 @dataclass(frozen=True)
 class Layout:

@@ -23,7 +23,7 @@ from physx_gym.env.default_spaces import (
 from physx_gym.env.observation_checks import ObservationChecks
 from physx_gym.env.pipeline_env import Info, PipelineEnv, Step
 from physx_gym.env.timing import StepTiming
-from physx_gym.simulator.simulator import Simulator, make_simulator
+from physx_gym.simulator.simulator import make_simulator, simulator_options
 from physx_gym.spaces import copy_tree, fill, neutral
 from physx_gym.telemetry.episode_recorder import EpisodeRecorder
 
@@ -62,6 +62,8 @@ class RobotEnv(PipelineEnv):
         simulation_duration_max: float = 86400.0,
         debug: bool = False,
         render_mode: str | None = None,
+        *,
+        engine: Any = None,
         **kwargs: Any,
     ) -> None:
         """Create an environment; nothing runs before `reset`.
@@ -72,15 +74,19 @@ class RobotEnv(PipelineEnv):
             simulation_duration_max: Time, in s, after which an episode is truncated.
             debug: Whether every physics step is recorded, in training too.
             render_mode: ``"human"``, ``"rgb_array"``, or None: whichever is possible.
-            kwargs: Options of `Simulator.build` or `Simulator`, if one is created; otherwise those
-                of the next class that an environment with several base classes inherits from.
+            engine: Reference of the engine, instead of the simulator's: another way to give the
+                option ``backend``, for trainers with an option of that name.
+            kwargs: Options of `Simulator.build` or `Simulator`, if one is created; all others are
+                those of the next class that an environment with several base classes inherits from.
 
         Raises:
             ConfigError: If an option is invalid.
         """
-        if not isinstance(simulator, Simulator):
-            simulator, kwargs = make_simulator(simulator, kwargs), {}
-        subclass_checks.construct_next(RobotEnv, self, kwargs)
+        known = simulator_options(simulator)
+        simulator, kwargs = make_simulator(simulator, kwargs)
+        if engine is not None:
+            simulator.change_backend(engine)
+        subclass_checks.construct_next(RobotEnv, self, kwargs, known)
         subclass_checks.check_mode(render_mode, self.metadata["render_modes"])
         self.simulator, self.render_mode, self.debug = simulator, render_mode, bool(debug)
         self.step_dt = checks.positive("step_dt", step_dt)

@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
 
-from physx_core.errors import ConfigError, UnknownOptionError
+from physx_core.errors import ConfigError, UnknownArgumentError, UnknownOptionError
 from physx_gym.show.display import has_display
 
 
-def construct_next(kind: type[Any], env: Any, options: Mapping[str, Any]) -> None:
+def construct_next(
+    kind: type[Any], env: Any, options: Mapping[str, Any], known: Iterable[str]
+) -> None:
     """Call the constructor of the next class in the method resolution order of an environment.
 
     Args:
         kind: The class before.
         env: The environment.
         options: Options of the constructor.
+        known: Options that the class before has taken, beside those that it names.
     """
     order = type(env).__mro__
     place = order.index(kind) + 1
     accepting = [each for each in order[place:-1] if "__init__" in vars(each)]
     if options and not accepting:
-        raise UnknownOptionError(type(env).__name__, options, _options(order[:place]))
+        raise UnknownArgumentError(type(env).__name__, options, {*_options(order[:place]), *known})
     super(kind, env).__init__(**options)
 
 

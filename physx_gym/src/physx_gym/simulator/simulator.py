@@ -16,7 +16,6 @@ from physx_core.errors import (
     ConfigError,
     EpisodeError,
     SimulationError,
-    UnknownOptionError,
 )
 from physx_core.simulation import (
     Ground,
@@ -223,6 +222,18 @@ class Simulator(SharedArrays):
         if sensed:
             found["measurements"] = sensed
         return found
+
+    def change_backend(self, backend: Any) -> None:
+        """Simulate with another engine from now on.
+
+        Args:
+            backend: Reference of the engine.
+
+        Raises:
+            EpisodeError: If an episode runs.
+        """
+        self._check_stopped("change_backend")
+        self.backend, self._stale = backend, True
 
     def prepare(self) -> None:
         """Build the engine now, unless it is built."""
@@ -555,22 +566,28 @@ class Simulator(SharedArrays):
             )
 
 
-def make_simulator(thing: Any, options: Mapping[str, Any]) -> Simulator:
-    """Return a simulator of a world, or of the file or name of a robot."""
+def make_simulator(thing: Any, options: Mapping[str, Any]) -> tuple[Simulator, dict[str, Any]]:
+    """Return a simulator of a world, or of the file or name of a robot, and the other options."""
+    if isinstance(thing, Simulator):
+        return thing, dict(options)
     make: Any = Simulator if isinstance(thing, World) else Simulator.build
     if not isinstance(thing, (World, str, Path)):
         raise ConfigError(
             f"An environment needs a Simulator, a World, or the path or name of a robot, not "
             f"{thing!r}."
         )
-    takers: list[Any] = [Simulator] if make is Simulator else [Simulator, Simulator.build]
+    known = simulator_options(thing)
+    own = {name: value for name, value in options.items() if name in known}
+    return make(thing, **own), {name: options[name] for name in options.keys() - own.keys()}
+
+
+def simulator_options(thing: Any) -> set[str]:
+    """Return the names of the options of a simulator that `make_simulator` makes of a thing."""
+    if isinstance(thing, Simulator):
+        return set()
+    takers: list[Any] = [Simulator, *(() if isinstance(thing, World) else (Simulator.build,))]
     known = {name for taker in takers for name in inspect.signature(taker).parameters}
-    known -= {"world", "urdf", "options"}
-    unknown = set(options) - known
-    if unknown:
-        raise UnknownOptionError("Simulator", unknown, known)
-    simulator: Simulator = make(thing, **options)
-    return simulator
+    return known - {"world", "urdf", "options"}
 
 
 def _check_list(option: str, kind: type[Any], given: Any) -> tuple[Any, ...] | None:

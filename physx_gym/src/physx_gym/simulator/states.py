@@ -73,6 +73,11 @@ class RobotState(SharedArrays):
         self.refresh()
         return self._torques
 
+    @property
+    def u_motor(self) -> Vector:
+        """The same as `torques`, under its name in Jiminy."""
+        return self.torques
+
     def refresh(self) -> None:
         """Update `a` and `torques`."""
         simulation, equipment, frame = self._simulation, self._equipment, self._stepper.iter
