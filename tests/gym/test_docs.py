@@ -27,7 +27,7 @@ def page():
 
 def test_all_code_of_the_page_runs(page, tmp_path):
     blocks = [(kind, text) for kind, text in BLOCK.findall(page)]
-    assert [kind for kind, _ in blocks] == ["xml", "python", "python", "toml", *["python"] * 6]
+    assert [kind for kind, _ in blocks] == ["xml", "python", "python", "toml", *["python"] * 7]
     for kind, text in blocks:
         if kind == "xml":
             (tmp_path / "swing.urdf").write_text(text, encoding="utf-8")

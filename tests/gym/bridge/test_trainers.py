@@ -21,7 +21,7 @@ ACCEPTED = {
 
 
 def make_as_torchrl(id, **kwargs):
-    """Make an environment as TorchRL's GymEnv._build_env does; return it and the dropped options."""
+    """Return an environment, made as TorchRL's GymEnv does, and the options that it dropped."""
     kwargs |= {"frameskip": 1, "disable_env_checker": True}
     dropped = []
     while True:
@@ -112,7 +112,7 @@ def test_gymnasium_extends_the_error_without_losing_its_class():
 
 def test_the_error_survives_pickling():
     error = UnknownArgumentError("Thing", ["colour"], ["color"])
-    again = pickle.loads(pickle.dumps(error))
+    again = pickle.loads(pickle.dumps(error))  # noqa: S301
     assert (str(again), again.owner, again.known) == (str(error), "Thing", ["color"])
 
 

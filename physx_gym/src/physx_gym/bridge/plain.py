@@ -50,9 +50,10 @@ class PlainEnv(gymnasium.Env[Any, Any]):
         self.env.unwrapped.np_random = value
 
     @property
-    def np_random_seed(self) -> int | None:
+    def np_random_seed(self) -> int:
         """The environment's seed."""
-        return self.env.unwrapped.np_random_seed
+        found: int = self.env.unwrapped.np_random_seed
+        return found
 
 
 def plain(env: gymnasium.Env[Any, Any]) -> PlainEnv:
