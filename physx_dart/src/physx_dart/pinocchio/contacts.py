@@ -219,7 +219,7 @@ class ContactFinder:
                     np.full(len(rows), place),
                     place * len(points) + rows,
                     touched[rows],
-                    axes[rows],
+                    frames[rows, :, :3],
                     gaps[rows],
                     self._friction[place, rows],
                     self._restitution[place, rows],

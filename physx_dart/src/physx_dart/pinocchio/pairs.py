@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physx_core.errors import FeatureNotSupportedError
-from physx_core.rotations import to_matrix
+from physx_core.rotations import cross_rows, to_matrix
 from physx_core.simulation import Stairs
 from physx_core.typing import Vector
 from physx_dart.models.parts import Parts
@@ -157,12 +157,10 @@ class PairFinder:
         self._move(velocities)
         turns, twists = self._turns[self._joints], self._twists[self._joints]
         centers = (turns @ self._positions)[:, :, 0] + self._places[self._joints]
-        speeds = np.linalg.norm(twists[:, :3] + np.cross(twists[:, 3:], centers), axis=1)
-        reach = self._radii + period * (
-            speeds + self._radii * np.linalg.norm(twists[:, 3:], axis=1)
-        )
+        speeds = _lengths(twists[:, :3] + cross_rows(twists[:, 3:], centers))
+        reach = self._radii + period * (speeds + self._radii * _lengths(twists[:, 3:]))
         first, second = self._first, self._second
-        apart = np.linalg.norm(centers[first] - centers[second], axis=1)
+        apart = _lengths(centers[first] - centers[second])
         near = (apart < reach[first] + reach[second] + MARGIN).nonzero()[0].tolist()
         if not near:
             return None
@@ -248,6 +246,11 @@ class PairFinder:
         owners = {solid.owner for both in touching for solid in both if solid.owner is not None}
         bodies = np.array([(a.body, b.body) for a, b in touching], np.intp)
         return PairPoints(pairs, bodies, owners, contacts)
+
+
+def _lengths(vectors: Vector) -> Vector:
+    """Return the lengths of rows."""
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
 
 
 def _radius(shape: CollisionShape) -> float:

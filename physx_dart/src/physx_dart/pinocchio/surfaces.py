@@ -21,7 +21,8 @@ class Surface(ABC):
         """Return distances of points (n, 3), negative inside, and the axes of the surface there.
 
         Returns:
-            Distances in m, shape (n,); two tangents and the outward normal as rows, (n, 3, 3).
+            Distances in m, shape (n,); two tangents and the outward normal as rows,
+            shape (n, 3, 3), or (1, 3, 3) if they are the same everywhere.
         """
 
 
@@ -34,13 +35,12 @@ class Plane(Surface):
 
     @cached_property
     def axes(self) -> Vector:
-        """Two tangents and the normal, as rows."""
-        return axes_of(self.normal[None])[0]
+        """Two tangents and the normal, as rows, shape (1, 3, 3)."""
+        return axes_of(self.normal[None])
 
     def distances(self, points: Vector) -> tuple[Vector, Vector]:
         """Return distances and axes."""
-        axes = np.broadcast_to(self.axes, (len(points), 3, 3))
-        return points @ self.normal - self.height, axes
+        return points @ self.normal - self.height, self.axes
 
 
 @dataclass(frozen=True, eq=False)
