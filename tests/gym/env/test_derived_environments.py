@@ -219,7 +219,7 @@ def test_recording_in_evaluation(tmp_path):
     assert list(env.log_fieldnames) == ["mine.counter"]
     env.reset()
     env.step([0.5])
-    assert env.log_data == {}
+    assert "mine.counter.up" not in env.log_data["variables"]
     env.stop()
     env.eval()
     _, info = env.reset(options={"log_path": tmp_path / "run.h5"})

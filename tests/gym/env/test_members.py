@@ -237,7 +237,7 @@ def test_logs_are_written_by_stop_and_by_the_next_reset(way):
 def test_nothing_is_registered_while_an_episode_runs():
     env = cart()
     env.reset()
-    env.register_variable("late", np.zeros(1))  # nothing is recorded, so from the next reset on
+    env.register_variable("late", np.zeros(1))  # in training: from the next reset on
     env.stop()
     env.eval()
     env.reset()

@@ -99,9 +99,11 @@ def test_several_logs_are_compared(tmp_path):
 
 def test_an_environment_plots_its_episode(tmp_path):
     env = RobotEnv("cartpole", 0.02)
-    env.reset(seed=0)
-    with pytest.raises(LogError, match="Nothing was recorded of the episode.*eval"):
+    with pytest.raises(LogError, match="Nothing was recorded: no episode has run"):
         env.plot()
+    env.reset(seed=0)
+    env.step([1.0, 0.0])
+    assert {axes.get_title() for axes in env.plot(show=False).axes} >= {"state.q.robot"}
     env.stop()
     env.eval()
     env.reset(seed=0)

@@ -162,9 +162,17 @@ def test_several_logs_side_by_side(tmp_path):
     assert sorted(transforms(tmp_path / "a.rrd", 3)) == list(range(11))
 
 
+def test_an_episode_in_training_is_replayed(tmp_path):
+    env = RobotEnv("ant", 0.05, fixed_base=False)
+    env.reset(seed=0)
+    for _ in range(10):
+        env.step(env.action_space.sample())
+    env.replay(path=tmp_path / "a.rrd")
+    assert sorted(transforms(tmp_path / "a.rrd", 1)) == list(range(16))
+
+
 def test_invalid_replays(tmp_path):
     env = RobotEnv("cartpole", 0.02)
-    env.reset(seed=0)
     with pytest.raises(LogError, match="Nothing was recorded"):
         env.replay(path=tmp_path / "a.rrd")
     env = recorded(2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import h5py
@@ -202,11 +203,65 @@ def test_only_the_newest_logs_stay():
     assert not paths[-1].parent.exists()
 
 
-def test_training_leaves_no_log():
-    env = RobotEnv("cartpole", 0.02)
-    info = run(env, 3)
-    assert "log_path" not in info
+def test_training_records_what_is_measured_once_a_step_and_writes_no_file():
+    env = RobotEnv("cartpole", 0.04, control_period=0.02, period=0.01)
     assert env.log_data == {}
+    observation, info = env.reset(seed=2)
+    assert "log_path" not in info
+    seen = [observation]
+    for _ in range(3):
+        seen.append(env.step(env.action_space.sample())[0])
+        data = env.log_data["variables"]
+        assert data["time"] == pytest.approx([0.04 * number for number in range(len(seen))])
+    env.stop()
+    data = env.log_data
+    log = Log(data["constants"], data["variables"])
+    for robot, motion in ((None, log.trajectory()), ("robot", log.trajectory("robot"))):
+        for row, one in enumerate(seen):
+            np.testing.assert_array_equal(motion.positions[row], one["states"]["agent"]["q"], robot)
+    names = ["sensor.Encoder.slider.position", "sensor.Encoder.slider.velocity"]
+    sensed = [one["measurements"]["Encoder"][:, 0] for one in seen]
+    np.testing.assert_array_equal([log.column(name) for name in names], np.transpose(sensed))
+    assert not [name for name in log.variables if name.startswith(("motor", "action", "state.a"))]
+    assert (log.constants["seed"], log.constants["step_dt"]) == (2, 0.04)
+    assert log.world() == env.simulator.world
+
+
+def test_an_episode_in_training_is_replaced_by_the_next():
+    env = RobotEnv("cartpole", 0.02)
+    run(env, 3)
+    env.reset(seed=1)
+    assert len(env.log_data["variables"]["time"]) == 1
+    env.step([0.5, 0.0])
+    times = env.log_data["variables"]["time"]
+    state = env.snapshot()
+    env.step([0.5, 0.0])
+    assert len(env.log_data["variables"]["time"]) == 3
+    env.restore(state)
+    np.testing.assert_array_equal(env.log_data["variables"]["time"], times)
+    twin = copy.deepcopy(env)
+    for each in (env, twin):
+        each.step([0.5, 0.0])
+        each.reset(seed=2)
+        each.step([0.5, 0.0])
+    assert env.log_data["variables"].keys() == twin.log_data["variables"].keys()
+    for name, column in env.log_data["variables"].items():
+        np.testing.assert_array_equal(column, twin.log_data["variables"][name])
+
+
+def test_options_that_are_changed_describe_the_next_episode_in_training():
+    env = RobotEnv("ant", 0.02, fixed_base=False)
+    run(env, 1)
+    env.stop()
+    env.simulator.set_options({"world": {"ground": {"friction": 0.25}}})
+    assert env.log_data["constants"]["options"]["world"]["ground"]["friction"] == 1.0
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    data = env.log_data
+    assert data["constants"]["options"]["world"]["ground"]["friction"] == 0.25
+    assert (
+        data["variables"]["state.q.robot.z"][0] == env.log_data["variables"]["state.q.robot.z"][0]
+    )
 
 
 # On the command line ------------------------------------------------------------------------

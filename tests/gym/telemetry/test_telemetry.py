@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from physx_core.errors import ConfigError, EpisodeError
-from physx_gym.telemetry.telemetry import Telemetry
+from physx_gym.telemetry.telemetry import MOST_IN_TRAINING, Telemetry
 
 
 def columns(telemetry):
@@ -235,3 +235,25 @@ def test_pickled_variables_are_still_those_of_their_owner():
     found = recorded(copy, 0.0)
     assert (found["v.part.0"][0], found["v.part.1"][0]) == (4.0, 5.0)
     assert dict(copy.fieldnames) == dict(telemetry.fieldnames)
+
+
+def test_only_the_latest_rows_are_kept_in_training():
+    telemetry, value = Telemetry(), np.zeros(1, np.int64)
+    telemetry.register("n", value, is_eval_only=False)
+    telemetry.begin(training=True)
+    rows = MOST_IN_TRAINING + 1500
+    for number in range(rows):
+        value[0] = number
+        telemetry.record(float(number))
+    found = telemetry.log_data["variables"]
+    assert len(found["time"]) == MOST_IN_TRAINING
+    for column in found.values():
+        np.testing.assert_array_equal(column, np.arange(rows - len(column), rows))
+    telemetry.rewind(rows - 1030.0)
+    value[0] = -1
+    telemetry.record(rows + 1.0)
+    assert telemetry.log_data["variables"]["n.0"][-2:].tolist() == [rows - 1031, -1]
+    telemetry.begin(training=True)
+    assert telemetry.rows == 0
+    telemetry.record(0.0)
+    assert telemetry.log_data["variables"]["n.0"].tolist() == [-1]

@@ -24,7 +24,7 @@ class ControlLoop(SharedArrays):
         builds: Build of the simulator that the spaces belong to.
         episode: Number of episodes since the environment was seeded.
         steps: Number of steps of the episode.
-        is_recorded: Whether the episode is recorded.
+        is_recorded: Whether everything is recorded, at every tick; otherwise little, at each step.
         own_checks: Checks of the base environment's observations.
         is_finite: Whether the base environment's observation is known to be free of NaN.
         actions: Accepts actions of the outermost environment.

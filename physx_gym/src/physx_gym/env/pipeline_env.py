@@ -286,7 +286,12 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
     def log_data(self) -> dict[str, Any]:
         """What was recorded of the running episode, up to now, or of the last one.
 
-        A dictionary of ``"constants"`` and ``"variables"``, columns by name; empty without rows.
+        In training that is the state and what sensors measure, once a step; in evaluation
+        everything, at every command and observation.
+
+        Returns:
+            A dictionary of ``"constants"`` and ``"variables"``, columns by name; empty before the
+            first episode.
         """
         return self.recorder.data()
 

@@ -415,11 +415,8 @@ class RobotEnv(PipelineEnv):
         loop.checks.check_form(outermost.observation)
         loop.checks.check_finite(outermost.observation)
         info: Info = {}
-        if self._is_training and not self.debug:
-            loop.is_recorded = self.recorder.begin_training()
-        else:
-            info["log_path"] = self._begin_recording(outermost)
-            loop.is_recorded = True
+        loop.is_recorded = self.debug or not self._is_training
+        self._begin_recording(outermost, loop.is_recorded, info)
         is_held = outermost is self and not loop.is_recorded and self._is_command_held()
         loop.schedule = loop.timing.schedule(is_held, loop.is_recorded and self.debug)
         ends = subclass_checks.check_pair(
@@ -433,16 +430,19 @@ class RobotEnv(PipelineEnv):
             )
         return info
 
-    def _begin_recording(self, outermost: PipelineEnv) -> str:
-        """Start to record everything; return the path of the log."""
+    def _begin_recording(self, outermost: PipelineEnv, everything: bool, info: Info) -> None:
+        """Start to record: everything, with a file that the information names, or the least."""
         constants = {
             "seed": self.np_random_seed,
             "step_dt": self.step_dt,
             "control_dt": self.control_dt,
             "observe_dt": self.observe_dt,
         }
-        path = self.reset_options.get("log_path")
-        return self.recorder.begin(type(self).__name__, outermost.action, path, constants)
+        name, path = type(self).__name__, self.reset_options.get("log_path")
+        if everything:
+            info["log_path"] = self.recorder.begin(name, outermost.action, path, constants)
+        else:
+            self.recorder.begin_training(name, constants)
 
     def _is_command_held(self) -> bool:
         """Return whether commands and observations within a step make no difference."""
@@ -496,6 +496,8 @@ class RobotEnv(PipelineEnv):
         """Control and simulate for a step, up to its last observation."""
         simulator, quantities = self.simulator, self._own_quantities
         measurements, command = self.measurements, self.robot_state.command
+        if not loop.is_recorded:
+            self.recorder.telemetry.record(self.stepper_state.t)
         for observe, control, steps in loop.schedule:
             if observe:
                 outermost.refresh_observation(measurements)

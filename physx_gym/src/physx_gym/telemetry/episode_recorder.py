@@ -16,7 +16,7 @@ from physx_gym.telemetry.telemetry import Telemetry
 
 
 class EpisodeRecorder:
-    """Records episodes: registered variables, and in evaluation the simulator and the action.
+    """Records episodes: registered variables, what is measured, and in evaluation all the rest.
 
     Files whose path is not given lie in a temporary folder that is removed by `close`.
 
@@ -29,16 +29,19 @@ class EpisodeRecorder:
         self._simulator = simulator
         self._folder = LogFolder()
         self._action: tuple[Any, Any] | None = None  # of another type, and its recorded copy
+        self._in_detail = False
+        self._described: dict[str, Any] = {}
+        self._described_when: tuple[Any, ...] = ()
 
-    def begin_training(self) -> bool:
-        """Start an episode of which only what was registered for training is recorded.
+    def begin_training(self, name: str, constants: Mapping[str, Any]) -> None:
+        """Start an episode of which only what is measured, and registered for it, is recorded.
 
-        Returns:
-            Whether anything is recorded.
+        Args:
+            name: Name of the environment.
+            constants: Description of the environment, beside that of its simulator.
         """
-        self._action = None
-        self.telemetry.begin(training=True)
-        return self.telemetry.is_recording
+        self._in_detail, self._action = False, None
+        self.telemetry.begin(None, self._describe(name, constants), training=True)
 
     def begin(self, name: str, action: Any, path: Any, constants: Mapping[str, Any]) -> str:
         """Start an episode of which everything is recorded, and written to a file at its end.
@@ -54,12 +57,21 @@ class EpisodeRecorder:
         """
         if path is not None and not isinstance(path, (str, Path)):
             raise ConfigError(f'The option "log_path" is {path!r} but must be a path.')
-        register_simulator(self.telemetry, self._simulator)
+        described = self._describe(name, constants)
+        self._in_detail = True
         self._register_action(action)
         file = self._folder.new_path(name) if path is None else Path(path)
-        described = {"environment": name, **describe_simulator(self._simulator), **constants}
         self.telemetry.begin(file, described)
         return str(file)
+
+    def _describe(self, name: str, constants: Mapping[str, Any]) -> dict[str, Any]:
+        """Register the simulator, and return the description of it and of the environment."""
+        simulator = self._simulator
+        now = simulator.builds, simulator.control_period, simulator.observe_period
+        if now != self._described_when:
+            register_simulator(self.telemetry, simulator)
+            self._described, self._described_when = describe_simulator(simulator), now
+        return {"environment": name, **self._described, **constants}
 
     def _register_action(self, action: Any) -> None:
         self.telemetry.unregister("action")
@@ -76,7 +88,8 @@ class EpisodeRecorder:
 
     def record(self) -> None:
         """Record a row of the present values."""
-        self._simulator.robot_state.refresh()
+        if self._in_detail:
+            self._simulator.robot_state.refresh()
         if self._action is not None:
             self._action[1][...] = self._action[0]
         self.telemetry.record(self._simulator.stepper_state.t)

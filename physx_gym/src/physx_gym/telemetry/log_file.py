@@ -65,10 +65,7 @@ def _log(source: Any) -> Log:
     if not isinstance(source, Log):
         raise LogError(f"{source!r} is neither a log nor log_data nor the path of a log.")
     if not len(source.variables.get(TIME, ())):
-        raise LogError(
-            "Nothing was recorded of the episode. In training only variables with "
-            "is_eval_only=False are; for all, call eval() before reset."
-        )
+        raise LogError("Nothing was recorded: no episode has run yet. Call reset and step first.")
     return source
 
 

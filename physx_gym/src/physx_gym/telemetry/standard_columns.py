@@ -30,14 +30,16 @@ _SENSED = {
 def register_simulator(telemetry: Telemetry, simulator: Simulator) -> None:
     """Register the state of the world, the sensors, and the commands and torques of the motors.
 
-    To be called before each episode: a simulator whose options have changed has new arrays.
+    What is measured is recorded in training too. To be called whenever the simulator was built: it
+    has new arrays.
     """
     layout, state = simulator.layout, simulator.robot_state
     positions, velocities = state_names(layout)
     units = [BASE_POSITION.get(name.rpartition(".")[2], "") for name in positions]
-    telemetry.register(POSITIONS, simulator.positions, positions, unit=units)
+    always: dict[str, Any] = {"is_eval_only": False}
+    telemetry.register(POSITIONS, simulator.positions, positions, unit=units, **always)
     units = [BASE_VELOCITY.get(name.rpartition(".")[2], "") for name in velocities]
-    telemetry.register(VELOCITIES, simulator.velocities, velocities, unit=units)
+    telemetry.register(VELOCITIES, simulator.velocities, velocities, unit=units, **always)
     for kind, values in simulator.measurements.get("measurements", {}).items():
         sensors = [sensor for sensor in simulator.sensors if kind_of(sensor) == kind]
         units = [
@@ -46,7 +48,8 @@ def register_simulator(telemetry: Telemetry, simulator: Simulator) -> None:
             for quantity, size in sensor.quantities.items()
             for _ in range(size)
         ]
-        telemetry.register(f"sensor.{kind}", values.T, sensor_names(sensors), unit=units)
+        names = sensor_names(sensors)
+        telemetry.register(f"sensor.{kind}", values.T, names, unit=units, **always)
     motors = [motor.joint for motor in simulator.motors]
     if "accelerations" in simulator.simulation.features:
         telemetry.register("state.a", state.a, velocities[simulator.robot.velocities])

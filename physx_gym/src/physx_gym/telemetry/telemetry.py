@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import bisect
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -15,7 +15,8 @@ from physx_core.errors import ConfigError, EpisodeError
 from physx_gym.telemetry.episode_log import TIME, Log
 from physx_gym.telemetry.variables import WORD, Variable, words_of
 
-_BLOCK = 1024  # rows that are allocated at once
+MOST_IN_TRAINING = 100_000
+"""Number of rows of an episode that are kept in training: the latest."""
 
 
 class Telemetry:
@@ -32,7 +33,7 @@ class Telemetry:
         self._constants: Mapping[str, Any] = {}
         self._path: Path | None = None
         self._table = _Table(())
-        self.is_recording = False
+        self.is_recording = self._is_training = False
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the registered variables, without what was recorded."""
@@ -73,7 +74,7 @@ class Telemetry:
             is_eval_only: Whether it is left out in training.
             unit: Unit of all its numbers, or a sequence of units.
         """
-        if self.is_recording:
+        if self.is_recording and not self._is_training:
             raise EpisodeError(
                 f'The variable "{name}" cannot be registered while an episode runs: register it '
                 "before reset, or call stop first."
@@ -125,13 +126,17 @@ class Telemetry:
         Args:
             path: File to write at the end; None: none.
             constants: Description of the episode: plain data.
-            training: Whether to record only what was registered with ``is_eval_only=False``; if
-                there is none, nothing is recorded.
+            training: Whether to record only what was registered with ``is_eval_only=False``, and
+                to keep no more than the latest `MOST_IN_TRAINING` rows; if there is no such
+                variable, nothing is recorded.
         """
         self.end()
         self._path, self._constants = path, dict(constants or {})
         chosen = [each for each in self._variables.values() if not (training and each.is_eval_only)]
-        self._table, self._new = _Table(chosen), set()
+        most = MOST_IN_TRAINING if training else None
+        self._new, self._is_training = set(), training
+        if not self._table.restart(chosen, most):
+            self._table = _Table(chosen, most)
         self.is_recording = bool(chosen)
 
     def record(self, time: float) -> None:
@@ -192,8 +197,14 @@ class Telemetry:
 class _Table:
     """Rows of numbers, copied as words of 8 bytes."""
 
-    def __init__(self, variables: Sequence[Variable]) -> None:
-        """Gather the memory of the variables."""
+    def __init__(self, variables: Sequence[Variable], most: int | None = None) -> None:
+        """Gather the memory of the variables.
+
+        Args:
+            variables: The variables.
+            most: Number of rows that are kept, the latest; None: all.
+        """
+        self._variables = variables
         self.units = {TIME: "s"}
         self._columns: list[tuple[str, np.dtype[Any]]] = []
         for variable in variables:
@@ -204,45 +215,44 @@ class _Table:
             self._columns += own
         arrays = [array for variable in variables for array in variable.arrays]
         self._words = words_of(arrays) or [np.empty(0, WORD)]
-        self._times: list[float] = []
-        self._blocks: list[NDArray[np.int64]] = []
-        self._last = np.empty(0, WORD)  # row of the last time
-        self._free: Iterator[NDArray[np.int64]] = iter(())  # unused rows of the last block
+        self._only = self._words[0] if len(self._words) == 1 else None
+        self._times: deque[float] = deque(maxlen=most)
+        self._rows: deque[bytes] = deque(maxlen=most)
 
     @property
     def rows(self) -> int:
         return len(self._times)
 
+    def restart(self, variables: Sequence[Variable], most: int | None) -> bool:
+        """Discard all rows, if the variables are the same; return whether they are."""
+        known = self._variables
+        is_same = len(known) == len(variables) and most == self._times.maxlen
+        if not is_same or any(a is not b for a, b in zip(known, variables, strict=True)):
+            return False
+        self._times.clear()
+        self._rows.clear()
+        return True
+
     def record(self, time: float) -> None:
         """Copy everything into the next row, or into the last one if that has the same time."""
+        words = np.concatenate(self._words) if self._only is None else self._only
         times = self._times
-        if not times or times[-1] != time:
-            row = next(self._free, None)
-            if row is None:
-                self._blocks.append(np.empty((_BLOCK, len(self._columns)), WORD))
-                self._free = iter(self._blocks[-1])
-                row = next(self._free)
-            self._last = row
+        if times and times[-1] == time:
+            self._rows[-1] = words.tobytes()
+        else:
             times.append(time)
-        np.concatenate(self._words, out=self._last)
+            self._rows.append(words.tobytes())
 
     def rewind(self, time: float) -> None:
         """Discard the rows from a time on."""
-        kept = bisect.bisect_left(self._times, time)
-        del self._times[kept:], self._blocks[-(-kept // _BLOCK) :]
-        self._free = iter(())
-        if kept:
-            begin = kept - (len(self._blocks) - 1) * _BLOCK
-            self._last, self._free = self._blocks[-1][begin - 1], iter(self._blocks[-1][begin:])
+        while self._times and self._times[-1] >= time:
+            self._times.pop()
+            self._rows.pop()
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return copies of the columns by name, each of shape (rows,)."""
-        values = np.empty((len(self._columns), self.rows), WORD)
-        begin = 0
-        for block in self._blocks:
-            part = block[: self.rows - begin]
-            values[:, begin : begin + len(part)] = part.T
-            begin += len(part)
+        words = np.frombuffer(b"".join(self._rows), WORD)
+        values = words.reshape(self.rows, len(self._columns)).T.copy()
         pairs = zip(self._columns, values, strict=True)
         return {TIME: np.array(self._times, np.float64)} | {
             name: column.view(dtype) for (name, dtype), column in pairs
