@@ -13,7 +13,9 @@ _ENTRY_POINTS = {
     "Ant": "ant:AntEnv",
     "Quadruped": "quadruped:QuadrupedEnv",
     "ArmReach": "arm_reach:ArmReachEnv",
+    "ArmReachGoal": "arm_reach:ArmReachGoalEnv",
     "PushBox": "push_box:PushBoxEnv",
+    "PushBoxGoal": "push_box:PushBoxGoalEnv",
 }
 _REWARD_THRESHOLDS = {"Cartpole": 475.0, "Acrobot": -100.0}
 

@@ -10,14 +10,16 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
-from physx_core.errors import EpisodeError
+from physx_core.errors import ConfigError, EpisodeError
 from physx_gym import RobotEnv
 from physx_gym.bridge.make_env import make_env
 
 ENGINES = ("dart", "pinocchio")
-NAMES = ("Cartpole", "Acrobot", "Ant", "Quadruped", "ArmReach", "PushBox")
+GOALS = ("ArmReachGoal", "PushBoxGoal")
+NAMES = ("Cartpole", "Acrobot", "Ant", "Quadruped", "ArmReach", "PushBox", *GOALS)
 ALL = [(n, b) for n in NAMES for b in ENGINES]
 STEPS = {"pinocchio": 12, "dart": 40}
 
@@ -45,14 +47,18 @@ def actions_of(env, count, seed=0):
     return [env.action_space.sample() for _ in range(count)]
 
 
+def flat(env, observation):
+    return gymnasium.spaces.flatten(env.observation_space, observation)
+
+
 def run(env, actions, seed):
-    observations, rewards = [env.reset(seed=seed)[0]], []
+    observations, rewards = [flat(env, env.reset(seed=seed)[0])], []
     for action in actions:
         observation, reward, terminated, truncated, _ = env.step(action)
-        observations.append(observation)
+        observations.append(flat(env, observation))
         rewards.append(reward)
         if terminated or truncated:
-            observations.append(env.reset()[0])
+            observations.append(flat(env, env.reset()[0]))
     return np.array(observations), np.array(rewards)
 
 
@@ -82,7 +88,7 @@ def test_checkers_find_nothing(name, backend):
         warnings.simplefilter("error")
         env = make(name, backend)
         check_env(env.unwrapped, skip_render_check=True)
-        sb3_check_env(Plain(env), skip_render_check=True)
+        sb3_check_env(env.unwrapped if name in GOALS else Plain(env), skip_render_check=True)
     env.close()
 
 
@@ -96,13 +102,15 @@ def test_the_same_seed_gives_the_same_bits(name, backend):
     for again in (run(env, actions, 3), run(other, actions, 3)):
         for one, two in zip(first, again, strict=True):
             np.testing.assert_array_equal(one, two)
-    assert not np.array_equal(first[0][0], env.reset(seed=4)[0])
+    assert not np.array_equal(first[0][0], flat(env, env.reset(seed=4)[0]))
     copied = pickle.loads(pickle.dumps(other.unwrapped))  # noqa: S301 - our own
     state = env.unwrapped.snapshot()
-    one = [env.step(action)[0] for action in actions[:3]]
+    one = [flat(env, env.step(action)[0]) for action in actions[:3]]
     env.unwrapped.restore(state)
-    np.testing.assert_array_equal(one, [env.step(action)[0] for action in actions[:3]])
-    np.testing.assert_array_equal(copied.step(actions[0])[0], other.step(actions[0])[0])
+    two = [flat(env, env.step(action)[0]) for action in actions[:3]]
+    np.testing.assert_array_equal(one, two)
+    again = flat(env, copied.step(actions[0])[0])
+    np.testing.assert_array_equal(again, flat(env, other.step(actions[0])[0]))
 
 
 def test_a_pole_that_falls_terminates_and_time_truncates():
@@ -152,6 +160,90 @@ def test_legged_robots_stand_fall_and_report_their_rewards(name):
     state[3:7] = [1.0, 0.0, 0.0, 0.0]  # upside down
     base.simulator.simulation.set_state(state, np.zeros(len(base.robot_state.v)))
     assert env.step(np.zeros(env.action_space.shape))[2]
+
+
+def test_an_ant_has_the_options_of_gymnasiums():
+    """As Ant-v5 defines them: weights, noise, what is healthy, whether that ends an episode."""
+    still = np.zeros(8, np.float32)
+    options = {"reset_noise_scale": 0.0, "exclude_current_positions_from_observation": False}
+    env = make("Ant", "dart", terminate_when_unhealthy=False, **options)
+    first, _ = env.reset(seed=0)
+    assert env.observation_space.shape == first.shape == (29,)
+    np.testing.assert_array_equal(first[:2], 0.0)
+    np.testing.assert_array_equal(first, env.reset(seed=1)[0])
+    weights = {"forward_reward_weight": 2.0, "ctrl_cost_weight": 0.5, "healthy_reward": 3.0}
+    other = make("Ant", "dart", healthy_z_range=(0.3, 0.4), **weights)
+    other.reset(seed=0)
+    push = np.full(8, 0.5, np.float32)
+    *_, info = other.step(push)
+    forward = 2.0 * info["x_velocity"]
+    assert info["reward"] == pytest.approx({"forward": forward, "survival": 3.0, "effort": -1.0})
+    assert other.unwrapped.robot_state.q[:2].tolist() == [info["x_position"], info["y_position"]]
+    ends = [lie_down(each).step(still) for each in (env, other)]
+    assert [end[2] for end in ends] == [False, True]
+    assert [end[4]["reward"]["survival"] for end in ends] == [0.0, 0.0]
+    with pytest.raises(ConfigError, match="healthy_z_range has 1 numbers but needs 2"):
+        make("Ant", "dart", healthy_z_range=(0.2,))
+
+
+def lie_down(env):
+    base = env.unwrapped
+    state = base.robot_state.q.copy()
+    state[2], state[7:] = 0.2, np.tile([0.0, 0.4], 4)
+    base.simulator.simulation.set_state(state, np.zeros(14))
+    return env
+
+
+def test_a_quadruped_is_rewarded_for_its_heading():
+    env = make("Quadruped", "dart")
+    env.reset(seed=0)
+    base = env.unwrapped
+    for heading, part in ((0.0, 0.5), (0.5, 0.5 * np.exp(-1.0)), (-0.5, 0.5 * np.exp(-1.0))):
+        state = base.robot_state.q.copy()
+        state[3:7] = 0.0, 0.0, np.sin(heading / 2), np.cos(heading / 2)
+        base.simulator.simulation.set_state(state, np.zeros(18))
+        seen, *_, info = env.step(np.zeros(12))
+        np.testing.assert_allclose(seen[45:], [np.cos(heading), np.sin(heading)], atol=0.02)
+        assert info["reward"]["heading"] == pytest.approx(part, abs=0.02)
+
+
+@pytest.mark.parametrize("name", GOALS)
+def test_rewards_of_goals_depend_on_the_goals_alone(name):
+    env, dense = make(name, "dart"), make(name, "dart", reward_type="dense")
+    for each in (env, dense):
+        each.reset(seed=0)
+    for action in actions_of(env, 5):
+        seen, reward, terminated, _, info = env.step(action)
+        wanted, reached = seen["desired_goal"], seen["achieved_goal"]
+        assert (reward, terminated, info["is_success"]) == (-1.0, False, False)
+        _, away, *_ = dense.step(action)
+        assert away == pytest.approx(-np.linalg.norm(wanted - reached))
+    base = env.unwrapped
+    near = reached + 0.9 * base.CLOSE * np.eye(len(reached))[0]
+    rewards = base.compute_reward(np.stack([reached] * 2), np.stack([wanted, near]), [{}, {}])
+    np.testing.assert_array_equal(rewards, [-1.0, 0.0])
+    assert base.compute_reward(reached, near, {}) == 0.0
+    assert not base.compute_terminated(reached, near, {})
+    task = make(name.removesuffix("Goal"), "dart")
+    whole, _ = task.reset(seed=0)
+    parts, _ = env.reset(seed=0)
+    way = parts["desired_goal"] - parts["achieved_goal"]
+    np.testing.assert_array_equal(whole, np.concatenate([parts["observation"], way]))
+    with pytest.raises(ConfigError, match="reward_type"):
+        make(name, "dart", reward_type="scarce")
+
+
+def test_hindsight_replaces_goals():
+    env = make("ArmReachGoal", "dart", simulation_duration_max=0.4)
+    options = {"n_sampled_goal": 4, "goal_selection_strategy": "future"}
+    model = SAC(
+        "MultiInputPolicy", env, seed=0, device="cpu", learning_starts=20, batch_size=32,
+        buffer_size=100, replay_buffer_class=HerReplayBuffer, replay_buffer_kwargs=options,
+        policy_kwargs={"net_arch": [8]},
+    )  # fmt: skip
+    model.learn(40)
+    rewards = model.replay_buffer.sample(200, None).rewards
+    assert set(np.unique(rewards)) == {-1.0, 0.0}
 
 
 @pytest.mark.parametrize("backend", ENGINES)

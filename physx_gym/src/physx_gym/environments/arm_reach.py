@@ -13,12 +13,11 @@ from physx_core.simulation import JointSettings, Motor, Robot, World
 from physx_core.typing import Vector
 from physx_gym.defaults import BACKEND
 from physx_gym.env.pipeline_env import Info
-from physx_gym.env.robot_env import RobotEnv
 from physx_gym.environments import limits
+from physx_gym.environments.goal import GoalEnv, GoalTask
 from physx_gym.simulator.simulator import Simulator
 
 HAND = "panda_hand"
-CLOSE = 0.05
 SPEED = 1.5
 STIFFNESS = np.array([400.0, 400.0, 400.0, 400.0, 100.0, 100.0, 50.0])
 DAMPING = np.array([40.0, 40.0, 40.0, 40.0, 8.0, 8.0, 4.0])
@@ -26,7 +25,7 @@ _ARM = [f"panda_joint{number}" for number in range(1, 8)]
 _REST = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.0])
 
 
-class ArmReachEnv(RobotEnv):
+class ArmReachEnv(GoalTask):
     """Reach for a point with the hand of a Franka Panda: ``physx/ArmReach-v0``.
 
     Needs the robots of ``physx-dart[robots]``. Action, shape (7,): velocities of the joints, as
@@ -36,6 +35,8 @@ class ArmReachEnv(RobotEnv):
     mean squared action; ``info["is_success"]`` is whether the distance is below 5 cm. An episode
     never terminates and is truncated after 100 steps of 40 ms.
     """
+
+    ACHIEVED, CLOSE = slice(14, 17), 0.05
 
     def __init__(self, *, backend: Any = BACKEND, **options: Any) -> None:
         """Create the environment.
@@ -96,14 +97,14 @@ class ArmReachEnv(RobotEnv):
         self.goal[:], self._target[:] = memory["goal"], memory["target"]
 
     def _draw(self, scene: Factory) -> None:
-        scene.add_sphere("goal", CLOSE, position=self.goal, color="green")
+        scene.add_sphere("goal", self.CLOSE, position=self.goal, color="green")
 
     def _redraw(self, scene: Factory) -> None:
         scene.update_sphere("goal", position=self.goal)
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
         """Observe the joints, the hand and the point."""
-        state, seen = measurement["states"]["agent"], self.observation
+        state, seen = measurement["states"]["agent"], self._seen
         seen[:7], seen[7:14] = state["q"][:7], state["v"][:7]
         hand = self.simulator.simulation.body_poses([HAND])[0, :3]
         seen[14:17], seen[17:] = hand, self.goal - hand
@@ -125,7 +126,16 @@ class ArmReachEnv(RobotEnv):
 
     def compute_reward(self, terminated: bool, info: Info) -> float:
         """Return the reward for being close to the point."""
-        away = self.observation[17:]
+        away = self._seen[17:]
         distance = float(np.sqrt(away @ away))
-        info["is_success"] = distance < CLOSE
+        info["is_success"] = distance < self.CLOSE
         return -distance - 0.01 * float(self.action @ self.action) / 7
+
+
+class ArmReachGoalEnv(GoalEnv, ArmReachEnv):
+    """`ArmReachEnv` with goals that hindsight can replace: ``physx/ArmReachGoal-v0``.
+
+    Observation: a dictionary of ``"observation"``, shape (17,): positions and velocities of the
+    joints, in rad and rad/s, and position of the hand, in m; ``"achieved_goal"``, shape (3,): the
+    latter again; and ``"desired_goal"``, shape (3,), the point. Reward: see `GoalEnv`.
+    """

@@ -14,17 +14,16 @@ from physx_core.simulation import Box, Ground, JointSettings, Motor, Robot, Worl
 from physx_core.typing import Vector
 from physx_gym.defaults import BACKEND
 from physx_gym.env.pipeline_env import Info
-from physx_gym.env.robot_env import RobotEnv
 from physx_gym.environments import limits
+from physx_gym.environments.goal import GoalEnv, GoalTask
 from physx_gym.simulator.simulator import Simulator
 
 FORCE = 20.0
-CLOSE = 0.08
 REACH = 1.0
 SIZE = (0.25, 0.25, 0.2)
 
 
-class PushBoxEnv(RobotEnv):
+class PushBoxEnv(GoalTask):
     """Push a box of 0.5 kg over the ground to a goal: ``physx/PushBox-v0``.
 
     The robot is a gantry that moves a stick over the ground. It needs an engine with contacts
@@ -35,6 +34,8 @@ class PushBoxEnv(RobotEnv):
     quarter of the stick's from the box, in m; 10 more when the box is within 8 cm of the goal,
     which terminates. It is truncated after 200 steps of 50 ms, or if the box is out of reach.
     """
+
+    ACHIEVED, CLOSE = slice(4, 6), 0.08
 
     def __init__(self, *, backend: Any = BACKEND, **options: Any) -> None:
         """Create the environment.
@@ -91,12 +92,12 @@ class PushBoxEnv(RobotEnv):
     def _goal_circle(self) -> Vector:
         """Return points on a circle around the goal, in which the center of the box must be."""
         angles = np.linspace(0.0, 2 * math.pi, 33)
-        around = CLOSE * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        around = self.CLOSE * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         return np.insert(self.goal + around, 2, 0.01, axis=1)
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
         """Observe the stick, the box and the goal."""
-        state, seen = measurement["states"]["agent"], self.observation
+        state, seen = measurement["states"]["agent"], self._seen
         simulation, part = self.simulator.simulation, self._box
         pose, twist = simulation.positions()[part.positions], simulation.body_velocities(["box"])[0]
         x, y, z, w = pose[3:].tolist()
@@ -112,15 +113,24 @@ class PushBoxEnv(RobotEnv):
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
         """Return whether the box is at the goal, and whether it is out of reach."""
-        box, left = self.observation[4:6], self.observation[13:15]
-        info["is_success"] = bool(left @ left < CLOSE**2)
+        box, left = self._seen[4:6], self._seen[13:15]
+        info["is_success"] = bool(left @ left < self.CLOSE**2)
         return info["is_success"], bool(np.abs(box).max() > REACH) or not self.is_inside()
 
     def compute_reward(self, terminated: bool, info: Info) -> float:
         """Return the reward for a box close to its goal."""
-        seen = self.observation.tolist()
+        seen = self._seen.tolist()
         near, left = math.hypot(*seen[11:13]), math.hypot(*seen[13:15])
         return (10.0 if terminated else 0.0) - left - 0.25 * near
+
+
+class PushBoxGoalEnv(GoalEnv, PushBoxEnv):
+    """`PushBoxEnv` with goals that hindsight can replace: ``physx/PushBoxGoal-v0``.
+
+    Observation: a dictionary of ``"observation"``, shape (13,): that of `PushBoxEnv` up to the
+    vector from the stick to the box; ``"achieved_goal"``, shape (2,): the position of the box, in
+    m; and ``"desired_goal"``, shape (2,). Reward: see `GoalEnv`. It does not terminate.
+    """
 
 
 def _away_from(

@@ -26,16 +26,18 @@ _UP = np.array([[0.0, 0.0, 1.0]])
 
 
 class QuadrupedEnv(RobotEnv):
-    """Walk forward with a Unitree A1: ``physx/Quadruped-v0``.
+    """Walk along the x axis with a Unitree A1: ``physx/Quadruped-v0``.
 
     Needs the robots of ``physx-dart[robots]``. Action, shape (12,): target positions of the joints,
     as fractions of 0.4 rad from a standing pose; a controller of 40 N m/rad and 1 N m s/rad follows
-    them, 200 times a second. Observation, shape (45,): the vertical in the frame of the trunk;
+    them, 200 times a second. Observation, shape (47,): the vertical in the frame of the trunk;
     linear and angular velocity of the trunk in its frame, in m/s and rad/s; the joints' positions,
-    from the standing pose, in rad, and velocities; the last action. Reward: up to 1 for a forward
-    velocity of `speed`, up to 0.5 for going straight, 0.25 for staying up, minus costs of torques
-    and of abrupt actions; ``info["reward"]`` has the parts. It terminates if the trunk is below
-    0.12 m or leans by more than 1 rad, and is truncated after 1000 steps of 20 ms.
+    from the standing pose, in rad, and velocities; the last action; cosine and sine of the heading,
+    the angle from the x axis to the trunk's. Reward: up to 1 for a forward velocity of `speed`, up
+    to 0.5 for going straight, up to 0.5 for a heading of 0, 0.25 for staying up, minus costs of
+    torques and of abrupt actions; ``info["reward"]`` has the parts, ``info["x_velocity"]`` the mean
+    velocity along the x axis in the step, in m/s. It terminates if the trunk is below 0.12 m or
+    leans by more than 1 rad, and is truncated after 1000 steps of 20 ms.
     """
 
     def __init__(self, *, backend: Any = BACKEND, speed: float = 0.6, **options: Any) -> None:
@@ -67,6 +69,7 @@ class QuadrupedEnv(RobotEnv):
             limits.joint_positions(simulator) + np.abs(self._stand),
             limits.joint_velocities(simulator),
             np.ones(12),
+            np.full(2, 1.001),
         )
 
     def _sample_state(self) -> tuple[Vector, Vector]:
@@ -77,26 +80,34 @@ class QuadrupedEnv(RobotEnv):
     def _initialize_buffers(self) -> None:
         self._previous[:] = 0.0
         self._haste = 0.0
+        self._place = self._before = float(self.robot_state.q[0])
 
     def _refresh_buffers(self) -> None:
         change = self.action - self._previous
         self._haste = float(change @ change)
         self._previous[:] = self.action
+        self._before, self._place = self._place, float(self.robot_state.q[0])
 
     def _memory(self) -> Any:
-        return {"previous": self._previous.copy(), "haste": self._haste}
+        places = self._place, self._before
+        return {"previous": self._previous.copy(), "haste": self._haste, "places": places}
 
     def _recall(self, memory: Any) -> None:
         self._previous[:], self._haste = memory["previous"], memory["haste"]
+        self._place, self._before = memory["places"]
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Observe attitude, velocities, joints and the last action."""
+        """Observe attitude, velocities, joints, the last action and the heading."""
         state, seen = measurement["states"]["agent"], self.observation
         q, v = state["q"], state["v"]
         seen[:3] = rotate_back_rows(q[np.newaxis, 3:7], _UP)[0]
         seen[3:9] = v[:6]
         np.subtract(q[7:], self._stand, out=seen[9:21])
-        seen[21:33], seen[33:] = v[6:], self._previous
+        seen[21:33], seen[33:45] = v[6:], self._previous
+        x, y, z, w = q[3:7].tolist()
+        cos, sin = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z)
+        length = math.hypot(cos, sin) or 1.0
+        seen[45], seen[46] = cos / length, sin / length
 
     def compute_command(self, action: Any, command: Vector) -> None:
         """Drive the joints to their target positions."""
@@ -115,13 +126,16 @@ class QuadrupedEnv(RobotEnv):
     def compute_reward(self, terminated: bool, info: Info) -> float:
         """Return the reward for walking."""
         forward, left, _, _, _, turn = self.observation[3:9].tolist()
+        heading = math.atan2(self.observation[46], self.observation[45])
         torques = self.robot_state.command
         parts = {
             "forward": math.exp(-4.0 * (forward - self.speed) ** 2),
             "straight": 0.5 * math.exp(-4.0 * (left**2 + 0.25 * turn**2)),
+            "heading": 0.5 * math.exp(-4.0 * heading**2),
             "survival": 0.0 if terminated else 0.25,
             "torques": -1e-4 * float(torques @ torques),
             "haste": -0.01 * self._haste,
         }
         info["reward"] = parts
+        info["x_velocity"] = (self._place - self._before) / self.step_dt
         return sum(parts.values())
