@@ -1,26 +1,38 @@
 """Train a policy for a registered environment with PPO of stable-baselines3.
 
     pip install stable-baselines3
-    python examples/train_ppo.py                       # physx/Cartpole-v0 on DART
-    python examples/train_ppo.py --backend pinocchio
-    python examples/train_ppo.py --env physx/Acrobot-v0
+    python examples/train_ppo.py                               # physx/Cartpole-v0 on DART
+    python examples/train_ppo.py --env physx/Ant-v0 --save ant # a session: physx evaluate ant ...
+    python examples/train_ppo.py --env physx/Acrobot-v0 --backend pinocchio
 
-Stops as soon as the mean reward of 20 evaluation episodes reaches the environment's threshold,
-prints it, and exits with 1 if that does not happen within `--steps` steps.
+Trains for the steps that are set for the environment, or until the mean reward of 20 deterministic
+episodes reaches its threshold. Prints rewards, lengths and speeds of the last such episodes as a
+table, and exits with 1 if the threshold was missed.
 """
 
 import argparse
 import sys
 import time
+from pathlib import Path
 
 import gymnasium
 import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 import physx_gym  # noqa: F401 - registers the environments
+from physx_core import Field, NetworkConfig, Normalization
+from physx_core.checkpoint import Progress
+from physx_core.pipelines import Learner
+from physx_gym.cli.evaluate import evaluate, print_table, summary
 
+WALKING = {
+    "n_envs": 8, "n_steps": 512, "batch_size": 512, "n_epochs": 10, "gamma": 0.99,
+    "learning_rate": 3e-4, "normalize": True, "part": 50_000,
+    "policy_kwargs": {"net_arch": [128, 128], "log_std_init": -1.0},
+}  # fmt: skip
 SETTINGS = {
     "physx/Cartpole-v0": {
         "n_steps": 64, "batch_size": 256, "n_epochs": 20, "gamma": 0.98, "gae_lambda": 0.8,
@@ -30,56 +42,101 @@ SETTINGS = {
         "n_steps": 256, "batch_size": 512, "n_epochs": 10, "gamma": 0.99, "gae_lambda": 0.94,
         "learning_rate": 1e-3, "ent_coef": 0.01,
     },
+    "physx/Ant-v0": {"steps": 500_000, **WALKING},
+    "physx/Quadruped-v0": {"steps": 400_000, **WALKING},
+    "physx/PushBox-v0": {
+        "steps": 500_000, "n_envs": 16, "n_steps": 128, "batch_size": 512, "n_epochs": 8,
+        "gamma": 0.98, "learning_rate": 5e-4, "policy_kwargs": {"net_arch": [128, 128]},
+        "part": 50_000,
+    },
 }  # fmt: skip
+"""Options of PPO, and ``steps``: how many at most, ``n_envs``: environments, ``normalize``: whether
+observations and rewards are normalized, ``part``: steps between two evaluations."""
 OTHERS = {"n_steps": 256, "batch_size": 512, "n_epochs": 10, "learning_rate": 3e-4}
 
 
-def mean_reward(model, env, episodes, seed=10_000):
-    """Return the mean total reward of deterministic episodes with seeds of their own."""
-    totals = []
-    for episode in range(episodes):
-        observation, _ = env.reset(seed=seed + episode)
-        total, over = 0.0, False
-        while not over:
-            action, _ = model.predict(observation, deterministic=True)
-            observation, reward, terminated, truncated, _ = env.step(action)
-            total, over = total + reward, terminated or truncated
-        totals.append(total)
-    return float(np.mean(totals))
+def save(folder, model, normalization):
+    """Write the policy as a session that `physx_gym.Policy` and ``physx evaluate`` read.
+
+    Args:
+        folder: The session's folder.
+        model: The model, whose policy is an `MlpPolicy`.
+        normalization: Mean and variance of the observation; None: it is not normalized.
+    """
+    policy, seen = model.policy, model.observation_space
+    layers = torch.nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net)
+    linear = [layer for layer in layers if isinstance(layer, torch.nn.Linear)]
+    sizes = [linear[0].in_features, *(layer.out_features for layer in linear)]
+    kwargs = {"layers": sizes, "activation": "Tanh"}
+    kwargs |= {"net_fields": "observation", "opt_fields": "action"}
+    config = NetworkConfig(
+        "torch/fc", network_kwargs=kwargs, loss="MSELoss", optimizer="Adam", lr=0.0
+    )
+    learner = Learner(config, trains=True)
+    fields = [
+        Field("observation", seen.shape, seen.dtype),
+        Field("action", (sizes[-1],), "float32"),
+    ]
+    known = {}
+    if normalization is not None:
+        scale = np.sqrt(normalization.var + 1e-8)
+        known["observation"] = Normalization(normalization.mean, scale)
+    learner.bind({field.name: field for field in fields}, known)
+    learner.network.layers.load_state_dict(layers.state_dict())
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    learner.save(Path(folder) / "network", Progress(0, 0, 0, model.seed or 0))
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="physx/Cartpole-v0")
     parser.add_argument("--backend", default="dart")
-    parser.add_argument("--steps", type=int, default=200_000)
+    parser.add_argument("--steps", type=int, help="at most; default: as set for the environment")
     parser.add_argument("--threshold", type=float, help="mean reward; default: the environment's")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--save", help="file for the policy")
+    parser.add_argument("--save", metavar="FOLDER", help="where to write the policy")
     chosen = parser.parse_args()
 
     torch.set_num_threads(1)
+    settings = dict(SETTINGS.get(chosen.env, OTHERS))
+    n_envs, part = settings.pop("n_envs", 8), settings.pop("part", 10_000)
+    steps = settings.pop("steps", 200_000) if chosen.steps is None else chosen.steps
+    settings.pop("steps", None)
     options = {"backend": chosen.backend}
-    many = make_vec_env(chosen.env, n_envs=8, seed=chosen.seed, env_kwargs=options)
+    many = make_vec_env(chosen.env, n_envs=n_envs, seed=chosen.seed, env_kwargs=options)
+    normalizer = None
+    if settings.pop("normalize", False):  # without clipping, as the saved network does not clip
+        many = normalizer = VecNormalize(many, gamma=settings["gamma"], clip_obs=np.inf)
     judge = gymnasium.make(chosen.env, **options)
     threshold = chosen.threshold if chosen.threshold is not None else judge.spec.reward_threshold
-    settings = SETTINGS.get(chosen.env, OTHERS)
     model = PPO("MlpPolicy", many, seed=chosen.seed, device="cpu", verbose=0, **settings)
-    begin, reached = time.perf_counter(), -np.inf
-    while model.num_timesteps < chosen.steps:
-        part = min(10_000, chosen.steps - model.num_timesteps)
-        model.learn(part, reset_num_timesteps=model.num_timesteps == 0)
-        reached = mean_reward(model, judge, 20)
-        elapsed = time.perf_counter() - begin
-        print(f"{model.num_timesteps:7d} steps, {elapsed:5.0f} s: mean reward {reached:.1f}")
+
+    def act(observation):
+        if normalizer is not None:
+            observation = normalizer.normalize_obs(observation)
+        return model.predict(observation, deterministic=True)[0]
+
+    begin = time.perf_counter()
+    while model.num_timesteps < steps:
+        model.learn(min(part, steps - model.num_timesteps), reset_num_timesteps=False)
+        found = summary(evaluate(judge, act, range(10_000, 10_020 if threshold else 10_005)))
+        reached, elapsed = found["reward"]["mean"], time.perf_counter() - begin
+        text = f"{model.num_timesteps:7d} steps, {elapsed:5.0f} s: mean reward {reached:.1f}"
+        if "speed" in found:
+            text += f", speed {found['speed']['mean']:.2f} m/s"
+        print(text, flush=True)
         if threshold is not None and reached >= threshold:
             break
     if chosen.save:
-        model.save(chosen.save)
-    solved = threshold is None or reached >= threshold
-    word = "solved" if solved else "not solved"
-    print(f"{chosen.env} on {chosen.backend}: {word}, {model.num_timesteps} steps, {reached:.1f}")
-    return 0 if solved else 1
+        save(chosen.save, model, None if normalizer is None else normalizer.obs_rms)
+        print(f"policy: {chosen.save}")
+    print(f"\n{chosen.env} on {chosen.backend}, seed {chosen.seed}: deterministic episodes")
+    print_table(found)
+    if threshold is None:
+        return 0
+    word = "solved" if reached >= threshold else "not solved"
+    print(f"\n{word}: mean reward {reached:.1f} after {model.num_timesteps} steps")
+    return 0 if reached >= threshold else 1
 
 
 if __name__ == "__main__":

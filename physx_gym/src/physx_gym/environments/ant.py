@@ -26,8 +26,8 @@ class AntEnv(RobotEnv):
     Action, shape (8,): torques of the joints, as fractions of 15 N m. Observation, shape (27,):
     height of the torso in m; its orientation, a quaternion x, y, z, w; the joints' positions in
     rad; velocity of the torso in its own frame, in m/s and rad/s; the joints' velocities. Reward:
-    mean velocity along x in the step, in m/s, plus 1 while it is healthy, minus 0.05 times the sum
-    of the squared actions; ``info["reward"]`` has the parts. It is healthy while the torso is
+    mean velocity along x in the step, in m/s, plus 0.5 while it is healthy, minus 0.05 times the
+    sum of the squared actions; ``info["reward"]`` has the parts. It is healthy while the torso is
     between 0.22 and 1 m high, and not upside down: the torso's radius is 0.2 m, so that lying on
     the ground is not. Otherwise it terminates; it is truncated after 1000 steps of 50 ms.
 
@@ -42,7 +42,7 @@ class AntEnv(RobotEnv):
         backend: Any = BACKEND,
         forward_reward_weight: float = 1.0,
         ctrl_cost_weight: float = 0.05,
-        healthy_reward: float = 1.0,
+        healthy_reward: float = 0.5,
         terminate_when_unhealthy: bool = True,
         healthy_z_range: tuple[float, float] = (0.22, 1.0),
         reset_noise_scale: float = 0.1,
@@ -125,7 +125,7 @@ class AntEnv(RobotEnv):
         """Whether the torso is neither too low, nor too high, nor upside down."""
         height, x, y, _, _ = self.observation[2 - self._first_seen :][:5].tolist()
         upright = 1.0 - 2.0 * (x * x + y * y) > 0.0
-        return upright and self._lowest <= height <= self._highest
+        return bool(upright and self._lowest <= height <= self._highest)
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
         """Return whether it is no longer healthy."""
@@ -143,4 +143,4 @@ class AntEnv(RobotEnv):
         info["reward"] = parts
         info["x_position"], info["y_position"] = x, y
         info["x_velocity"], info["y_velocity"] = velocity, (y - y_before) / self.step_dt
-        return sum(parts.values())
+        return float(sum(parts.values()))

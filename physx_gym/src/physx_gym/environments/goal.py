@@ -65,7 +65,8 @@ class GoalEnv(GoalTask):
 
     def _initialize_observation_space(self) -> None:
         super()._initialize_observation_space()
-        bounds = self.observation_space.high
+        whole: Any = self.observation_space
+        bounds = whole.high
         self._flat = np.zeros(len(bounds))
         self.observation_space = spaces.Dict(
             {

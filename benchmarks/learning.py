@@ -1,0 +1,118 @@
+"""Learning: what PPO reaches in the registered environments, over several seeds.
+
+    python benchmarks/learning.py --env physx/Ant-v0 --seeds 0 1 2
+    python benchmarks/learning.py --env physx/Quadruped-v0 --check
+    python benchmarks/learning.py --env physx/Ant-v0 --steps 300000 --folder policies
+
+Trains with `examples/train_ppo.py` once for each seed, one after the other, with the settings that
+stand there; then runs deterministic episodes on the engine that it was trained on and on the
+other one. Prints a line for each seed and engine, with the wall time of the training, and the range
+over the seeds. With `--check`, exits with 1 if any seed misses the target on its own engine.
+Needs stable-baselines3.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from measure import claim, finish
+
+from physx_core.errors import FeatureNotSupportedError
+from physx_gym import Policy
+from physx_gym.bridge.make_env import make_env
+from physx_gym.cli.evaluate import evaluate, summary
+
+TRAIN = Path(__file__).parent.parent / "examples" / "train_ppo.py"
+TARGETS = {
+    "physx/Cartpole-v0": ("reward", 475.0, 20),
+    "physx/Acrobot-v0": ("reward", -100.0, 20),
+    "physx/Ant-v0": ("speed", 0.5, 5),
+    "physx/Quadruped-v0": ("speed", 0.5, 5),
+    "physx/PushBox-v0": ("success", 0.9, 20),
+}
+"""Figure of `evaluate` whose mean must reach a value, for every seed, and number of episodes."""
+FIRST_SEED = 30_000
+NAMES = ("reward", "length", "speed", "success")
+
+
+def train(env: str, backend: str, seed: int, steps: int | None, folder: Path) -> float:
+    """Train a policy and return the wall time in s."""
+    words = ["--env", env, "--backend", backend, "--seed", str(seed), "--save", str(folder)]
+    if steps is not None:
+        words += ["--steps", str(steps)]
+    begin = time.perf_counter()
+    done = subprocess.run([sys.executable, str(TRAIN), *words], check=False)  # 1: missed threshold
+    if not (folder / "network").is_dir():
+        sys.exit(f"The training with seed {seed} failed with status {done.returncode}.")
+    return time.perf_counter() - begin
+
+
+def figures(env: str, backend: str, folder: Path) -> dict[str, dict[str, float]] | None:
+    """Return the figures of deterministic episodes; None if the engine cannot run them."""
+    made = make_env(env, {"backend": backend})
+    try:
+        seeds = range(FIRST_SEED, FIRST_SEED + TARGETS[env][2])
+        return summary(evaluate(made, Policy(folder, made).act, seeds))
+    except FeatureNotSupportedError:
+        return None
+    finally:
+        made.close()
+
+
+def row(label: str, found: dict[str, dict[str, float]], seconds: str) -> None:
+    """Print mean and standard deviation of each figure of a policy's episodes."""
+    texts = []
+    for name in NAMES:
+        known = found.get(name)
+        texts.append("" if known is None else f"{known['mean']:.4g} ± {known['std']:.2g}")
+    print(f"{label:20}{seconds:>10}" + "".join(f"{text:>18}" for text in texts), flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--env", default="physx/Ant-v0", choices=TARGETS)
+    parser.add_argument("--backend", default="dart", choices=("dart", "pinocchio"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--steps", type=int, help="default: as set in the example")
+    parser.add_argument("--folder", type=Path, help="where to keep the policies")
+    parser.add_argument("--check", action="store_true")
+    chosen = parser.parse_args()
+    torch.set_num_threads(1)
+    other = {"dart": "pinocchio", "pinocchio": "dart"}[chosen.backend]
+    results: dict[str, list[dict[str, Any]]] = {chosen.backend: [], other: []}
+    lines = []
+    with tempfile.TemporaryDirectory() as temporary:
+        place = chosen.folder or Path(temporary)
+        for seed in chosen.seeds:
+            folder = place / f"{chosen.env.split('/')[1]}_{seed}"
+            seconds = train(chosen.env, chosen.backend, seed, chosen.steps, folder)
+            for engine, kept in results.items():
+                found = figures(chosen.env, engine, folder)
+                if found is not None:
+                    kept.append(found)
+                    time_of = f"{seconds:.0f}" if engine == chosen.backend else ""
+                    lines.append((f"{seed} on {engine}", found, time_of))
+    print(f"\n{chosen.env}, PPO on {chosen.backend}: mean ± standard deviation of the episodes")
+    print(f"{'seed':20}{'time (s)':>10}" + "".join(f"{name:>18}" for name in NAMES))
+    for line in lines:
+        row(*line)
+    met = []
+    name, target, _ = TARGETS[chosen.env]
+    for engine, kept in results.items():
+        values = [found[name]["mean"] for found in kept]
+        if values:
+            print(f"{engine}: {name} {min(values):.4g} to {max(values):.4g} over the seeds")
+        if engine == chosen.backend:
+            met.append(claim(f"least {name} of the seeds", min(values), at_least=target))
+    finish(met)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""``physx evaluate``: run episodes of an environment under a saved policy, on any engine."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import gymnasium
+import numpy as np
+import tyro
+
+from physx_core.cli import argument_registry, show
+from physx_core.errors import ConfigError
+from physx_gym.bridge.make_env import make_env
+from physx_gym.bridge.policy import Policy
+from physx_gym.env.robot_env import RobotEnv
+
+SPEED = "x_velocity"
+"""Name, in information, of the velocity in the direction in which a robot is to walk, in m/s."""
+SUCCESS = "is_success"
+"""Name, in information, of whether the goal of a task is reached."""
+
+
+@dataclass
+class Evaluate:
+    """Run episodes under a saved policy, and show their rewards, lengths, speeds and successes."""
+
+    policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+    """Session or checkpoint of the policy's network."""
+    env: str
+    """Id of the environment, or "package.module:Class"."""
+    backend: str | None = None
+    """Engine; by default the environment's own."""
+    episodes: int = 20
+    """Number of episodes."""
+    seed: int = 10_000
+    """Seed of the first episode; that of each further one is higher by 1."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Further options of the environment."""
+    json: bool = False
+    """Print JSON, with the figures of each episode, instead of a table."""
+    replay: str | None = None
+    """Write a recording of the first episode for the viewer to this file (.rrd)."""
+    film: str | None = None
+    """Write a film of the first episode to this file (.gif, .webp)."""
+    trust: bool = False
+    """Import whatever the checkpoint names, not only components of installed plugins."""
+
+
+def run(words: Sequence[str]) -> None:
+    """Print the figures, and write what was asked for."""
+    with argument_registry():
+        options = tyro.cli(Evaluate, args=words, prog="physx evaluate")
+    if options.episodes < 1:
+        raise ConfigError(f"--episodes is {options.episodes} but must be at least 1.")
+    backend = {} if options.backend is None else {"backend": options.backend}
+    env = make_env(options.env, options.env_kwargs | backend)
+    try:
+        act = Policy(options.policy, env, trust=options.trust).act
+        seeds = range(options.seed, options.seed + options.episodes)
+        found = evaluate(env, act, seeds)
+        if options.json:
+            given = {"env": options.env, "backend": options.backend, "policy": options.policy}
+            show(json.dumps(given | {"summary": summary(found), "episodes": found}))
+        else:
+            where = "" if options.backend is None else f" on {options.backend}"
+            show(f"{options.env}{where}: {len(found)} episodes, seeds {seeds[0]} to {seeds[-1]}\n")
+            print_table(summary(found))
+        if options.replay is not None or options.film is not None:
+            _show_episode(env, act, options)
+    finally:
+        env.close()
+
+
+def evaluate(
+    env: gymnasium.Env[Any, Any], act: Callable[[Any], Any], seeds: Sequence[int]
+) -> list[dict[str, float]]:
+    """Run an episode for each seed, and return its figures by name.
+
+    ``reward`` is the sum of the rewards and ``length`` the number of steps; if the information of
+    steps tells them, ``speed`` is the mean velocity along x in m/s, and ``success`` is 1 if the
+    goal is reached at the end, otherwise 0.
+
+    Args:
+        env: The environment.
+        act: Returns the action for an observation.
+        seeds: Seeds of the episodes.
+    """
+    found = []
+    for seed in seeds:
+        observation, _ = env.reset(seed=seed)
+        rewards, speeds, over = [], [], False
+        info: dict[str, Any] = {}
+        while not over:
+            observation, reward, terminated, truncated, info = env.step(act(observation))
+            rewards.append(float(reward))
+            if SPEED in info:
+                speeds.append(float(info[SPEED]))
+            over = terminated or truncated
+        figures = {"seed": seed, "reward": math.fsum(rewards), "length": len(rewards)}
+        if speeds:
+            figures["speed"] = math.fsum(speeds) / len(speeds)
+        if SUCCESS in info:
+            figures["success"] = float(info[SUCCESS])
+        found.append(figures)
+    return found
+
+
+def summary(episodes: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Return mean, standard deviation, smallest and largest value of each figure of episodes."""
+    found = {}
+    for name in episodes[0]:
+        if name != "seed":
+            values = np.array([episode[name] for episode in episodes])
+            found[name] = {
+                "mean": float(values.mean()),
+                "std": float(values.std()),
+                "min": float(values.min()),
+                "max": float(values.max()),
+            }
+    return found
+
+
+def print_table(figures: dict[str, dict[str, float]]) -> None:
+    """Print what `summary` returned."""
+    show(f"{'':8}  {'mean':>10}  {'std':>10}  {'min':>10}  {'max':>10}")
+    units = {"length": "steps", "speed": "m/s"}
+    for name, values in figures.items():
+        text = "  ".join(f"{value:10.4g}" for value in values.values())
+        show(f"{name:8}  {text}  {units.get(name, '')}".rstrip())
+
+
+def _show_episode(env: gymnasium.Env[Any, Any], act: Any, options: Evaluate) -> None:
+    """Write a recording and a film of the first episode."""
+    base = env.unwrapped
+    if not isinstance(base, RobotEnv):
+        raise ConfigError(f"{options.env} is not a RobotEnv, and has no recording of its episodes.")
+    base.evaluate(act, seed=options.seed, enable_stats=False, enable_replay=False)
+    if options.replay is not None:
+        show(f"recording: {base.replay(path=options.replay)}")
+    if options.film is not None:
+        show(f"film: {base.replay(record_video_path=options.film)}")
