@@ -27,7 +27,7 @@ def page():
 
 def test_all_code_of_the_page_runs(page, tmp_path):
     blocks = [(kind, text) for kind, text in BLOCK.findall(page)]
-    assert [kind for kind, _ in blocks] == ["xml", "python", "python", "toml", *["python"] * 7]
+    assert [kind for kind, _ in blocks] == ["xml", "python", "python", "toml", *["python"] * 8]
     for kind, text in blocks:
         if kind == "xml":
             (tmp_path / "swing.urdf").write_text(text, encoding="utf-8")
@@ -66,7 +66,8 @@ def test_the_tables_list_what_is_registered(path):
 
 
 def test_names_of_methods_exist(page):
-    named = set(re.findall(r"`(_?[a-z]+(?:_[a-z]+)+)`", page.split("## Order of calls")[1]))
+    section = page.split("## Order of calls")[1].split("\n## ")[0]
+    named = set(re.findall(r"`(_?[a-z]+(?:_[a-z]+)+)`", section))
     assert {name for name in named if not hasattr(RobotEnv, name)} == {
         "control_dt", "observe_dt", "reset_options",
     } & named  # fmt: skip
