@@ -36,6 +36,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/checkpoint.py
 	$(BIN)/python benchmarks/backends.py
 	$(BIN)/python benchmarks/differentiable.py
+	$(BIN)/python benchmarks/physics.py
 	$(BIN)/python benchmarks/gym.py
 	$(BIN)/python benchmarks/idle_threads.py
 	$(BIN)/python benchmarks/remote.py
