@@ -100,6 +100,8 @@ class Constraints:
 
     def add_missed(self, velocities: Vector) -> bool:
         """Let limits that velocities (nv,) violate act; return whether there are any."""
+        if not self.joints.violated(self.bounds, velocities[self.base :], _MISSED):
+            return False
         ahead = self.joints.acting(self.bounds, velocities[self.base :], -_MISSED)
         missed = ahead & ~self.acts
         self.acts |= missed
@@ -157,7 +159,7 @@ def constrained(
             guess.append(part.warmth.points[part.touching.numbers].ravel())
     points = joined([each.jacobian for each in touching])
     wanted = -joined([each.bias(before, period) for each in touching])
-    friction = joined([each.friction for each in touching])
+    friction, unit = joined([each.friction for each in touching]), np.eye(len(v))
     while True:
         rows = [part.rows() for part in parts]
         limits = [part.limits(some) for part, some in zip(parts, rows, strict=True)]
@@ -170,9 +172,7 @@ def constrained(
         order: Any = slice(None)
         if len(parts) > 1:  # the solver wants rows with one bound first
             order = np.argsort(np.isinf(least) == np.isinf(most), kind="stable")
-        unit = np.zeros((len(column), len(v)))
-        unit[np.arange(len(column)), column[order]] = 1.0
-        jacobian = np.concatenate([points, unit])
+        jacobian = np.concatenate([points, unit.take(column[order], 0)])
         spread = inverse @ jacobian.T
         impulses = solver.solve(
             jacobian @ spread,

@@ -125,6 +125,10 @@ class JointConstraints:
             acts[bounds.size : bounds.size + len(self._rubs)] = velocities[self._rubs] != 0
         return acts
 
+    def violated(self, bounds: Vector, velocities: Vector, margin: float) -> bool:
+        """Return whether velocities (n,) are below their bounds by more than a margin."""
+        return bool((self._signs * velocities - bounds).min(initial=0.0) < -margin)
+
     def aims(self, bounds: Vector) -> Vector:
         """Return the target velocity of each row, shape (rows,)."""
         limits = (self._signs * bounds).ravel()
