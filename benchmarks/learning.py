@@ -2,13 +2,13 @@
 
     python benchmarks/learning.py --env physx/Ant-v0 --seeds 0 1 2
     python benchmarks/learning.py --env physx/Quadruped-v0 --check
-    python benchmarks/learning.py --env physx/Ant-v0 --steps 300000 --folder policies
+    python benchmarks/learning.py --folder policies --steps 300000 --ppo gamma=0.98
 
-Trains with `examples/train_ppo.py` once for each seed, one after the other, with the settings that
+Trains with `examples/train_ppo.py` once for each seed, `--jobs` at a time, with the settings that
 stand there; then runs deterministic episodes on the engine that it was trained on and on the
 other one. Prints a line for each seed and engine, with the wall time of the training, and the range
 over the seeds. With `--check`, exits with 1 if any seed misses the target on its own engine.
-Needs stable-baselines3.
+Options that are not its own are passed on to the example. Needs stable-baselines3.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,16 +44,17 @@ FIRST_SEED = 30_000
 NAMES = ("reward", "length", "speed", "success")
 
 
-def train(env: str, backend: str, seed: int, steps: int | None, folder: Path) -> float:
-    """Train a policy and return the wall time in s."""
+def train(env: str, backend: str, more: list[str], place: Path, seed: int) -> tuple[Path, float]:
+    """Train a policy, and return its folder and the wall time in s."""
+    folder = place / f"{env.split('/')[1]}_{seed}"
     words = ["--env", env, "--backend", backend, "--seed", str(seed), "--save", str(folder)]
-    if steps is not None:
-        words += ["--steps", str(steps)]
     begin = time.perf_counter()
-    done = subprocess.run([sys.executable, str(TRAIN), *words], check=False)  # 1: missed threshold
+    done = subprocess.run(
+        [sys.executable, str(TRAIN), *words, *more], check=False
+    )  # 1: missed threshold
     if not (folder / "network").is_dir():
         sys.exit(f"The training with seed {seed} failed with status {done.returncode}.")
-    return time.perf_counter() - begin
+    return folder, time.perf_counter() - begin
 
 
 def figures(env: str, backend: str, folder: Path) -> dict[str, dict[str, float]] | None:
@@ -80,19 +83,20 @@ def main() -> None:
     parser.add_argument("--env", default="physx/Ant-v0", choices=TARGETS)
     parser.add_argument("--backend", default="dart", choices=("dart", "pinocchio"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--steps", type=int, help="default: as set in the example")
     parser.add_argument("--folder", type=Path, help="where to keep the policies")
+    parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
     parser.add_argument("--check", action="store_true")
-    chosen = parser.parse_args()
+    chosen, words = parser.parse_known_args()
     torch.set_num_threads(1)
     other = {"dart": "pinocchio", "pinocchio": "dart"}[chosen.backend]
     results: dict[str, list[dict[str, Any]]] = {chosen.backend: [], other: []}
     lines = []
     with tempfile.TemporaryDirectory() as temporary:
         place = chosen.folder or Path(temporary)
-        for seed in chosen.seeds:
-            folder = place / f"{chosen.env.split('/')[1]}_{seed}"
-            seconds = train(chosen.env, chosen.backend, seed, chosen.steps, folder)
+        run = partial(train, chosen.env, chosen.backend, words, place)
+        with ThreadPoolExecutor(chosen.jobs) as pool:
+            policies = list(pool.map(run, chosen.seeds))
+        for seed, (folder, seconds) in zip(chosen.seeds, policies, strict=True):
             for engine, kept in results.items():
                 found = figures(chosen.env, engine, folder)
                 if found is not None:

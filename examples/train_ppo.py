@@ -13,6 +13,7 @@ table, and exits with 1 if the threshold was missed.
 import argparse
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import gymnasium
@@ -31,7 +32,7 @@ from physx_gym.cli.evaluate import evaluate, print_table, summary
 WALKING = {
     "n_envs": 8, "n_steps": 512, "batch_size": 512, "n_epochs": 10, "gamma": 0.99,
     "learning_rate": 3e-4, "normalize": True, "part": 50_000,
-    "policy_kwargs": {"net_arch": [128, 128], "log_std_init": -1.0},
+    "policy_kwargs": {"net_arch": [128, 128], "log_std_init": -0.5},
 }  # fmt: skip
 SETTINGS = {
     "physx/Cartpole-v0": {
@@ -67,7 +68,7 @@ def save(folder, model, normalization):
     layers = torch.nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net)
     linear = [layer for layer in layers if isinstance(layer, torch.nn.Linear)]
     sizes = [linear[0].in_features, *(layer.out_features for layer in linear)]
-    kwargs = {"layers": sizes, "activation": "Tanh"}
+    kwargs = {"layers": sizes, "activation": policy.activation_fn.__name__}
     kwargs |= {"net_fields": "observation", "opt_fields": "action"}
     config = NetworkConfig(
         "torch/fc", network_kwargs=kwargs, loss="MSELoss", optimizer="Adam", lr=0.0
@@ -87,6 +88,12 @@ def save(folder, model, normalization):
     learner.save(Path(folder) / "network", Progress(0, 0, 0, model.seed or 0))
 
 
+def option(word):
+    """Return name and value of ``NAME=VALUE``, whose value is TOML."""
+    name, _, text = word.partition("=")
+    return name, tomllib.loads(f"value = {text}")["value"]
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--env", default="physx/Cartpole-v0")
@@ -94,15 +101,18 @@ def main():
     parser.add_argument("--steps", type=int, help="at most; default: as set for the environment")
     parser.add_argument("--threshold", type=float, help="mean reward; default: the environment's")
     parser.add_argument("--seed", type=int, default=0)
+    pairs = {"nargs": "+", "type": option, "default": [], "metavar": "NAME=VALUE"}
+    parser.add_argument("--ppo", **pairs, help="options that replace those set for it")
+    parser.add_argument("--env-kwargs", **pairs, help="options of the environment")
     parser.add_argument("--save", metavar="FOLDER", help="where to write the policy")
     chosen = parser.parse_args()
 
     torch.set_num_threads(1)
-    settings = dict(SETTINGS.get(chosen.env, OTHERS))
+    settings = SETTINGS.get(chosen.env, OTHERS) | dict(chosen.ppo)
     n_envs, part = settings.pop("n_envs", 8), settings.pop("part", 10_000)
     steps = settings.pop("steps", 200_000) if chosen.steps is None else chosen.steps
     settings.pop("steps", None)
-    options = {"backend": chosen.backend}
+    options = {"backend": chosen.backend, **dict(chosen.env_kwargs)}
     many = make_vec_env(chosen.env, n_envs=n_envs, seed=chosen.seed, env_kwargs=options)
     normalizer = None
     if settings.pop("normalize", False):  # without clipping, as the saved network does not clip

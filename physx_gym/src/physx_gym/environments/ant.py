@@ -26,7 +26,7 @@ class AntEnv(RobotEnv):
     Action, shape (8,): torques of the joints, as fractions of 15 N m. Observation, shape (27,):
     height of the torso in m; its orientation, a quaternion x, y, z, w; the joints' positions in
     rad; velocity of the torso in its own frame, in m/s and rad/s; the joints' velocities. Reward:
-    mean velocity along x in the step, in m/s, plus 0.5 while it is healthy, minus 0.05 times the
+    mean velocity along x in the step, in m/s, plus 0.5 while it is healthy, minus 0.02 times the
     sum of the squared actions; ``info["reward"]`` has the parts. It is healthy while the torso is
     between 0.22 and 1 m high, and not upside down: the torso's radius is 0.2 m, so that lying on
     the ground is not. Otherwise it terminates; it is truncated after 1000 steps of 50 ms.
@@ -41,7 +41,7 @@ class AntEnv(RobotEnv):
         *,
         backend: Any = BACKEND,
         forward_reward_weight: float = 1.0,
-        ctrl_cost_weight: float = 0.05,
+        ctrl_cost_weight: float = 0.02,
         healthy_reward: float = 0.5,
         terminate_when_unhealthy: bool = True,
         healthy_z_range: tuple[float, float] = (0.22, 1.0),
@@ -74,7 +74,7 @@ class AntEnv(RobotEnv):
         self._lowest, self._highest = checks.vector("healthy_z_range", healthy_z_range, 2)
         self._noise = checks.not_negative("reset_noise_scale", reset_noise_scale)
         self._first_seen = 2 if exclude_current_positions_from_observation else 0
-        world = World([Robot("ant", fixed_base=False)], period=6.25e-3, ground=Ground())
+        world = World([Robot("ant", fixed_base=False)], period=1.25e-2, ground=Ground())
         options = {"simulation_duration_max": 50.0, **options}
         super().__init__(Simulator(world, backend=backend, sensors=()), 0.05, **options)
 
