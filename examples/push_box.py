@@ -2,7 +2,7 @@
 
     python examples/push_box.py                             # 20 episodes
     python examples/push_box.py --episodes 5 --render push_box.rrd
-    python examples/push_box.py --learn 300000              # PPO of stable-baselines3 instead
+    python examples/push_box.py --policy FOLDER             # of train_ppo.py --env physx/PushBox-v0
 
 Prints how many episodes succeeded; exits with 1 if the policy failed in more than one of ten.
 `--render` writes the last episode as a recording that Rerun opens.
@@ -14,7 +14,7 @@ import sys
 import gymnasium
 import numpy as np
 
-import physx_gym  # noqa: F401 - registers the environments
+from physx_gym import Policy
 
 AWAY = 0.3  # m, from the middle of the box, at which the stick goes around it
 
@@ -40,31 +40,15 @@ def push(observation):
     return np.clip(6.0 * (target - stick) - speed, -1.0, 1.0).astype(np.float32)
 
 
-def learned(steps, seed):
-    """Return a policy that PPO learns in so many steps."""
-    import torch
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.env_util import make_vec_env
-
-    torch.set_num_threads(1)
-    many = make_vec_env("physx/PushBox-v0", n_envs=16, seed=seed)
-    settings = {"n_steps": 128, "batch_size": 512, "n_epochs": 8, "learning_rate": 5e-4}
-    settings |= {"gamma": 0.98, "policy_kwargs": {"net_arch": [128, 128]}}
-    model = PPO("MlpPolicy", many, seed=seed, device="cpu", **settings)
-    model.learn(steps)
-    many.close()
-    return lambda observation: model.predict(observation, deterministic=True)[0]
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--learn", type=int, metavar="STEPS", help="learn a policy with PPO")
+    parser.add_argument("--policy", metavar="FOLDER", help="a policy that train_ppo.py saved")
     parser.add_argument("--render", metavar="FILE", help="recording of the last episode: FILE.rrd")
     chosen = parser.parse_args()
-    policy = learned(chosen.learn, chosen.seed) if chosen.learn else push
     env = gymnasium.make("physx/PushBox-v0")
+    policy = Policy(chosen.policy, env) if chosen.policy else push
     base = env.unwrapped
     successes = 0
     for episode in range(chosen.episodes):
