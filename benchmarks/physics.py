@@ -157,9 +157,12 @@ def threshold(holds: Callable[[float], bool], theory: float) -> float:
 # Time -------------------------------------------------------------------------------------------
 
 
-def ant(engine: str, solver: str | None, driven: bool) -> tuple[Simulation, Callable[[], int]]:
+def ant(
+    engine: str, solver: str | None, driven: bool, iterations: int | None = None
+) -> tuple[Simulation, Callable[[], int]]:
     """Return an ant, at rest or driven by random torques, and what steps it."""
-    simulation = build(engine, solver, Robot("ant", fixed_base=False), period=6.25e-3)
+    options = {"period": 6.25e-3, "iterations": iterations}
+    simulation = build(engine, solver, Robot("ant", fixed_base=False), **options)
     q = simulation.positions()
     q[2], q[8::2] = 0.377, 1.0
     simulation.set_state(q, np.zeros(14))
@@ -207,6 +210,7 @@ def stack(engine: str, solver: str | None) -> tuple[Simulation, Callable[[], int
 SCENES: dict[str, Callable[[str, str | None], tuple[Simulation, Callable[[], int]]]] = {
     "ant at rest": lambda engine, solver: ant(engine, solver, False),
     "ant, random torques": lambda engine, solver: ant(engine, solver, True),
+    "the same, iterations=5": lambda engine, solver: ant(engine, solver, True, 5),
     "A1 standing": standing,
     "stack of 5 boxes": stack,
 }

@@ -40,6 +40,20 @@ def test_a_sliding_box_stops_at_the_same_distance_in_all_directions(backend, deg
         np.testing.assert_allclose(math.atan2(y, x), angle, atol=1e-3)
 
 
+def test_friction_is_right_with_few_iterations(backend):
+    """The solver goes on from the impulses of the last step."""
+    cube = Box(name="cube", size=(0.2, 0.2, 0.2), position=(0, 0, 0.1), friction=0.5)
+    with backend.build(World(objects=[cube], ground=Ground(), iterations=5)) as simulation:
+        v = simulation.velocities()
+        v[:2] = 1.2, 1.6
+        simulation.step(20)
+        simulation.set_state(simulation.positions(), v)
+        simulation.step(600)
+        np.testing.assert_allclose(
+            math.hypot(*simulation.positions()[:2]), 4 / (2 * 0.5 * GRAVITY), rtol=0.01
+        )
+
+
 @pytest.mark.parametrize("degrees", [35, 50])
 def test_an_a_frame_stands_if_friction_holds_its_legs_together(backend, write_urdf, degrees):
     """Friction bears load here: a bound from the normal forces without friction is too small."""

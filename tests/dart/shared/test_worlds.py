@@ -191,6 +191,7 @@ def test_duplicate_names_of_bodies_are_rejected(backend, bar):
         (lambda: World(objects=[Sphere(name="s", radius=1)], gravity=(0, 1)), "gravity"),
         (lambda: World(objects=[Sphere(name="s", radius=1)], contacts="some"), "contacts"),
         (lambda: World(objects=[Sphere(name="s", radius=1)], integrator="rk5"), "rk4"),
+        (lambda: World(objects=[Sphere(name="s", radius=1)], iterations=0), "iterations is 0"),
         (lambda: World(objects=[Sphere(name="s", radius=1)], ground=3), "ground"),
         (lambda: Sphere(name="a/b", radius=1), "without '/'"),
         (lambda: Sphere(name="s", radius=-1), "radius.*positive"),

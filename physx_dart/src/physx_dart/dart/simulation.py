@@ -204,10 +204,12 @@ def _new_world(world: World, detector: str, solver: str) -> Any:
     contacts = made.getConstraintSolver()
     if solver == "nsgs":
         options = constraint.NsgsFrictionSolver.Options()
-        options.maxSweeps, options.tolerance = _SWEEPS, _TOLERANCE
+        options.maxSweeps, options.tolerance = world.iterations or _SWEEPS, _TOLERANCE
         contacts.setBoxedLcpSolver(constraint.NsgsFrictionSolver(options))
     elif solver == "fbf":
-        contacts.setBoxedLcpSolver(constraint.FbfFrictionSolver())
+        options = constraint.FbfFrictionSolver.Options()
+        options.maxOuterIterations = world.iterations or options.maxOuterIterations
+        contacts.setBoxedLcpSolver(constraint.FbfFrictionSolver(options))
     return made
 
 

@@ -34,21 +34,23 @@ class ImpulseSolver:
 
     Args:
         name: The solver to try first: ``"pgs"`` (projected Gauss-Seidel) or ``"admm"``.
+        iterations: Most iterations of Pinocchio's solvers.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, iterations: int | None = None) -> None:
         """Prepare the solver."""
+        most = iterations or _ITERATIONS
         if name not in SOLVERS:
             raise UnknownOptionError("World.solver for pinocchio", [name], SOLVERS)
         gauss_seidel = (
             pinocchio.PGSConstraintSolver,
             pinocchio.PGSSolverResult,
-            _accurate(pinocchio.PGSSolverSettings()),
+            _accurate(pinocchio.PGSSolverSettings(), most),
         )
         admm = (
             pinocchio.ADMMConstraintSolver,
             pinocchio.ADMMSolverResult,
-            _accurate(pinocchio.ADMMSolverSettings()),
+            _accurate(pinocchio.ADMMSolverSettings(), most),
         )
         self._solvers = {"pgs": gauss_seidel, "admm": admm}
         self._order = sorted(SOLVERS, key=lambda each: each != name)
@@ -164,9 +166,9 @@ def _joints(length: int) -> Any:
     return joints
 
 
-def _accurate(settings: Any) -> Any:
+def _accurate(settings: Any, iterations: int) -> Any:
     """Return settings with which a solver iterates until its result is accurate."""
-    settings.max_iterations = _ITERATIONS
+    settings.max_iterations = iterations
     for kind in ("feasibility", "complementarity"):
         setattr(settings, f"absolute_{kind}_tol", _ACCURACY)
         setattr(settings, f"relative_{kind}_tol", 0.0)
