@@ -130,3 +130,12 @@ def test_restore_gives_the_same_bits_among_bodies(backend):
         simulation.restore(state)
         simulation.step(150)
         np.testing.assert_array_equal(simulation.positions(), expected)
+
+
+def test_nothing_touches_a_table_without_contacts(backend):
+    ball = Sphere(name="ball", radius=0.1, position=(0, 0, 1.2))
+    table = Box(name="table", size=(2.0, 2.0, 0.1), static=True, position=(0, 0, 0.95))
+    for contacts, rests in (("none", False), ("static", True)):
+        with backend.build(World(objects=[ball, table], contacts=contacts)) as simulation:
+            simulation.step(600)
+            assert (simulation.positions()[2] > 1.0) == rests

@@ -131,8 +131,10 @@ class PairFinder:
 
     def _possible(self, solids: Sequence[_Solid]) -> Iterator[tuple[int, int]]:
         """Yield the pairs of shapes that may touch: those that can move against each other."""
+        contacts = self._parts.world.contacts
         for (i, a), (j, b) in itertools.combinations(enumerate(solids), 2):
-            if a.owner is None or not (b.owner is None or self._parts.world.contacts == "all"):
+            wanted = contacts == "all" or (contacts == "static" and b.owner is None)
+            if a.owner is None or not wanted:
                 continue
             if a.joint == 0 and (b.owner is None or b.joint == 0):
                 continue
