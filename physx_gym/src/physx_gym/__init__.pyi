@@ -16,6 +16,7 @@ from .env.layers.block_layers import ControlledEnv as ControlledEnv
 from .env.layers.block_layers import ObservedEnv as ObservedEnv
 from .env.layers.composed import ComposedEnv as ComposedEnv
 from .env.layers.layer import Layer as Layer
+from .env.layers.randomized import RandomizedEnv as RandomizedEnv
 from .env.pipeline_env import PipelineEnv as PipelineEnv
 from .env.robot_env import RobotEnv as RobotEnv
 from .pipeline.recipe import build_pipeline as build_pipeline

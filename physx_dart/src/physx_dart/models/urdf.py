@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -109,7 +109,8 @@ def read_robot(robot: Robot, *, touching: bool = False) -> RobotModel:
         moving = [joint for joint in tree.joints if joint.get("type") in _MOVING]
         joints = tuple(_joint(joint, robot.joints) for joint in moving)
         _check_settings(robot, joints)
-        text = _engine_text(tree)
+        _check_masses(robot, list(tree.links))
+        text = _engine_text(tree, robot.mass_factors)
         shapes = shapes_of_robot(robot, path, tree) if touching else ()
     except (ModelError, ValueError) as error:
         raise ModelError(f'Robot "{robot.name}", {path}: {error}.') from error
@@ -123,6 +124,15 @@ def _check_settings(robot: Robot, joints: tuple[Joint, ...]) -> None:
             raise ModelError(
                 f'joints has settings for "{name}", which is not a movable joint.'
                 f"{nearest(name, known)} Joints: {listed(known)}"
+            )
+
+
+def _check_masses(robot: Robot, links: Sequence[str]) -> None:
+    for name in robot.mass_factors:
+        if name not in links:
+            raise ModelError(
+                f'mass_factors has one for "{name}", which is not a link.'
+                f"{nearest(name, links)} Links: {listed(links)}"
             )
 
 
@@ -160,10 +170,10 @@ def _number(joint: Element, tag: str, attribute: str) -> float:
     return number
 
 
-def _engine_text(tree: UrdfTree) -> str:
+def _engine_text(tree: UrdfTree, mass_factors: Mapping[str, float]) -> str:
     parts = ['<robot name="robot">']
     for name in tree.links:
-        link = _inertial(name, tree.elements[name])
+        link = _inertial(name, tree.elements[name], mass_factors.get(name, 1.0))
         parts.append(f"<link name={_quote(name)}>{link}</link>")
     for joint in tree.joints:
         moving = joint.get("type") in _MOVING
@@ -187,8 +197,8 @@ def _quote(name: str) -> str:
     return quoteattr(name)
 
 
-def _inertial(name: str, link: Element) -> str:
-    """Return the text of a link's inertia, with each number validated."""
+def _inertial(name: str, link: Element, factor: float) -> str:
+    """Return the text of a link's inertia times a factor, with each number validated."""
     given, where = link.find("inertial"), f'link "{name}"'
     mass = None if given is None else given.find("mass")
     if given is None or mass is None or _checked_text(where, mass, "value", "0", 1) == "0":
@@ -197,8 +207,12 @@ def _inertial(name: str, link: Element) -> str:
         raise ModelError(f'{where} has the mass "{mass.get("value")}"')
     inertia = given.find("inertia")
     found = Element("none") if inertia is None else inertia
-    moments = " ".join(f'{key}="{_checked_text(where, found, key, "0", 1)}"' for key in _MOMENTS)
+    values = {key: _checked_text(where, found, key, "0", 1) for key in _MOMENTS}
     value = mass.get("value", "")
+    if factor != 1.0:
+        values = {key: repr(factor * float(text)) for key, text in values.items()}
+        value = repr(factor * float(value))
+    moments = " ".join(f'{key}="{text}"' for key, text in values.items())
     origin = _origin(where, given)
     return f'<inertial>{origin}<mass value="{value}"/><inertia {moments}/></inertial>'
 

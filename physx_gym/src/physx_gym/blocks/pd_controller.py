@@ -75,6 +75,7 @@ class PDController(ControllerBlock):
         self.joint_position_margin = joint_position_margin
         self.joint_velocity_limit = joint_velocity_limit
         self.joint_acceleration_limit = joint_acceleration_limit
+        self._gain_factors: Any = np.ones((2, 1))
         self.refresh_connection()
 
     def connect(self) -> None:
@@ -99,13 +100,25 @@ class PDController(ControllerBlock):
         self.action_space = spaces.Box(-most, most, dtype=np.float64)
         self.targets = Targets(self.lower, self.upper, self.max_velocity, self.max_acceleration)
         self.target_state = self.targets.state
-        gains = kp / joints.reduction
-        self._encoders, self._errors = joints.encoders, np.zeros((2, len(gains)))
-        self._gains = np.array([gains, gains * kd])
+        self._nominal = kp / joints.reduction, kp / joints.reduction * kd
+        self._encoders, self._errors = joints.encoders, np.zeros((2, len(kp)))
+        self._gains = self._gain_factors * self._nominal
         self._least, self._most = -joints.max_torque, joints.max_torque
         # Row by row, as the measurements may have a different memory layout.
         targets = (self.targets.positions, self.targets.velocities)
         self._rows = (*targets, *self._encoders.values, *self._errors)
+
+    def scale_gains(self, position: Any, velocity: Any) -> None:
+        """Multiply the gains, as they were given, by factors from now on.
+
+        Args:
+            position: Factor of the torque for each unit of position error: a number, or one for
+                each motor.
+            velocity: Factor of the torque for each unit of velocity error, likewise.
+        """
+        self._gain_factors = np.array(np.broadcast_arrays(position, velocity), np.float64)
+        self._gain_factors = self._gain_factors.reshape(2, -1)
+        self._gains[:] = self._gain_factors * self._nominal
 
     def setup(self) -> None:
         """Compute the periods."""

@@ -343,6 +343,18 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
     def _recall(self, memory: Any) -> None:
         """Restore what `_memory` returned."""
 
+    def _foresee(self, memory: Any) -> bool:
+        """Prepare `_setup` for a memory that `_recall` will get.
+
+        Returns:
+            Whether the world has to be set up for it; otherwise it may be fit as it is.
+        """
+        return False
+
+    def _constants(self) -> dict[str, Any]:
+        """Return what describes this layer in the log of the episode: plain data."""
+        return {}
+
     def _snapshot_own(self) -> dict[str, Any]:
         return {
             "action": copy_tree(self.action),

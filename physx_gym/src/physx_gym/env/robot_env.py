@@ -37,9 +37,9 @@ class RobotEnv(PipelineEnv):
     `refresh_observation`. `_initialize_action_space` and `_initialize_observation_space` are called
     at construction, and at a reset after `_setup` has changed the simulator's options.
 
-    Reset: `stop`; the seed; registered forces are removed; `_setup`; spaces, if the simulator was
-    rebuilt; actions become neutral; `_setup` of the layers; `_sample_state`; the simulation starts;
-    `_initialize_buffers`; `_refresh_buffers`; `refresh_observation`; `has_terminated`.
+    Reset: `stop`; the seed; registered forces are removed; `_setup`, then that of the layers;
+    spaces, if the simulator was rebuilt; actions become neutral; `_sample_state`; the simulation
+    starts; `_initialize_buffers`; `_refresh_buffers`; `refresh_observation`; `has_terminated`.
 
     Step: the action is checked and clipped; every `control_dt` `compute_command`, every
     `observe_dt` `refresh_observation` (before a command at the same time); then once
@@ -351,10 +351,12 @@ class RobotEnv(PipelineEnv):
             self._initialize_seed(seed)
         self.reset_options = dict(options or {})
         simulator.remove_all_forces()
-        self._setup()
+        for layer in layers:
+            layer._setup()
         self._set_timing()
         simulator.prepare()
         if simulator.builds != loop.builds:
+            self.recorder.telemetry.renew()
             self._initialize_spaces()
             for layer in layers[1:]:
                 layer._initialize_action_space()
@@ -364,8 +366,6 @@ class RobotEnv(PipelineEnv):
         for layer in layers:
             fill(layer.action, neutral(layer.action_space))
         self.num_steps[...] = loop.steps = 0
-        for layer in layers[1:]:
-            layer._setup()
         state = subclass_checks.check_pair(self, "_sample_state", self._sample_state())
         if self._own_quantities is not None:
             self._own_quantities.reset()
@@ -432,12 +432,14 @@ class RobotEnv(PipelineEnv):
 
     def _begin_recording(self, outermost: PipelineEnv, everything: bool, info: Info) -> None:
         """Start to record: everything, with a file that the information names, or the least."""
-        constants = {
+        constants: dict[str, Any] = {
             "seed": self.np_random_seed,
             "step_dt": self.step_dt,
             "control_dt": self.control_dt,
             "observe_dt": self.observe_dt,
         }
+        for layer in outermost.layers:
+            constants |= layer._constants()
         name, path = type(self).__name__, self.reset_options.get("log_path")
         if everything:
             info["log_path"] = self.recorder.begin(name, outermost.action, path, constants)
@@ -571,6 +573,10 @@ class RobotEnv(PipelineEnv):
             given = state.get("layers") if isinstance(state, dict) else state
             raise SimulationError(f"The snapshot is of {given}, not of {names}.")
         runs = state["own"][0]["simulator"]["running"]
+        memories = [own["memory"] for own in state["own"]]
+        foreseen = [layer._foresee(each) for layer, each in zip(layers, memories, strict=True)]
+        if any(foreseen):
+            self.stop()
         if not runs or self.outermost is not outermost or not self.is_simulation_running:
             self.run_reset(outermost, None, state["own"][0]["options"])
         for layer, own in zip(layers, state["own"], strict=True):
@@ -584,6 +590,7 @@ class RobotEnv(PipelineEnv):
             "simulator": self.simulator.snapshot(),
             "random": copy_tree(self.np_random.bit_generator.state),
             "seed": self.np_random_seed,
+            "episode": loop.episode,
             "num_steps": int(self.num_steps),
             "ready": (loop.is_ready, loop.reason),
             "options": dict(self.reset_options),
@@ -594,7 +601,7 @@ class RobotEnv(PipelineEnv):
         loop = self._control_loop
         self.simulator.restore(own["simulator"])
         self.np_random.bit_generator.state = own["random"]
-        self._np_random_seed = own["seed"]
+        self._np_random_seed, loop.episode = own["seed"], own["episode"]
         self.num_steps[...] = loop.steps = own["num_steps"]
         loop.is_ready, loop.reason = own["ready"]
         self.reset_options = dict(own["options"])

@@ -19,6 +19,7 @@ _MODULES = {
     "component": (
         "physx_gym.tasks.rewards",
         "physx_gym.tasks.terminations",
+        "physx_gym.tasks.randomizations",
         "physx_gym.tasks.quantities",
         "physx_gym",
         "physx_core",

@@ -104,6 +104,10 @@ class Telemetry:
                 )
             taken[name] = f'"{variable.name}" too'
 
+    def renew(self) -> None:
+        """Let new arrays replace the variables registered so far, as after an episode."""
+        self._new = set()
+
     def unregister(self, name: str) -> None:
         """Remove a variable, if there is one of a name with namespace."""
         if self.is_recording:

@@ -71,6 +71,8 @@ class Robot:
         friction: Coefficient of friction of all links; the smaller one of a pair counts.
         restitution: Coefficient of restitution of all links; the product of a pair counts.
         joints: Settings of joints, by their name in the URDF file.
+        mass_factors: Factors of the mass and the moments of inertia of links, by their name in the
+            URDF file; 1 for all others.
     """
 
     urdf: str | Path
@@ -85,6 +87,7 @@ class Robot:
     friction: float = 1.0
     restitution: float = 0.0
     joints: Mapping[str, JointSettings] = field(default_factory=dict)
+    mass_factors: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         checks.name("robot", self.name)
@@ -105,3 +108,5 @@ class Robot:
         for joint, settings in self.joints.items():
             if not isinstance(settings, JointSettings):
                 raise ConfigError(f'{where}joints["{joint}"] must be JointSettings(...).')
+        for link, factor in self.mass_factors.items():
+            checks.positive(f'{where}mass_factors["{link}"]', factor)

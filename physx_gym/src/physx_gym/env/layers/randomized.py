@@ -1,0 +1,124 @@
+"""The layer of domain randomization."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from physx_core.errors import ConfigError
+from physx_gym.env.layers.layer import Layer
+from physx_gym.env.pipeline_env import PipelineEnv
+from physx_gym.tasks.randomizations import Randomization
+from physx_gym.tasks.randomizations.randomization import Nominal
+
+
+class RandomizedEnv(Layer):
+    """Draws properties of the world anew for each episode, from ranges.
+
+    What is drawn depends on the environment's seed and the number of the episode alone: first
+    states, noise and all else that is random stay as they are without this layer. Factors are those
+    of the values that the environment had when it was put under this layer. New masses, friction,
+    delays and noise need a new simulation, some milliseconds; gains and pushes do not.
+
+    Attributes:
+        randomizations: What is drawn.
+        every: Number of episodes between two draws.
+        drawn: What was drawn for the present episode, by the randomizations' names; also in the
+            constants of the log, as ``"randomization"``.
+    """
+
+    def __init__(
+        self,
+        env: PipelineEnv,
+        *,
+        randomizations: Sequence[Randomization] | Randomization,
+        every: int = 1,
+    ) -> None:
+        """Put randomizations on an environment.
+
+        Args:
+            env: The environment.
+            randomizations: One or several, with different names.
+            every: Number of episodes that share what is drawn.
+
+        Raises:
+            ConfigError: If one is not a `Randomization`, two have the same name, the environment is
+                randomized already, or lacks what is randomized.
+            ComponentNotFoundError: If the environment lacks something that is named.
+        """
+        given = [randomizations] if isinstance(randomizations, Randomization) else randomizations
+        self.randomizations = tuple(given)
+        self.every = every
+        self.drawn: dict[str, Any] = {}
+        self._foreseen: dict[str, Any] | None = None
+        super().__init__(env)
+        self._check()
+        self._nominal_options = env.simulator.get_options()
+        self._draw_from(0, 0)  # so that what is missing is noticed here
+
+    def _check(self) -> None:
+        if type(self.every) is not int or self.every < 1:
+            raise ConfigError(
+                f"RandomizedEnv.every is {self.every!r} but must be a number of episodes."
+            )
+        for each in self.randomizations:
+            if not isinstance(each, Randomization):
+                raise ConfigError(f"{each!r} is not a Randomization.")
+        names = [each.name for each in self.randomizations]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"Two randomizations have the same name: {sorted(names)}.")
+        if any(isinstance(layer, RandomizedEnv) for layer in self.env.layers):
+            raise ConfigError(
+                "The pipeline has a RandomizedEnv already: give all randomizations to one."
+            )
+
+    @property
+    def _nominal(self) -> Nominal:
+        return Nominal(self.env, self._nominal_options)
+
+    def _draw(self, number: int) -> dict[str, Any]:
+        """Return what is drawn for the episodes of a number."""
+        seed = self.np_random_seed
+        if seed < 0:  # the random generator was set, so the seed is not known
+            seed = int(self.np_random.integers(2**32))
+        return self._draw_from(seed, number)
+
+    def _draw_from(self, seed: int, number: int) -> dict[str, Any]:
+        found = {}
+        for place, each in enumerate(self.randomizations):
+            sequence = np.random.SeedSequence(seed, spawn_key=(3, place, number))
+            found[each.name] = each.draw(self._nominal, np.random.default_rng(sequence))
+        return found
+
+    def _setup(self) -> None:
+        super()._setup()
+        before, self._foreseen = self.drawn, self._foreseen or None
+        number, rest = divmod(self._base._control_loop.episode, self.every)
+        if self._foreseen is not None:
+            self.drawn = self._foreseen
+        elif rest == 0 or not before:
+            self.drawn = self._draw(number)
+        if self.drawn != before:
+            for each in self.randomizations:
+                options = each.options(self._nominal, self.drawn[each.name])
+                if options:
+                    self.simulator.set_options(options)
+        for each in self.randomizations:
+            each.apply(self.env, self.drawn[each.name])
+
+    # State -----------------------------------------------------------------------------------
+
+    def _memory(self) -> Any:
+        return self.drawn
+
+    def _recall(self, memory: Any) -> None:
+        self._foreseen = None
+
+    def _foresee(self, memory: Any) -> bool:
+        self._foreseen = memory
+        return bool(memory != self.drawn)
+
+    def _constants(self) -> dict[str, Any]:
+        return {"randomization": self.drawn}
