@@ -25,14 +25,18 @@ def page():
     return PAGE.read_text(encoding="utf-8")
 
 
+_KINDS = ["python", "python", "toml", "python", "toml", *["python"] * 8]
+
+
 def test_all_code_of_the_page_runs(page, tmp_path):
     blocks = [(kind, text) for kind, text in BLOCK.findall(page)]
-    assert [kind for kind, _ in blocks] == ["xml", "python", "python", "toml", *["python"] * 8]
+    assert [kind for kind, _ in blocks] == ["xml", *_KINDS]
     for kind, text in blocks:
         if kind == "xml":
             (tmp_path / "swing.urdf").write_text(text, encoding="utf-8")
         if kind == "toml":
-            (tmp_path / "walker.toml").write_text(text, encoding="utf-8")
+            with (tmp_path / "walker.toml").open("a", encoding="utf-8") as file:
+                file.write(text)
     code = [text for kind, text in blocks if kind == "python" and "render_mode" not in text]
     (tmp_path / "page.py").write_text("\n".join(code), encoding="utf-8")
     variables = {key: each for key, each in os.environ.items() if "DISPLAY" not in key}
@@ -50,7 +54,7 @@ def test_all_code_of_the_page_runs(page, tmp_path):
     for name in ("swing.png", "both.png", "swing.rrd"):
         assert (tmp_path / name).stat().st_size > 1000
     assert len(read_log(tmp_path / "swing.h5").time) == 3
-    assert len(read_toml(tmp_path / "walker.toml")["layers_config"]) == 4
+    assert len(read_toml(tmp_path / "walker.toml")["layers_config"]) == 5
 
 
 def test_the_example_of_the_readme_runs():

@@ -234,3 +234,24 @@ def test_a_world_is_plain_and_picklable(bar):
     assert other.objects == world.objects
     np.testing.assert_array_equal(other.ground.heights, world.ground.heights)
     assert copy.deepcopy(Ground()) == Ground()
+
+
+def test_factors_of_masses_change_masses_and_moments_of_inertia(backend):
+    floating = {"fixed_base": False, "collisions": "none"}
+    with (
+        backend.build(World([Robot("ant", **floating)])) as plain,
+        backend.build(World([Robot("ant", mass_factors={"torso": 3.0}, **floating)])) as heavy,
+    ):
+        q = plain.positions()
+        difference = heavy.mass_matrix(q) - plain.mass_matrix(q)
+    linear, angular = np.diagonal(difference)[:3], np.diagonal(difference)[3:6]
+    assert (linear > 0).all() and np.ptp(linear) < 1e-9
+    assert (angular > 0).all()
+    assert not difference[6:, 6:].any() or np.abs(difference[6:, 6:]).max() < 1e-12
+
+
+def test_factors_of_masses_are_of_links_and_positive(backend):
+    with pytest.raises(ModelError, match=r'"torsoo", which is not a link. Did you mean "torso"\?'):
+        backend.build(World([Robot("ant", fixed_base=False, mass_factors={"torsoo": 2.0})]))
+    with pytest.raises(ConfigError, match=r'mass_factors\["torso"\]'):
+        Robot("ant", mass_factors={"torso": 0.0})
