@@ -331,6 +331,7 @@ class History:
         """Go on after a power cut that left what is in the folder now."""
         self._stage.boot = boot
         self._model.adopt(seen, promise, power=True)
+        self._modes |= {name: mode.fields for name, mode in self._model.now.modes.items()}
         self.calls.append(f"-- power cut; {boot} --")
 
     # Choosing calls -------------------------------------------------------------------------
