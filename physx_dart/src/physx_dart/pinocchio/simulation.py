@@ -55,7 +55,7 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
 
     def __init__(self, world: World) -> None:
         """Build the world; errors are those of the backend's `build`."""
-        solver = ImpulseSolver(world.solver or "pgs", world.iterations)
+        solver = ImpulseSolver(world.solver or "pgs")
         parts = read_parts(world)
         self._check_features(parts)
         statics = [] if world.contacts == "none" else parts.statics

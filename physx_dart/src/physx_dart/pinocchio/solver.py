@@ -34,23 +34,21 @@ class ImpulseSolver:
 
     Args:
         name: The solver to try first: ``"pgs"`` (projected Gauss-Seidel) or ``"admm"``.
-        iterations: Most iterations of Pinocchio's solvers.
     """
 
-    def __init__(self, name: str, iterations: int | None = None) -> None:
+    def __init__(self, name: str) -> None:
         """Prepare the solver."""
-        most = iterations or _ITERATIONS
         if name not in SOLVERS:
             raise UnknownOptionError("World.solver for pinocchio", [name], SOLVERS)
         gauss_seidel = (
             pinocchio.PGSConstraintSolver,
             pinocchio.PGSSolverResult,
-            _accurate(pinocchio.PGSSolverSettings(), most),
+            _accurate(pinocchio.PGSSolverSettings()),
         )
         admm = (
             pinocchio.ADMMConstraintSolver,
             pinocchio.ADMMSolverResult,
-            _accurate(pinocchio.ADMMSolverSettings(), most),
+            _accurate(pinocchio.ADMMSolverSettings()),
         )
         self._solvers = {"pgs": gauss_seidel, "admm": admm}
         self._order = sorted(SOLVERS, key=lambda each: each != name)
@@ -166,9 +164,9 @@ def _joints(length: int) -> Any:
     return joints
 
 
-def _accurate(settings: Any, iterations: int) -> Any:
+def _accurate(settings: Any) -> Any:
     """Return settings with which a solver iterates until its result is accurate."""
-    settings.max_iterations = iterations
+    settings.max_iterations = _ITERATIONS
     for kind in ("feasibility", "complementarity"):
         setattr(settings, f"absolute_{kind}_tol", _ACCURACY)
         setattr(settings, f"relative_{kind}_tol", 0.0)

@@ -33,7 +33,8 @@ class World:
         detector: Name of the engine's collision detector; None: its default.
         solver: Name of the engine's contact solver; None: its default.
         iterations: Most iterations of an iterative solver in a step; None: its default. Fewer are
-            faster, where it does not need them all, and less accurate in impacts and piles.
+            faster, where it does not need them all, and less accurate in impacts and piles. An
+            engine that solves contacts exactly ignores it.
     """
 
     robots: Sequence[Robot] = ()
