@@ -30,9 +30,9 @@ from physx_core.pipelines import Learner
 from physx_gym.cli.evaluate import evaluate, print_table, summary
 
 WALKING = {
-    "n_envs": 8, "n_steps": 512, "batch_size": 512, "n_epochs": 10, "gamma": 0.99,
-    "learning_rate": 3e-4, "normalize": True, "part": 50_000, "episodes": 5,
-    "policy_kwargs": {"net_arch": [128, 128], "log_std_init": -0.5},
+    "n_envs": 8, "n_steps": 256, "batch_size": 512, "n_epochs": 10, "gamma": 0.98,
+    "gae_lambda": 0.9, "learning_rate": 3e-4, "normalize": True, "part": 50_000, "episodes": 5,
+    "policy_kwargs": {"net_arch": [128, 128]},
 }  # fmt: skip
 SETTINGS = {
     "physx/Cartpole-v0": {
@@ -43,7 +43,7 @@ SETTINGS = {
         "n_steps": 256, "batch_size": 512, "n_epochs": 10, "gamma": 0.99, "gae_lambda": 0.94,
         "learning_rate": 1e-3, "ent_coef": 0.01,
     },
-    "physx/Ant-v0": {"steps": 500_000, **WALKING},
+    "physx/Ant-v0": {"steps": 400_000, **WALKING},
     "physx/Quadruped-v0": {"steps": 400_000, **WALKING},
     "physx/PushBox-v0": {
         "steps": 1_000_000, "n_envs": 16, "n_steps": 128, "batch_size": 512, "n_epochs": 8,

@@ -3,6 +3,8 @@
 What subclasses change is in `test_derived_environments`.
 """
 
+import warnings
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -28,7 +30,7 @@ def ant(backend="dart", **options):
 
 def test_default_spaces(backend):
     env = ant(backend)
-    assert env.action_space == spaces.Box(-15.0, 15.0, (8,), np.float64)
+    assert env.action_space == spaces.Box(-60.0, 60.0, (8,), np.float64)
     observed = env.observation_space
     assert observed["t"].low == 0 and observed["t"].high == 86400.0
     q, v = observed["states"]["agent"]["q"], observed["states"]["agent"]["v"]
@@ -139,6 +141,27 @@ def test_the_longest_duration_truncates():
     env.simulation_duration_max = 0.05
     env.reset()
     assert [env.step([0.0])[3] for _ in range(3)] == [False, False, True]
+
+
+def test_an_observation_outside_of_its_space_truncates_and_the_first_one_warns():
+    class Narrow(RobotEnv):
+        def _initialize_observation_space(self):
+            self.observation_space = spaces.Box(-0.1, 0.1, (2,), np.float64)
+
+        def refresh_observation(self, measurement):
+            self.observation[:] = measurement["states"]["agent"]["q"]
+
+        def _sample_state(self):
+            return np.array([0.2, 0.0]), np.zeros(2)
+
+    env = Narrow("cartpole", 0.02, motors=SLIDER, period=5e-3)
+    env.reset()
+    expected = r"Narrow is outside of its space: 0\.2 at \[0\] is not between -0\.1 and 0\.1"
+    with pytest.warns(UserWarning, match=expected):
+        assert env.step([0.0])[2:4] == (False, True)
+    env.reset()
+    with warnings.catch_warnings(action="error"):
+        assert env.step([0.0])[3]
 
 
 def test_has_terminated_needs_a_running_episode():

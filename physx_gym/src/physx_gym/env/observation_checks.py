@@ -78,6 +78,25 @@ class ObservationChecks(SharedArrays):
         np.less_equal(vector, self._high, self._below)
         return b"\0" not in self._within.tobytes()  # many times faster than all()
 
+    def describe_outside(self, observation: Any) -> str:
+        """Return which number of an observation is first outside of its space, in words."""
+        for path, space in self._leaves:
+            part = value_at(observation, path)
+            if space.contains(part):
+                continue
+            if isinstance(space, spaces.Box):
+                part = np.asarray(part)
+                places = np.argwhere((part < space.low) | (part > space.high))
+                if len(places):
+                    place = tuple(places[0].tolist())
+                    where = format_path((*path, *place))
+                    low, high = space.low[place], space.high[place]
+                    at = f" at {where}" if where else ""
+                    return f"{part[place]:.6g}{at} is not between {low:.6g} and {high:.6g}"
+            where = format_path(path)
+            return f"{part}{f' at {where}' if where else ''} is not in {space}"
+        return "it is not in the space"
+
     def check_form(self, observation: Any) -> None:
         """Check that an observation has the form of its space, whatever its values."""
         for path, space in self._leaves:

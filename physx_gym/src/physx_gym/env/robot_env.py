@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import weakref
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -102,6 +103,7 @@ class RobotEnv(PipelineEnv):
         self._own_renderer: Any = None
         self._own_quantities: Any = None
         self._is_training = True
+        self._has_left_space = False
         self._set_timing()
         self._initialize_spaces()
 
@@ -199,10 +201,18 @@ class RobotEnv(PipelineEnv):
         return False, not self.is_inside()
 
     def is_inside(self) -> bool:
-        """Return whether `observation` is within its space."""
+        """Return whether `observation` is within its space; warn the first time that it is not."""
         loop = self._control_loop
         inside = loop.own_checks.is_inside(self.observation)
         loop.is_finite = inside and loop.own_checks.excludes_nan
+        if not inside and not self._has_left_space:
+            self._has_left_space = True
+            warnings.warn(
+                f"An observation of {type(self).__name__} is outside of its space: "
+                f"{loop.own_checks.describe_outside(self.observation)}. If that is no failure of "
+                "the task, widen the space.",
+                stacklevel=2,
+            )
         return inside
 
     def compute_reward(self, terminated: bool, info: Info) -> float:

@@ -24,10 +24,14 @@ def box(*bounds: ArrayLike) -> spaces.Box:
 
 
 def joint_positions(simulator: Simulator) -> Vector:
-    """Return bounds of the joints' positions: the larger of their limits, with a margin."""
+    """Return bounds of the joints' positions: the larger of their limits, with a margin.
+
+    An engine may stop a joint at its limit only after the physics step in which it passes that.
+    """
     layout, joints = simulator.layout, simulator.robot.joints
     farthest = np.maximum(np.abs(layout.lower[joints]), np.abs(layout.upper[joints]))
-    return np.where(np.isfinite(farthest), farthest * _MARGIN + 0.1, 1e6)
+    beyond = joint_velocities(simulator) * simulator.period
+    return np.where(np.isfinite(farthest), farthest * _MARGIN + beyond, 1e6)
 
 
 def joint_velocities(simulator: Simulator) -> Vector:

@@ -49,7 +49,7 @@ class QuadrupedEnv(RobotEnv):
             options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
         self.speed = float(speed)
-        world = World([Robot("a1/a1", fixed_base=False)], period=2.5e-3, ground=Ground())
+        world = World([Robot("a1/a1", fixed_base=False)], period=5e-3, ground=Ground())
         simulator = Simulator(world, backend=backend, sensors=(), control_period=5e-3)
         options = {"simulation_duration_max": 20.0, **options}
         super().__init__(simulator, 0.02, **options)
