@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -432,8 +432,7 @@ class Simulator(SharedArrays):
         first, part = engine.first, engine.part
         q = _whole("positions", positions, first.positions, part.positions)
         v = _whole("velocities", velocities, first.velocities, part.velocities)
-        engine.simulation.restore(first)
-        engine.simulation.set_state(q, v)
+        engine.simulation.restore(replace(first, positions=q, velocities=v, native=(), engine=""))
         self.robot_state.command.fill(0.0)
         engine.equipment.begin(self._random, self._reading_period)
         self._pending = list(self._forces)
