@@ -8,7 +8,8 @@ Trains with `examples/train_ppo.py` once for each seed, `--jobs` at a time, with
 stand there; then runs deterministic episodes on the engine that it was trained on and on the
 other one. Prints a line for each seed and engine, with the wall time of the training, and the range
 over the seeds. With `--check`, exits with 1 if any seed misses the target on its own engine.
-Options that are not its own are passed on to the example. Needs stable-baselines3.
+`--film FILE` shows the beginning of an episode under the policy of the first seed. Options that are
+not its own are passed on to the example. Needs stable-baselines3.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ import torch
 from measure import claim, finish
 
 from physx_core.errors import FeatureNotSupportedError
-from physx_gym import Policy
+from physx_gym import Policy, RobotEnv
 from physx_gym.bridge.make_env import make_env
 from physx_gym.cli.evaluate import evaluate, summary
 
@@ -41,6 +42,7 @@ TARGETS = {
 }
 """Figure of `evaluate` whose mean must reach a value, for every seed, and number of episodes."""
 FIRST_SEED = 30_000
+FILM_TIME, FILM_SIZE = 6.0, (320, 240)
 NAMES = ("reward", "length", "speed", "success")
 
 
@@ -69,6 +71,20 @@ def figures(env: str, backend: str, folder: Path) -> dict[str, dict[str, float]]
         made.close()
 
 
+def film(env: str, backend: str, folder: Path, path: Path) -> None:
+    """Write a small film of the first seconds of an episode."""
+    made = make_env(env, {"backend": backend, "simulation_duration_max": FILM_TIME})
+    try:
+        base = made.unwrapped
+        assert isinstance(base, RobotEnv)
+        act = Policy(folder, made).act
+        base.evaluate(act, seed=FIRST_SEED, enable_stats=False, enable_replay=False)
+        base.replay(record_video_path=path, frame_rate=15.0, picture_size=FILM_SIZE)
+        print(f"film: {path}")
+    finally:
+        made.close()
+
+
 def row(label: str, found: dict[str, dict[str, float]], seconds: str) -> None:
     """Print mean and standard deviation of each figure of a policy's episodes."""
     texts = []
@@ -85,6 +101,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--folder", type=Path, help="where to keep the policies")
     parser.add_argument("--jobs", type=int, default=1, help="trainings at a time")
+    parser.add_argument("--film", type=Path, metavar="FILE", help=".webp or .gif to write")
     parser.add_argument("--check", action="store_true")
     chosen, words = parser.parse_known_args()
     torch.set_num_threads(1)
@@ -103,6 +120,8 @@ def main() -> None:
                     kept.append(found)
                     time_of = f"{seconds:.0f}" if engine == chosen.backend else ""
                     lines.append((f"{seed} on {engine}", found, time_of))
+        if chosen.film:
+            film(chosen.env, chosen.backend, policies[0][0], chosen.film)
     print(f"\n{chosen.env}, PPO on {chosen.backend}: mean ± standard deviation of the episodes")
     print(f"{'seed':20}{'time (s)':>10}" + "".join(f"{name:>18}" for name in NAMES))
     for line in lines:

@@ -30,9 +30,8 @@ from physx_core.pipelines import Learner
 from physx_gym.cli.evaluate import evaluate, print_table, summary
 
 WALKING = {
-    "n_envs": 8, "n_steps": 256, "batch_size": 512, "n_epochs": 10, "gamma": 0.98,
-    "gae_lambda": 0.9, "learning_rate": 3e-4, "normalize": True, "part": 50_000, "episodes": 5,
-    "policy_kwargs": {"net_arch": [128, 128]},
+    "steps": 400_000, "n_envs": 8, "batch_size": 512, "n_epochs": 10, "learning_rate": 3e-4,
+    "normalize": True, "part": 50_000, "episodes": 5,
 }  # fmt: skip
 SETTINGS = {
     "physx/Cartpole-v0": {
@@ -43,8 +42,14 @@ SETTINGS = {
         "n_steps": 256, "batch_size": 512, "n_epochs": 10, "gamma": 0.99, "gae_lambda": 0.94,
         "learning_rate": 1e-3, "ent_coef": 0.01,
     },
-    "physx/Ant-v0": {"steps": 400_000, **WALKING},
-    "physx/Quadruped-v0": {"steps": 400_000, **WALKING},
+    "physx/Ant-v0": {
+        **WALKING, "n_steps": 256, "gamma": 0.98, "gae_lambda": 0.9,
+        "policy_kwargs": {"net_arch": [128, 128]},
+    },
+    "physx/Quadruped-v0": {
+        **WALKING, "n_steps": 512, "gamma": 0.99, "gae_lambda": 0.95,
+        "policy_kwargs": {"net_arch": [128, 128], "log_std_init": -0.7},
+    },
     "physx/PushBox-v0": {
         "steps": 1_000_000, "n_envs": 16, "n_steps": 128, "batch_size": 512, "n_epochs": 8,
         "gamma": 0.98, "learning_rate": 5e-4, "policy_kwargs": {"net_arch": [128, 128]},

@@ -33,7 +33,7 @@ class QuadrupedEnv(RobotEnv):
     them, 200 times a second. Observation, shape (47,): the vertical in the frame of the trunk;
     linear and angular velocity of the trunk in its frame, in m/s and rad/s; the joints' positions,
     from the standing pose, in rad, and velocities; the last action; cosine and sine of the heading,
-    the angle from the x axis to the trunk's. Reward: up to 1 for a forward velocity of `speed`, up
+    the angle from the x axis to the trunk's. Reward: up to 2 for a forward velocity of `speed`, up
     to 0.5 for going straight, up to 0.5 for a heading of 0, 0.25 for staying up, minus costs of
     torques and of abrupt actions; ``info["reward"]`` has the parts, ``info["x_velocity"]`` the mean
     velocity along the x axis in the step, in m/s. It terminates if the trunk is below 0.12 m or
@@ -129,7 +129,7 @@ class QuadrupedEnv(RobotEnv):
         heading = math.atan2(self.observation[46], self.observation[45])
         torques = self.robot_state.command
         parts = {
-            "forward": math.exp(-4.0 * (forward - self.speed) ** 2),
+            "forward": 2.0 * math.exp(-4.0 * (forward - self.speed) ** 2),
             "straight": 0.5 * math.exp(-4.0 * (left**2 + 0.25 * turn**2)),
             "heading": 0.5 * math.exp(-4.0 * heading**2),
             "survival": 0.0 if terminated else 0.25,
