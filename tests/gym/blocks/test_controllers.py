@@ -71,7 +71,7 @@ def test_targets_are_consistent_and_within_limits(backend):
 
 
 def test_torques_follow_the_formula_and_are_clipped():
-    env = with_pd(RobotEnv(simulator(), DT), kp=800.0, kd=0.01)
+    env = with_pd(RobotEnv(simulator(), DT), kp=3200.0, kd=0.01)
     rng = np.random.default_rng(1)
     cut = free = 0
     observation, _ = env.reset(seed=0)
@@ -79,7 +79,7 @@ def test_torques_follow_the_formula_and_are_clipped():
         q, v = observation["measurements"]["Encoder"]
         observation, *_ = env.step(rng.uniform(env.action_space.low, env.action_space.high))
         target_q, target_v = observation["states"]["pd"]
-        wanted = 800.0 * ((target_q - q) + 0.01 * (target_v - v))
+        wanted = 3200.0 * ((target_q - q) + 0.01 * (target_v - v))
         most = env.simulator.layout.max_torque
         expected = np.clip(wanted, -most, most)
         np.testing.assert_allclose(env.robot_state.command, expected, atol=1e-9)

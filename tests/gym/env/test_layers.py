@@ -263,7 +263,7 @@ def test_options_that_change_reach_the_blocks():
     env = pipeline(Weaker(base().simulator, 0.02))
     env.reset(seed=0)
     pd = env.env.controller
-    assert (pd.joints.max_torque == 15.0).all()
+    assert (pd.joints.max_torque == 60.0).all()
     env.reset(seed=0, options={"torque": 0.5})
     assert (pd.joints.max_torque == 0.5).all()
     for action in actions(env, 5):

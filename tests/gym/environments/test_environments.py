@@ -166,18 +166,19 @@ def test_an_ant_has_the_options_of_gymnasiums():
     """As Ant-v5 defines them: weights, noise, what is healthy, whether that ends an episode."""
     still = np.zeros(8, np.float32)
     options = {"reset_noise_scale": 0.0, "exclude_current_positions_from_observation": False}
-    env = make("Ant", "dart", terminate_when_unhealthy=False, **options)
+    stands = {"healthy_z_range": (0.3, 0.4)}
+    env = make("Ant", "dart", terminate_when_unhealthy=False, **options, **stands)
     first, _ = env.reset(seed=0)
     assert env.observation_space.shape == first.shape == (29,)
     np.testing.assert_array_equal(first[:2], 0.0)
     np.testing.assert_array_equal(first, env.reset(seed=1)[0])
     weights = {"forward_reward_weight": 2.0, "ctrl_cost_weight": 0.5, "healthy_reward": 3.0}
-    other = make("Ant", "dart", healthy_z_range=(0.3, 0.4), **weights)
+    other = make("Ant", "dart", **weights, **stands)
     other.reset(seed=0)
-    push = np.full(8, 0.5, np.float32)
+    push = np.full(8, 0.125, np.float32)
     *_, info = other.step(push)
     forward = 2.0 * info["x_velocity"]
-    assert info["reward"] == pytest.approx({"forward": forward, "survival": 3.0, "effort": -1.0})
+    assert info["reward"] == pytest.approx({"forward": forward, "survival": 3.0, "effort": -0.0625})
     assert other.unwrapped.robot_state.q[:2].tolist() == [info["x_position"], info["y_position"]]
     ends = [lie_down(each).step(still) for each in (env, other)]
     assert [end[2] for end in ends] == [False, True]
