@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import time
 from multiprocessing.shared_memory import SharedMemory
 from typing import Any
 
@@ -87,8 +88,13 @@ def serve(name: str, block: SharedMemory, sizes: tuple[int, int, int], number: i
     kind = envs[0].action_space.dtype
     over, done, counters = [True] * count, 0, memory.counters
     while True:
+        looks = 0
         while counters[0] == done:
-            os.sched_yield()
+            looks += 1
+            if looks < 10_000:
+                os.sched_yield()
+            else:  # it is another one's turn
+                time.sleep(5e-3)
         if counters[0] == END:
             return
         for place, env in zip(mine, envs, strict=True):

@@ -21,7 +21,7 @@ END = -1
 """What `SharedBatch.asked` is set to when a worker is to end."""
 NEVER = 1 << 62
 """A number of entries that is never reached."""
-SPIN_TIME = 2e-4
+SPIN_TIME = 1e-3
 """How long a process looks for what it waits for before it sleeps, in s."""
 
 _Layout: TypeAlias = tuple[tuple[int, ...], Any]
