@@ -51,9 +51,9 @@ SETTINGS = {
         "policy_kwargs": {"net_arch": [128, 128], "log_std_init": -0.7},
     },
     "physx/PushBox-v0": {
-        "steps": 1_000_000, "n_envs": 16, "n_steps": 128, "batch_size": 512, "n_epochs": 8,
-        "gamma": 0.98, "learning_rate": 5e-4, "policy_kwargs": {"net_arch": [128, 128]},
-        "part": 25_000, "episodes": 40,
+        "steps": 1_000_000, "n_envs": 16, "n_steps": 128, "batch_size": 256, "n_epochs": 10,
+        "gamma": 0.98, "learning_rate": 3e-4, "policy_kwargs": {"net_arch": [128, 128]},
+        "normalize": True, "part": 25_000, "episodes": 40,
     },
 }  # fmt: skip
 """Options of PPO, and ``steps``: how many at most, ``n_envs``: environments, ``normalize``: whether

@@ -21,6 +21,7 @@ from physx_gym.simulator.simulator import Simulator
 FORCE = 20.0
 REACH = 1.0
 SIZE = (0.25, 0.25, 0.2)
+BEHIND = 0.18
 
 
 class PushBoxEnv(GoalTask):
@@ -31,8 +32,9 @@ class PushBoxEnv(GoalTask):
     Observation, shape (15,): position and velocity of the stick; position of the box, cosine and
     sine of its heading, its linear and angular velocity; vectors from the stick to the box and from
     the box to the goal; in m, m/s and rad/s. Reward: minus the box's distance from the goal and a
-    quarter of the stick's from the box, in m; 10 more when the box is within 8 cm of the goal,
-    which terminates. It is truncated after 200 steps of 50 ms, or if the box is out of reach.
+    quarter of the stick's from the place behind the box, 18 cm from its middle, where it pushes it
+    towards the goal, in m; 10 more when the box is within 8 cm of the goal, which terminates. It is
+    truncated after 200 steps of 50 ms, or if the box is out of reach.
     """
 
     ACHIEVED, CLOSE = slice(4, 6), 0.08
@@ -118,10 +120,12 @@ class PushBoxEnv(GoalTask):
         return info["is_success"], bool(np.abs(box).max() > REACH) or not self.is_inside()
 
     def compute_reward(self, terminated: bool, info: Info) -> float:
-        """Return the reward for a box close to its goal."""
-        seen = self._seen.tolist()
-        near, left = math.hypot(*seen[11:13]), math.hypot(*seen[13:15])
-        return (10.0 if terminated else 0.0) - left - 0.25 * near
+        """Return the reward for a box close to its goal, and a stick that can push it there."""
+        x, y, to_goal_x, to_goal_y = self._seen[11:15].tolist()
+        left = math.hypot(to_goal_x, to_goal_y)
+        behind = BEHIND / max(left, 1e-9)
+        away = math.hypot(x - behind * to_goal_x, y - behind * to_goal_y)
+        return (10.0 if terminated else 0.0) - left - 0.25 * away
 
 
 class PushBoxGoalEnv(GoalEnv, PushBoxEnv):
