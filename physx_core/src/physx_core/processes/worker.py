@@ -1,4 +1,4 @@
-"""What processes that compute for another one have in common."""
+"""Set-up of worker processes: their variables and signals, and their exit status in words."""
 
 from __future__ import annotations
 

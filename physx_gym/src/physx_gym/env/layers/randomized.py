@@ -94,9 +94,9 @@ class RandomizedEnv(Layer):
 
     def _setup(self) -> None:
         super()._setup()
-        before, self._foreseen = self.drawn, self._foreseen or None
+        before = self.drawn
         number, rest = divmod(self._base._control_loop.episode, self.every)
-        if self._foreseen is not None:
+        if self._foreseen:
             self.drawn = self._foreseen
         elif rest == 0 or not before:
             self.drawn = self._draw(number)

@@ -1,4 +1,4 @@
-"""What differs from episode to episode: domain randomization."""
+"""Domain randomization: properties of the world that episodes draw from ranges."""
 
 from __future__ import annotations
 
