@@ -8,14 +8,14 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-PAUSES = 0.0, 3e-4, 2e-3, 1.5
+PAUSES = 0.0, 3e-4, 2e-3, 1.5, 60.0
 FAULTS = "none", "raise", "kill", "exit"
 
 
 class Walk(gymnasium.Env):
     """Walks at random, for a number of steps that the reset draws; its infos vary."""
 
-    def __init__(self, *, pauses=True, fails_in="", made=None):
+    def __init__(self, *, pauses=True, fails_in=""):
         self.observation_space = spaces.Dict(
             {"place": spaces.Box(-np.inf, np.inf, (2,), np.float64), "n": spaces.Discrete(100)}
         )

@@ -87,12 +87,16 @@ def test_a_process_that_dies_between_two_steps_is_noticed_by_the_next(nothing_st
 
 
 def test_a_step_that_takes_too_long_is_named_with_its_place(nothing_stays_behind):
-    with vectors(timeout=0.7) as vector:
+    with vectors(timeout=3) as vector:
         for _ in range(3):  # each is short enough
-            vector.step(actions(pauses=(2, 2, 2, 2)))
+            vector.step(actions(pauses=(3, 3, 2, 2)))
         vector.reset(seed=0)
-        with pytest.raises(ClientError, match=r"Client 1 sent nothing for 0.7 s in environment 1"):
-            vector.step(actions(pauses=(0, 3, 0, 0)))
+        with pytest.raises(ClientError, match=r"Client 1 sent nothing for 3 s in environment 1"):
+            vector.step(actions(pauses=(0, 4, 0, 0)))
+
+
+def test_a_short_limit_of_steps_leaves_time_to_make_and_close(nothing_stays_behind):
+    ParallelVectorEnv(f"{WALK}:Walk", COUNT, num_processes=2, timeout=1e-6).close()
 
 
 @pytest.mark.parametrize(

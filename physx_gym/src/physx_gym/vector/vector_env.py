@@ -75,7 +75,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             autoreset_mode: What happens after the end of an episode.
             copy: Whether the results of `reset` and `step` are copies; otherwise observations are
                 views of the shared memory, valid until the next call.
-            timeout: Longest duration of a step of an environment, in s.
+            timeout: Longest duration of a step of an environment, in s. To make and to close its
+                environments, a process has this long too, and at least a minute.
 
         Raises:
             ConfigError: If a value is out of range, or values of a space do not have a fixed shape.

@@ -38,6 +38,8 @@ _TICK = 0.1
 _LAST_WORDS_TIME = 0.3
 _EXIT_TIME = 5.0
 _GRACE = 0.5
+_MAKE_TIME = 60.0
+"""Shortest time that processes have to make their environments, and to close them, in s."""
 
 
 class Workers:
@@ -60,7 +62,7 @@ class Workers:
             setup: What the workers run, with their ``shares``.
             timeout: Longest time that an entry may take, in s.
         """
-        self._batch, self._timeout = batch, timeout
+        self._batch, self._timeout = batch, max(timeout, _MAKE_TIME)
         self._shares: Sequence[int] = setup["shares"]
         self._owner = os.getpid()
         self._links: list[_Link] = []
@@ -90,6 +92,7 @@ class Workers:
         except BaseException:
             self.close(orderly=False)
             raise
+        self._timeout = timeout
 
     def ask(self, number: int, entries: Sequence[int] | Array) -> None:
         """Add entries to the queue of a worker."""
@@ -245,7 +248,8 @@ class Workers:
     def _end(self, orderly: bool) -> None:
         """Have the processes end, and kill those that do not."""
         running = set(range(len(self._links)))
-        until = time.monotonic() + (self._timeout if orderly else _GRACE)
+        self._timeout = max(self._timeout, _MAKE_TIME) if orderly else _GRACE
+        until = time.monotonic() + self._timeout
         try:
             for number, link in enumerate(self._links):
                 self._batch.asked[number] = END
