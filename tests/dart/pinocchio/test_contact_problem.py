@@ -49,7 +49,8 @@ def test_impulses_obey_coulombs_law_and_bounds(name, points, limits, bounded):
     rng, solver = np.random.default_rng(points), ImpulseSolver(name)
     for _ in range(30):
         problem = random_problem(rng, points, limits, bounded, spare=6)
-        check(problem, solver.solve(*problem))
+        for guess in (np.zeros(len(problem[1])), rng.normal(size=len(problem[1]))):
+            check(problem, solver.solve(*problem, guess))
 
 
 @pytest.mark.parametrize("name", ["pgs", "admm"])
@@ -63,7 +64,7 @@ def test_a_plate_on_four_points_is_carried_even_if_newton_cycles(name):
     for _ in range(20):
         push = np.array([*rng.normal(size=2), -3.0, *rng.normal(size=3)])
         problem = response, jacobian @ push, np.full(5, 0.5), np.zeros(0), np.zeros(0)
-        check(problem, solver.solve(*problem))
+        check(problem, solver.solve(*problem, np.zeros(15)))
 
 
 def test_the_iterative_solvers_agree_with_newton():
@@ -73,7 +74,7 @@ def test_the_iterative_solvers_agree_with_newton():
         problem = ContactProblem(*random_problem(rng, 2, 3, 2, spare=20))
         best, error = problem.newton(np.zeros(11), 50)
         assert error < problem.accuracy
-        iterate = solver.iterate(problem, name)
+        iterate = solver.iterate(problem, name, (300, 1e-11), np.zeros(11))
         np.testing.assert_allclose(iterate, best, atol=1e-6)
         assert problem.error(iterate) < 1e-6
 
@@ -81,7 +82,7 @@ def test_the_iterative_solvers_agree_with_newton():
 def test_values_that_are_not_finite_are_an_error():
     with pytest.raises(SimulationError, match="no longer finite"):
         ImpulseSolver("pgs").solve(
-            np.eye(3), np.full(3, np.nan), np.ones(1), np.zeros(0), np.zeros(0)
+            np.eye(3), np.full(3, np.nan), np.ones(1), np.zeros(0), np.zeros(0), np.zeros(3)
         )
 
 
@@ -94,3 +95,14 @@ def test_directions_without_motion_get_no_impulse():
         impulses, error = problem.newton(np.zeros(3), 10)
     np.testing.assert_array_equal(impulses, 0.0)
     assert error <= problem.accuracy
+
+
+@pytest.mark.parametrize("name", ["pgs", "admm"])
+def test_what_was_solved_before_changes_no_bit(name, monkeypatch):
+    monkeypatch.setattr("physx_dart.pinocchio.solver._MOST_KNOWN", 3)
+    rng, used = np.random.default_rng(8), ImpulseSolver(name)
+    for number in range(40):
+        problem = random_problem(rng, 1 + number % 3, number % 2, number % 5, spare=6)
+        for guess in (np.zeros(len(problem[1])), rng.normal(size=len(problem[1]))):
+            found = used.solve(*problem, guess)
+            np.testing.assert_array_equal(found, ImpulseSolver(name).solve(*problem, guess))

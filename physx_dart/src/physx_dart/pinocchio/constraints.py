@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -77,15 +76,18 @@ class Constraints:
         """
         self.joints, self.warmth, self.touching = joints, warmth, touching
         self._invert = inverse
+        self._inverse: Vector | None = None
         self.bounds = joints.bounds(positions)
         self.acts = joints.acting(self.bounds, velocities, _REACH if touched else 0.0)
         self.base, self.nv = base, base + len(velocities)
         self.impulses = np.zeros((0, 3))
 
-    @cached_property
+    @property
     def inverse(self) -> Vector:
         """The inverse of the mass matrix, shape (nv, nv)."""
-        return self._invert()
+        if self._inverse is None:  # `cached_property` locks, which takes longer than this
+            self._inverse = self._invert()
+        return self._inverse
 
     def rows(self) -> Indices:
         """Return the rows of the joints that act."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import eigenpy
 import numpy as np
 from numpy.typing import NDArray
 
@@ -103,9 +104,10 @@ class JointConstraints:
         """
         needed = self._limits - self._pace * positions
         bounds = np.maximum(needed, self._slowest)
-        if (needed > 0).any():
+        if needed.max(initial=0.0) > 0:
             bounds = np.where((needed > 0).any(axis=0), needed, bounds)
-        return np.minimum(bounds, _FASTEST_RETURN)
+            np.minimum(bounds, _FASTEST_RETURN, out=bounds)
+        return bounds
 
     def acting(self, bounds: Vector, velocities: Vector, reach: float) -> NDArray[np.bool_]:
         """Return which rows act, shape (rows,): motors, friction of moving joints, and some limits.
@@ -165,7 +167,7 @@ def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vect
         impulses = np.where(side < 0, least, np.where(side > 0, most, 0.0))
         if free.any():
             rest = (change - matrix @ impulses)[free]
-            impulses[free] = np.linalg.solve(matrix[free][:, free], rest)
+            impulses[free] = eigenpy.PartialPivLU(matrix[free][:, free]).solve(rest).ravel()
         under, over = free & (impulses < least), free & (impulses > most)
         freed = side * (matrix @ impulses - change) > 0
         wrong = np.flatnonzero(under | over | freed)

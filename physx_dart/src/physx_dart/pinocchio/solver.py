@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,10 +16,22 @@ from physx_dart.pinocchio.contact_problem import ContactProblem
 
 SOLVERS = ("pgs", "admm")
 _NEWTON_STEPS = 12
-_ITERATIONS = 300
-"""Iterations of Pinocchio's solvers; Newton's method improves what they find."""
-_ACCURACY = 1e-11
-"""Of velocities, in m/s, and impulses."""
+_KINDS = {
+    "pgs": (
+        pinocchio.PGSConstraintSolver,
+        pinocchio.PGSSolverSettings,
+        pinocchio.PGSSolverResult,
+    ),
+    "admm": (
+        pinocchio.ADMMConstraintSolver,
+        pinocchio.ADMMSolverSettings,
+        pinocchio.ADMMSolverResult,
+    ),
+}
+_FEW, _MANY = (30, 1e-4), (300, 1e-11)
+"""Most iterations of Pinocchio's solvers, and where they stop: errors in m/s and N s."""
+_MOST_KNOWN = 1000
+"""Descriptions of problems that are kept; each takes some KiB."""
 _GOOD = 100.0
 """Error at which an iterated solution is accepted, as a multiple of an exact one's."""
 _ENDLESS = 1e6
@@ -27,10 +41,11 @@ _ENDLESS = 1e6
 class ImpulseSolver:
     """Solves for the impulses of points with friction cones, and of rows with bounds.
 
-    Newton's method mostly finds them exactly in a few steps, from the impulses of the last step in
-    one or two. If it cycles, it continues from the results of Pinocchio's solvers, one after the
-    other: projected Gauss-Seidel fails for impacts of light links on heavy ones and for jammed
-    joints, ADMM for some problems that the former solves.
+    A few iterations of one of Pinocchio's solvers, from the impulses of the last step, mostly show
+    which points stick, slide, or separate; Newton's method then finds the impulses exactly. If it
+    cycles, it begins at zero, then at the results of many iterations of either solver: projected
+    Gauss-Seidel fails for impacts of light links on heavy ones and for jammed joints, ADMM for some
+    problems that the former solves.
 
     Args:
         name: The solver to try first: ``"pgs"`` (projected Gauss-Seidel) or ``"admm"``.
@@ -40,21 +55,11 @@ class ImpulseSolver:
         """Prepare the solver."""
         if name not in SOLVERS:
             raise UnknownOptionError("World.solver for pinocchio", [name], SOLVERS)
-        gauss_seidel = (
-            pinocchio.PGSConstraintSolver,
-            pinocchio.PGSSolverResult,
-            _accurate(pinocchio.PGSSolverSettings()),
-        )
-        admm = (
-            pinocchio.ADMMConstraintSolver,
-            pinocchio.ADMMSolverResult,
-            _accurate(pinocchio.ADMMSolverSettings()),
-        )
-        self._solvers = {"pgs": gauss_seidel, "admm": admm}
         self._order = sorted(SOLVERS, key=lambda each: each != name)
         self._points: dict[float, Any] = {}
         self._limits: dict[int, Any] = {}
         self._chains: dict[int, Any] = {}
+        self._known: dict[tuple[bytes, ...], tuple[Any, Any, Vector, Vector]] = {}
 
     def solve(
         self,
@@ -63,7 +68,7 @@ class ImpulseSolver:
         friction: Vector,
         least: Vector,
         most: Vector,
-        guess: Vector | None = None,
+        guess: Vector,
     ) -> Vector:
         """Return the impulses, shape (3 k + m,).
 
@@ -79,45 +84,68 @@ class ImpulseSolver:
         if not math.isfinite(free.sum() + response.sum()):
             raise SimulationError("The state is no longer finite. Use a smaller period.")
         problem = ContactProblem(response, free, friction, least, most)
-        good = problem.accuracy
-        if guess is not None and guess.any():
-            best, least_error = problem.newton(guess, _NEWTON_STEPS)
-            if least_error < good:
-                return best
-        best, least_error = problem.newton(np.zeros(len(free)), _NEWTON_STEPS)
-        for name in self._order:
-            if least_error < good:
-                break
-            good = _GOOD * problem.accuracy
-            begin = self.iterate(problem, name)
-            if np.isfinite(begin).all():
+        best, least_error, good = guess, math.inf, problem.accuracy
+        for begin in self._beginnings(problem, guess):
+            if math.isfinite(begin.sum()):
                 found, error = problem.newton(begin, _NEWTON_STEPS)
                 if error < least_error:
                     best, least_error = found, error
+            if least_error < good:
+                break
+            good = _GOOD * problem.accuracy
         return best
 
-    def iterate(self, problem: ContactProblem, name: str) -> Vector:
-        """Return the result of one of Pinocchio's solvers, ``"pgs"`` or ``"admm"``."""
-        models = pinocchio.StdVec_ConstraintModel()
+    def _beginnings(self, problem: ContactProblem, guess: Vector) -> Iterator[Vector]:
+        """Yield impulses for Newton's method to begin with."""
+        yield self.iterate(problem, self._order[0], _FEW, guess)
+        nothing = np.zeros(len(guess))
+        yield nothing
+        for name in self._order:
+            yield self.iterate(problem, name, _MANY, nothing)
+
+    def iterate(
+        self, problem: ContactProblem, name: str, limits: tuple[int, float], guess: Vector
+    ) -> Vector:
+        """Return the result of one of Pinocchio's solvers.
+
+        Args:
+            problem: The problem.
+            name: Name of the solver.
+            limits: Most iterations, and the accuracy at which it stops.
+            guess: Impulses to begin with.
+        """
+        models, data, signs, flips = self._models(problem)
+        delassus = pinocchio.DelassusOperatorDense(problem.matrix * flips)
+        solver, result = _KINDS[name][0](), _KINDS[name][2]()
+        result.setConstraintImpulseGuess(signs * guess)
+        settings = _settings(name, *limits)
+        solver.solve(delassus, signs * problem.free, models, data, settings, result)
+        found: Vector = signs * result.retrieveConstraintImpulses()
+        return found
+
+    def _models(self, problem: ContactProblem) -> tuple[Any, Any, Vector, Vector]:
+        """Return Pinocchio's description of a problem, and the signs of rows and matrix there."""
+        least, most = problem.least, problem.most
+        key = problem.friction.tobytes(), least.tobytes(), most.tobytes()
+        if key in self._known:
+            return self._known[key]
+        models, data = pinocchio.StdVec_ConstraintModel(), pinocchio.StdVec_ConstraintData()
         for coefficient in problem.friction:
             models.append(self._point(float(coefficient)))
-        size, least, most = 3 * len(problem.friction), problem.least, problem.most
         one_sided = int((np.isinf(least) != np.isinf(most)).sum())
         if one_sided:
             models.append(self._limit(one_sided))
         if one_sided < len(least):
             models.append(self._bounds_model(least[one_sided:], most[one_sided:]))
-        data = pinocchio.StdVec_ConstraintData()
         for model in models:
             data.append(model.createData())
         # Pinocchio's limits only push upward.
         signs = np.ones(len(problem.free))
-        signs[size:][np.isinf(least) & np.isfinite(most)] = -1.0
-        delassus = pinocchio.DelassusOperatorDense(problem.matrix * np.outer(signs, signs))
-        kind, result_of, settings = self._solvers[name]
-        result = result_of()
-        kind().solve(delassus, signs * problem.free, models, data, settings, result)
-        return signs * result.retrieveConstraintImpulses()
+        signs[3 * len(problem.friction) :][np.isinf(least) & np.isfinite(most)] = -1.0
+        if len(self._known) >= _MOST_KNOWN:
+            self._known.clear()
+        self._known[key] = models, data, signs, np.outer(signs, signs)
+        return self._known[key]
 
     def _point(self, coefficient: float) -> Any:
         if coefficient not in self._points:
@@ -164,10 +192,11 @@ def _joints(length: int) -> Any:
     return joints
 
 
-def _accurate(settings: Any) -> Any:
-    """Return settings with which a solver iterates until its result is accurate."""
-    settings.max_iterations = _ITERATIONS
+@functools.cache
+def _settings(name: str, iterations: int, accuracy: float) -> Any:
+    settings = _KINDS[name][1]()
+    settings.max_iterations = iterations
     for kind in ("feasibility", "complementarity"):
-        setattr(settings, f"absolute_{kind}_tol", _ACCURACY)
+        setattr(settings, f"absolute_{kind}_tol", accuracy)
         setattr(settings, f"relative_{kind}_tol", 0.0)
     return settings
