@@ -203,8 +203,32 @@ class Zoo:
         self._process.communicate()
 
 
+def engine_alone(env: Any, actions: list[Any]) -> float:
+    """Return how many steps per second there were if only dartpy's ``World.step`` took time."""
+    simulation, steps, spent = env.simulator.simulation, 1000, 0.0
+    step = simulation._step_world
+
+    def timed(*arguments: Any) -> None:
+        nonlocal spent
+        begin = clock()
+        step(*arguments)
+        spent += clock() - begin
+
+    env.reset(seed=0)
+    simulation._step_world = timed
+    for number in range(steps):
+        if any(env.step(actions[number % len(actions)])[2:4]):
+            env.reset()
+    simulation._step_world = step
+    return steps / spent
+
+
 def against_jiminy(python: str) -> list[bool]:
-    """Compare steps per second with gym_jiminy, at physx's own physics period and at its."""
+    """Compare steps per second with gym_jiminy, at physx's own physics period and at its.
+
+    The rate of DART's steps alone, with the same solver and detector, is printed too: no
+    environment around that engine can be faster.
+    """
     zoo, met = Zoo(python), []
     for name, target in (("Cartpole", 1.6), ("Acrobot", 5.0), ("Ant", 1.3)):
         theirs = zoo.measure(name.lower(), 0.1)
@@ -219,19 +243,23 @@ def against_jiminy(python: str) -> list[bool]:
         rounds = []
         for _ in range(2 * ROUNDS + 1):
             row = [steps_per_second(env, actions, 0.25) for env in envs]
+            alone = [(engine_alone(env, actions),) * 2 for env in envs]
             found = zoo.measure(name.lower(), 0.25)
-            rounds.append([*row, (found["rate"], found["rate_of_step"])])
+            rounds.append([*row, *alone, (found["rate"], found["rate_of_step"])])
         # Rounds, candidates, with and without resets.
         measured = np.array(rounds)
         middle = np.median(measured, axis=0)
-        ratios = np.median(measured[:, :2] / measured[:, 2:], axis=0)
+        ratios = np.median(measured[:, :4] / measured[:, 4:], axis=0)
         print(f"{name}, steps of {envs[0].step_dt:g} s under random actions, resets included")
         print(f"  gym_jiminy, integrating every {1e3 * theirs['period']:g} ms", end=": ")
-        print(f"{middle[2, 0]:,.0f} steps/s, {middle[2, 1]:,.0f} without the resets")
-        for env, rate, ratio in zip(envs, middle, ratios, strict=False):
+        print(f"{middle[4, 0]:,.0f} steps/s, {middle[4, 1]:,.0f} without the resets")
+        for env, rate, alone, ratio, bound in zip(
+            envs, middle, middle[2:], ratios, ratios[2:], strict=False
+        ):
             print(f"  physx, every {1e3 * env.simulator.period:g} ms", end=": ")
             print(f"{rate[0]:,.0f} steps/s, {rate[1]:,.0f} without the resets", end=", ")
-            print(f"which is {ratio[1]:.2f} times as many")
+            print(f"which is {ratio[1]:.2f} times as many;", end=" ")
+            print(f"DART's steps alone {alone[0]:,.0f}, {bound[0]:.2f} times as many")
             met.append(claim("ratio", float(ratio[0]), at_least=target))
     zoo.close()
     return met
@@ -303,10 +331,12 @@ def start_up() -> bool:
 
 _MEMORY = """
 import gc, os, sys
-import gymnasium
+import dartpy, gymnasium
 import physx_gym
 
 def made():
+    if sys.argv[1] == "bullet":
+        return None
     if sys.argv[1].endswith(".toml"):
         return physx_gym.load_pipeline(sys.argv[1])()
     return gymnasium.make(sys.argv[1])
@@ -316,12 +346,15 @@ def resident():
     with open("/proc/self/statm") as file:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
-kept = []
+kept, bullet = [], dartpy.collision.BulletCollisionDetector()
 for number in range(50):
     env = made()
-    env.reset(seed=number)
-    for _ in range(5):
-        env.step(env.action_space.sample())
+    if env is None:
+        env = bullet.createCollisionGroup()
+    else:
+        env.reset(seed=number)
+        for _ in range(5):
+            env.step(env.action_space.sample())
     kept.append(env)
     if number == 9:
         before = resident()
@@ -330,15 +363,20 @@ print((resident() - before) / 40)
 
 
 def memory() -> list[bool]:
-    """Measure what each further environment takes."""
+    """Measure what each further environment takes, and what Bullet's part of it alone takes."""
     met = []
     for name, path, most in (
         ("cartpole", "physx/Cartpole-v0", 2.0),
         ("quadruped with blocks", str(PIPELINE), 5.0),
+        ("collision group of Bullet, which each world with contacts has", "bullet", None),
     ):
         command = [sys.executable, "-c", _MEMORY, path]
         done = subprocess.run(command, check=True, capture_output=True, text=True)
-        met.append(claim(f"MiB for each further {name}", float(done.stdout), at_most=most))
+        found = f"MiB for each further {name}", float(done.stdout)
+        if most is None:
+            print(f"  {found[0]}: {found[1]:.2f}")
+        else:
+            met.append(claim(*found, at_most=most))
     return met
 
 

@@ -21,14 +21,15 @@ class CartpoleEnv(OneMotorEnv):
     Action: push to the left, not at all, or to the right, with 10 N; or, if `continuous`, the push
     as a fraction of that. Observation, shape (4,): position of the cart in m, angle of the pole in
     rad, and their velocities. Reward: 1 for every step. It terminates if the pole leans by more
-    than 12 degrees or the cart is more than 2.2 m away, and is truncated after 500 steps of 20 ms.
+    than 12 degrees or the cart is more than 2.2 m away, and is truncated after 500 steps of 20 ms,
+    each a single step of the physics, as in Gymnasium's CartPole-v1.
 
     The task is that of A. G. Barto, R. S. Sutton and C. W. Anderson, "Neuronlike adaptive elements
     that can solve difficult learning control problems", 1983.
     """
 
     MODEL, JOINT, STRENGTH = "cartpole", "slider", 10.0
-    PERIOD, STEP, DURATION = 1e-2, 0.02, 10.0
+    PERIOD, STEP, DURATION = 0.02, 0.02, 10.0
 
     def _initialize_observation_space(self) -> None:
         fastest = limits.joint_velocities(self.simulator)
