@@ -8,8 +8,8 @@ Trains with `examples/train_ppo.py` once for each seed, `--jobs` at a time, with
 stand there; then runs deterministic episodes on the engine that it was trained on and on the
 other one. Prints a line for each seed and engine, with the wall time of the training, and the range
 over the seeds. With `--check`, exits with 1 if any seed misses the target on its own engine.
-`--film FILE` shows the beginning of an episode under the policy of the first seed. Options that are
-not its own are passed on to the example. Needs stable-baselines3.
+`--film FILE` shows the first seconds of episodes under the policy of the first seed. Options that
+are not its own are passed on to the example. Needs stable-baselines3.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -31,6 +32,7 @@ from physx_core.errors import FeatureNotSupportedError
 from physx_gym import Policy, RobotEnv
 from physx_gym.bridge.make_env import make_env
 from physx_gym.cli.evaluate import evaluate, summary
+from physx_gym.show.film import write_film
 
 TRAIN = Path(__file__).parent.parent / "examples" / "train_ppo.py"
 TARGETS = {
@@ -42,7 +44,7 @@ TARGETS = {
 }
 """Figure of `evaluate` whose mean must reach a value, for every seed, and number of episodes."""
 FIRST_SEED = 30_000
-FILM_TIME, FILM_SIZE = 6.0, (320, 240)
+FILM_TIME, FILM_SIZE, FRAME_RATE = 6.0, (320, 240), 15.0
 NAMES = ("reward", "length", "speed", "success")
 
 
@@ -72,15 +74,26 @@ def figures(env: str, backend: str, folder: Path) -> dict[str, dict[str, float]]
 
 
 def film(env: str, backend: str, folder: Path, path: Path) -> None:
-    """Write a small film of the first seconds of an episode."""
-    made = make_env(env, {"backend": backend, "simulation_duration_max": FILM_TIME})
+    """Write a small film of the first seconds of episodes."""
+    made = make_env(env, {"backend": backend, "render_mode": "rgb_array"})
+    base = made.unwrapped
+    assert isinstance(base, RobotEnv)
+    base.viewer_kwargs = {"picture_size": FILM_SIZE}
+    act, every = Policy(folder, made).act, max(1, round(1 / (FRAME_RATE * base.step_dt)))
+
+    def pictures() -> Iterator[Any]:
+        seed, over, observation = FIRST_SEED, True, None
+        for step in range(round(FILM_TIME / base.step_dt)):
+            if over:
+                observation, _ = made.reset(seed=seed)
+                seed += 1
+            observation, _, terminated, truncated, _ = made.step(act(observation))
+            over = terminated or truncated
+            if over or step % every == 0:
+                yield made.render()
+
     try:
-        base = made.unwrapped
-        assert isinstance(base, RobotEnv)
-        act = Policy(folder, made).act
-        base.evaluate(act, seed=FIRST_SEED, enable_stats=False, enable_replay=False)
-        base.replay(record_video_path=path, frame_rate=15.0, picture_size=FILM_SIZE)
-        print(f"film: {path}")
+        print(f"film: {write_film(pictures(), path, 1 / (every * base.step_dt))}")
     finally:
         made.close()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import gymnasium
@@ -53,6 +53,10 @@ class RobotEnv(PipelineEnv):
     holds_command: ClassVar[bool | None] = None
     """Whether `compute_command` depends on nothing but the action, so that once a step is enough if
     nothing observes in between; None: if it is not overridden."""
+
+    view: ClassVar[Mapping[str, Sequence[float]]] = {}
+    """``eye`` and ``target`` of the camera that `render` shows the world with, in m; by default it
+    shows all objects."""
 
     _left_out: ClassVar[frozenset[str]] = frozenset({"_outermost", "_own_renderer"})
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -38,6 +38,10 @@ class PushBoxEnv(GoalTask):
     """
 
     ACHIEVED, CLOSE = slice(4, 6), 0.08
+    view: ClassVar[Mapping[str, Sequence[float]]] = {
+        "eye": (0.7, -1.2, 0.8),
+        "target": (0.0, 0.0, 0.1),
+    }
 
     def __init__(self, *, backend: Any = BACKEND, **options: Any) -> None:
         """Create the environment.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -30,7 +31,7 @@ from physx_core.simulation import (
 from physx_core.typing import Vector
 
 _GROUND, _MOVING, _RESTING = "#6d7885", "orange", "#a3acb6"
-_THICKNESS, _REACH = 0.01, 20.0  # of a drawn plane, and half its width, in m
+_THICKNESS, _REACH = 0.01, 100.0  # of a drawn plane, and half its width, in m
 _SIDES = 32  # of a drawn cylinder
 _ROBOT = """<robot name="mesh"><link name="mesh"><visual><geometry>
 <mesh filename={} scale="{scale} {scale} {scale}"/>
@@ -49,6 +50,7 @@ class WorldDrawing:
         title: str,
         *,
         follow: bool = True,
+        view: Mapping[str, Sequence[float]] | None = None,
     ) -> None:
         """Keep the world; `add` draws it.
 
@@ -59,7 +61,9 @@ class WorldDrawing:
             layout: Order of the bodies.
             title: Title of the window.
             follow: Whether the camera follows the first robot whose base floats.
+            view: Place of the camera: see `Factory.set_view`; None: where it shows everything.
         """
+        self._view = view or {}
         self._factory, self._world, self._layout, self._backend = factory, world, layout, backend
         floating = (robot.name for robot in world.robots if not robot.fixed_base)
         self._title, self._followed = title, next(floating, None) if follow else None
@@ -73,7 +77,7 @@ class WorldDrawing:
         """
         if self._world.ground is not None:
             _add_ground(self._factory, self._world.ground)
-        self._factory.set_view(self._title, self._followed)
+        self._factory.set_view(self._title, self._followed, **self._view)
         for robot in self._world.robots:
             self._add_robot(robot, poses[self._layout.parts[robot.name].bodies])
         for each in self._world.objects:

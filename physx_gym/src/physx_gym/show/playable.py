@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Protocol
 
 from physx_core.components import Factory
 from physx_gym.simulator.simulator import Simulator
@@ -13,6 +14,7 @@ Info = dict[str, Any]
 class Drawable(Protocol):
     """An environment that can be drawn; every `RobotEnv` is one."""
 
+    view: ClassVar[Mapping[str, Sequence[float]]]
     viewer_kwargs: dict[str, Any]
     render_mode: str | None
 

@@ -87,6 +87,7 @@ class Renderer:
                 simulator.layout,
                 type(self._env).__name__,
                 follow=self._follow,
+                view=self._env.view,
             )
             self._drawing.add(poses)
             self._env._draw(self._factory)
