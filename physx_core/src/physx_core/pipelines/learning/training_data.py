@@ -12,6 +12,7 @@ from physx_core.dataset import Dataset, Subset
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import RESERVED, Field
+from physx_core.pipelines.learning.blocks import Block, Blocks
 from physx_core.pipelines.storage import other_samples, record_rejected
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.sources.source import Source
@@ -92,7 +93,13 @@ class TrainingData:
                 f"{other_samples(dataset.directory, self._mode)}"
             )
         self.parts = self._split(replay)
-        self._stored = self._stored_rows(source) if replay and source is not None else None
+        self._stored: StoredRows | None = None
+        self._blocks: Blocks | None = None
+        self._block: Block | None = None
+        if source is not None and replay:
+            self._stored = self._stored_rows(source)
+        elif source is not None:
+            self._blocks = Blocks(source, dataset, self._mode, normalize=config.normalize)
 
     def _split(self, replay: bool) -> dict[str, Subset]:
         share = self._config.validation_split
@@ -144,14 +151,12 @@ class TrainingData:
 
     def next_batch(self) -> Batch:
         """Return the next batch in physical units; generated ones are stored already."""
-        if self._uses_source and self.source is not None:
+        if self._uses_source and self._blocks is not None:
+            self._block = self._blocks.next(self._batch_size)
+            return self._block.rows
+        if self._uses_source and self.source is not None and self._stored is not None:
             with record_rejected(self.source, self.dataset):
-                if self._stored is not None:
-                    return self._replay(self.source, self._stored)
-                batch = self.source.batch(self._batch_size)
-                self.dataset.define_fields(self._mode, self.source.fields)
-                self.dataset.append(self._mode, batch, checked=True)
-                return batch
+                return self._replay(self.source, self._stored)
         if self._reader is None:
             raise UsageError("next_batch() needs begin_epoch() before it.")
         self.batches_read += 1
@@ -195,6 +200,8 @@ class TrainingData:
     @property
     def fields(self) -> Mapping[str, Field]:
         """The stored fields by name; those of the environments until something is stored."""
+        if self._block is not None:
+            return self._block.fields
         if self.source is not None and not self._count(self._mode):
             return {field.name: field for field in self.source.fields}
         return self.dataset.fields(self._mode)
@@ -202,6 +209,8 @@ class TrainingData:
     def normalization(self) -> dict[str, Normalization]:
         """Return the normalization by field; empty if nothing is to be normalized."""
         self._changed = False
+        if self.produces and self._block is not None:
+            return self._block.normalization
         if not self._config.normalize or not self._count(self._mode):
             return {}
         if self.parts:

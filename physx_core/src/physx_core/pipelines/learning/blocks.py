@@ -1,0 +1,71 @@
+"""Blocks: the rows that environments generate for a training, block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from physx_core.dataset import Dataset
+from physx_core.fields import Field
+from physx_core.pipelines.storage import record_rejected
+from physx_core.sources.source import Source
+from physx_core.statistics import Normalization
+from physx_core.typing import Batch
+
+
+@dataclass(frozen=True)
+class Block:
+    """Consecutive rows that environments generated; they are stored already.
+
+    Attributes:
+        rows: The rows, field name to array with a leading row axis, in physical units; valid until
+            the next block is taken. Empty if the block has no rows.
+        fields: The stored fields by name; empty before the first row.
+        normalization: The normalization of all rows up to the last one of this block, by field;
+            empty if nothing is to be normalized.
+    """
+
+    rows: Batch = field(default_factory=dict)
+    fields: Mapping[str, Field] = field(default_factory=dict)
+    normalization: dict[str, Normalization] = field(default_factory=dict)
+
+
+class Blocks:
+    """Takes rows from environments in the order of their numbers, and stores them."""
+
+    def __init__(self, source: Source, dataset: Dataset, mode: str, *, normalize: bool) -> None:
+        """Keep the arguments.
+
+        Args:
+            source: The environments; open.
+            dataset: Stores the rows.
+            mode: Mode to store them in.
+            normalize: Whether the blocks have a normalization.
+        """
+        self._source, self._dataset, self._mode = source, dataset, mode
+        self._normalizes = normalize
+        self._last = Block()
+
+    def next(self, count: int) -> Block:
+        """Return the next rows, generated and stored.
+
+        Args:
+            count: Number of rows; with 0 no environment is asked for any.
+
+        Raises:
+            PhysxError: If an environment fails, or a row cannot be stored.
+        """
+        rows: Batch = {}
+        if count:
+            with record_rejected(self._source, self._dataset):
+                rows = self._source.batch(count)
+                self._dataset.define_fields(self._mode, self._source.fields)
+                self._dataset.append(self._mode, rows, checked=True)
+        self._last = self._describe(rows)
+        return self._last
+
+    def _describe(self, rows: Batch) -> Block:
+        if not rows:
+            return Block({}, self._last.fields, self._last.normalization)
+        normalization = self._dataset.normalization_of(self._mode) if self._normalizes else {}
+        return Block(rows, self._dataset.fields(self._mode), normalization)
