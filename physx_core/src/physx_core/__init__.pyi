@@ -2,6 +2,7 @@
 
 from . import plugins as plugins
 from .closeable import Closeable as Closeable
+from .components import Buffer as Buffer
 from .components import ClientHandle as ClientHandle
 from .components import Environment as Environment
 from .components import Factory as Factory

@@ -15,6 +15,17 @@ def physx_launchers() -> Components:
 
 
 @hookimpl
+def physx_buffers() -> Components:
+    """Return the buffers of trainings while environments generate."""
+    return {
+        "stream": "physx_core.buffers.stream:Stream",
+        "reservoir": "physx_core.buffers.reservoir:Reservoir",
+        "window": "physx_core.buffers.window:Window",
+        "fifo": "physx_core.buffers.fifo:Fifo",
+    }
+
+
+@hookimpl
 def physx_transformations() -> Components:
     """Return the transformation of networks that name none."""
     return {"identity": "physx_core.components.transformation:Transformation"}

@@ -1,0 +1,27 @@
+"""Reservoir: batches from rows of all ages."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physx_core.buffers.mixing import MixingBuffer
+from physx_core.typing import Index
+
+
+class Reservoir(MixingBuffer):
+    """Once it is full, a new row replaces a random one of those that were used before.
+
+    So every row is used at least once while rows arrive, and the rows that are kept are of all
+    ages, newer ones more than older ones. Batches are drawn from all of them alike.
+    """
+
+    def place(self, count: int, random: np.random.Generator) -> Index:
+        """Return empty slots, then random ones of used rows: see `Buffer.place`."""
+        empty = np.arange(self.held, min(self.held + count, self.capacity))
+        count -= len(empty)
+        if not count:
+            return empty
+        used = np.flatnonzero(self.uses)
+        if len(used) < count:  # the run was made longer, and many rows arrive at once
+            used = np.flatnonzero(self.rows >= 0)
+        return np.concatenate([empty, random.choice(used, count, replace=False)])
