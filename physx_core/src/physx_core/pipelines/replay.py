@@ -133,6 +133,7 @@ class Replay(NewSessionPipeline):
             resources,
             environment,
             derive_seed(seed, "prediction", 0),
+            run_ahead=0,
             in_process=environment.num_clients == 1,
             replayed=dataset.directory,
             accept_all=True,

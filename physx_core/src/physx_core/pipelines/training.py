@@ -27,6 +27,8 @@ from physx_core.dataset import Dataset
 from physx_core.errors import DivergedError
 from physx_core.observers import statistics_observers
 from physx_core.pipelines.interrupt import Interrupt, Terminated, deferred_interrupt
+from physx_core.pipelines.learning.blocks import Block
+from physx_core.pipelines.learning.feeder import Feeder
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.resuming import (
     can_resume,
@@ -408,9 +410,11 @@ class Training(NewSessionPipeline):
         self._record_config(self._resumed.seed)
         further = statistics_observers(self.statistics, self.statistics_kwargs, environment)
         self._observe(resources, environment, further if self._leads else ())
-        source = None
+        source = feeder = None
         if environment is not None:
-            source = self._open_environments(resources, environment, dataset)
+            if environment.as_tcp_ip_client and not environment.load_samples:
+                feeder = Feeder[Block]()
+            source = self._open_environments(resources, environment, dataset, feeder)
         self.data = TrainingData(
             dataset,
             source,
@@ -420,7 +424,11 @@ class Training(NewSessionPipeline):
             seed=self._resumed.seed,
             environment=environment,
             data_type=self.network_config.data_type,
+            feeder=feeder,
+            ahead=type(self).batch_condition is Training.batch_condition
+            and type(self).batch_produce is Training.batch_produce,
         )
+        resources.callback(self.data.close)
         fields = self.data.fields
         shapes = [fields[name].shape for name in self.learner.batch_fields if name in fields]
         if not self.data.produces or None not in shapes:  # else bound with the first batch
@@ -511,7 +519,11 @@ class Training(NewSessionPipeline):
             self.session.note(found.notice)
 
     def _open_environments(
-        self, resources: contextlib.ExitStack, config: EnvironmentConfig, dataset: Dataset
+        self,
+        resources: contextlib.ExitStack,
+        config: EnvironmentConfig,
+        dataset: Dataset,
+        feeder: Feeder[Block] | None,
     ) -> Source:
         seed = self._resumed.seed if config.seed is None else config.seed
         dataset.update_info(**describe_environment(config, seed))
@@ -520,8 +532,18 @@ class Training(NewSessionPipeline):
             resources,
             config,
             derive_seed(seed, "training", stored),
-            predict=self._predict,
+            predict=self._predict if feeder is None else feeder.calling(self._predict),
+            show=None if feeder is None else feeder.telling(self.observers.events),
+            run_ahead=0 if config.load_samples else None,
+            total=self._generated_rows(config),
         )
+
+    def _generated_rows(self, config: EnvironmentConfig) -> int | None:
+        """Return how many rows the environments generate in all; None: unknown."""
+        if config.load_samples or self.batch_nb is None:
+            return None
+        epochs = self.epoch_nb if config.always_produce else 1
+        return epochs * self.batch_nb * self.batch_size * self.group.size
 
     def _predict(self, batch: Batch) -> Batch:
         """Answer `Environment.get_prediction`; before the first batch with the step's shapes."""

@@ -32,10 +32,12 @@ class ClientSource(Source):
     """Collects rows from clients, and places each by its instance and step.
 
     Rows are the same as those of `LocalSource`, bit for bit. Requests of the environments are
-    served while waiting for a batch. If the services have a method
-    ``predict_batch(batch) -> batch``, predictions wait until every working instance has requested
-    one, and are computed as one batch in the order of the instances: with ``run_ahead=0`` the same
-    batches in every run. A network may round these differently from single samples.
+    served while waiting for a batch; one for a prediction is held until the batch is requested to
+    which the row belongs that its environment is making. If the services have a method
+    ``predict_batch(batch) -> batch``, predictions wait until every instance that owes a row of the
+    batch has requested one, and are computed together in the order of the instances: the same
+    groups in every run, however far the clients run ahead. A network may round these differently
+    from single samples.
     """
 
     def __init__(
@@ -55,8 +57,8 @@ class ClientSource(Source):
             services: Serves the environments' requests.
             seed: Seed of all instances.
             run_ahead: Number of rows that each client may generate before they are requested;
-                None: as many as fit in 4 MB. It must be 0 if rows depend on a network that is
-                trained, or on predictions that are applied.
+                None: as many as fit in 4 MB. It must be 0 if predictions are applied, or stored
+                rows are replayed.
             total: Number of rows that will be requested in all, beyond which no client generates
                 any; None: unknown.
             accept_all: Whether samples that `check_sample` rejects count like the others.
@@ -222,7 +224,7 @@ class ClientSource(Source):
             ahead = min(max(1, _AHEAD_BYTES // size), _AHEAD_ROWS) if self._table else 0
         for number in range(1, self.instance_nb + 1):
             peer = self._group.peer(number)
-            needed = self._wanted(number, self._asked)
+            needed = peer.wanted = self._wanted(number, self._asked)
             allowed = needed + ahead
             if self._total is not None:
                 allowed = max(needed, min(allowed, self._wanted(number, self._total)))
@@ -233,6 +235,7 @@ class ClientSource(Source):
 
     def _without_table(self) -> list[int]:
         """Return the first instance until its fields are known; it generates the first row."""
+        self._check_canceled()
         peer = self._group.peer(1)
         if peer.row_fields:
             self._table = peer.row_fields
@@ -243,6 +246,7 @@ class ClientSource(Source):
 
     def _without_rows(self) -> list[int]:
         """Move received rows into the batch; return the instances whose rows are missing."""
+        self._check_canceled()
         owing, failed = [], {}
         for number in range(1, self.instance_nb + 1):
             peer, taken = self._group.peer(number), self._taken[number - 1]
@@ -268,6 +272,10 @@ class ClientSource(Source):
                 raise failed[row]
             return earlier  # rows rejected before it are needed too
         return owing
+
+    def _check_canceled(self) -> None:
+        if self._is_canceled:
+            raise UsageError("This source is being closed.")
 
     def _next_row(self, number: int) -> int:
         """Return the index among all rows of the next one that an instance generates."""

@@ -24,6 +24,7 @@ class Source(ABC):
     """
 
     instance_nb: int
+    _is_canceled = False
 
     @property
     @abstractmethod
@@ -71,6 +72,13 @@ class Source(ABC):
     @abstractmethod
     def apply(self, prediction: Batch) -> None:
         """Pass row i of a prediction to the instance that generated row i of the last batch."""
+
+    def cancel(self) -> None:
+        """Have a call of `batch` in another thread end soon, with an error; `close` follows.
+
+        Environments in this process finish the call.
+        """
+        self._is_canceled = True
 
     @abstractmethod
     def close(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import repeat
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from physx_core.dataset.store.definitions import compare_fields
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import RESERVED, Field
 from physx_core.pipelines.learning.blocks import Block, Blocks
+from physx_core.pipelines.learning.feeder import Feeder
 from physx_core.pipelines.storage import other_samples, record_rejected
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.sources.source import Source
@@ -55,6 +57,8 @@ class TrainingData:
         seed: int,
         environment: EnvironmentConfig | None,
         data_type: str,
+        feeder: Feeder[Block] | None = None,
+        ahead: bool = True,
     ) -> None:
         """Check that the samples are available, and hold some back if configured.
 
@@ -67,6 +71,10 @@ class TrainingData:
             seed: Seed of the order of samples.
             environment: Configuration of the source; None without one.
             data_type: Floating type of the batches that are read.
+            feeder: Has a thread that has the environments generate batches ahead of the training;
+                None: they are generated when they are taken.
+            ahead: Whether all batches of an epoch will be taken, so that they may be generated
+                ahead.
         """
         replay = environment is not None and environment.load_samples
         if source is not None and batch_nb is None and not replay:
@@ -78,6 +86,7 @@ class TrainingData:
         self._config = config
         self._batch_size, self._batch_nb = batch_size, batch_nb
         self._seed = seed
+        self._ahead = ahead
         self._always = environment is not None and (
             not environment.only_first_epoch if replay else environment.always_produce
         )
@@ -99,7 +108,9 @@ class TrainingData:
         if source is not None and replay:
             self._stored = self._stored_rows(source)
         elif source is not None:
-            self._blocks = Blocks(source, dataset, self._mode, normalize=config.normalize)
+            self._blocks = Blocks(
+                source, dataset, self._mode, normalize=config.normalize, feeder=feeder
+            )
 
     def _split(self, replay: bool) -> dict[str, Subset]:
         share = self._config.validation_split
@@ -135,6 +146,8 @@ class TrainingData:
             names: Fields of the batches that are read from the dataset.
         """
         self._uses_source = self.source is not None and (epoch_id == 0 or self._always)
+        if self._uses_source and self._blocks is not None and self._ahead:
+            self._blocks.expect(repeat(self._batch_size, self._batch_nb or 0))
         if not self._uses_source and self._reader is None:
             part = self.parts.get("training")
             batches = part.batches if part else partial(self.dataset.batches, self._mode)
@@ -170,6 +183,11 @@ class TrainingData:
         self.dataset.update(self._mode, index, made)
         self._changed = True
         return batch
+
+    def close(self) -> None:
+        """End what generates batches ahead, before the source is closed."""
+        if self._blocks is not None:
+            self._blocks.close()
 
     def skip(self, batches: int) -> None:
         """Skip batches that a training read before it was interrupted."""

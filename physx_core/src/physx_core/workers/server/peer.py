@@ -28,6 +28,7 @@ class Peer(Connection):
         rows: Rows that arrived.
         received: How many rows arrived in all.
         granted: How many rows it may make in all.
+        wanted: How many of them the run waits for, or has had; the others it makes ahead.
         rejected: Rows that arrived and that its environment rejected.
         rejected_limit: How many of those it may send in all.
         failure: The error that it sent.
@@ -57,7 +58,7 @@ class Peer(Connection):
         self.fields: list[Field] = []
         self.row_fields: list[Field] = []
         self.rows = RowQueue()
-        self.received = self.granted = 0
+        self.received = self.granted = self.wanted = 0
         self.rejected = RejectedRows()
         self.rejected_limit = 0
         self.failure: PhysxError | None = None
@@ -71,9 +72,17 @@ class Peer(Connection):
         self._next_order: int | None = None  # of the journal's, for this client; None: it had all
 
     @property
-    def is_at_work(self) -> bool:
-        """Whether its environment is starting or making rows, or would be if it were not lost."""
-        return not self.finished and (not self.fields or self.received < self.granted)
+    def is_awaited(self) -> bool:
+        """Whether its environment is starting or making rows that the run waits for.
+
+        Or would be if it were not lost.
+        """
+        return not self.finished and (not self.fields or self.received < self.wanted)
+
+    @property
+    def is_ahead(self) -> bool:
+        """Whether its environment is making a row that the run does not wait for yet."""
+        return bool(self.fields) and self.wanted <= self.received < self.granted
 
     @property
     def is_lost(self) -> bool:
@@ -83,6 +92,7 @@ class Peer(Connection):
     def succeed(self, former: Peer) -> None:
         """Take the place of another client of the instance, with everything it sent."""
         self.rows, self.received, self.granted = former.rows, former.received, former.granted
+        self.wanted = former.wanted
         self.rejected, self.rejected_limit = former.rejected, former.rejected_limit
         self.row_fields, self.last_step = former.row_fields, former.last_step
         self.shown, self.journal = former.shown, former.journal

@@ -131,6 +131,8 @@ class Server:
             spin: How long to look for it without sleeping before that, in s.
         """
         self._has_news = False
+        if self._can_predict():  # held requests that are due now
+            timeout = 0.0
         for peer, events in self._listener.select(timeout, spin):
             if events & selectors.EVENT_WRITE:
                 peer.flush()
@@ -139,20 +141,20 @@ class Server:
                 self._read(peer)
         if self._listener.accept():
             self._has_news = True
-        asked = self._requests.count
-        if not asked or (asked < self._instance_nb and self._expects_more_requests()):
+        if not self._can_predict():
             return False
         return self._requests.predict() and not self._has_news
 
     @property
     def asking(self) -> set[int]:
-        """The instances that wait for a prediction."""
+        """The instances that wait for a prediction, due or held."""
         return self._requests.asking
 
     def end(self) -> None:
         """Tell all clients to close their environments."""
         self._ending = True
         for peer in self.peers.values():
+            peer.wanted = peer.granted  # nothing is held any more
             peer.send(pack(Kind.CLOSE))
 
     def vacate(self, number: int) -> None:
@@ -175,30 +177,35 @@ class Server:
     def holding_up(self, waited: Iterable[int]) -> set[int]:
         """Return the instances that cause the wait when the server waits for some instances.
 
-        Those that wait for a prediction wait for the others that are at work.
+        Those that wait for a prediction wait for the others that are awaited.
         """
         waited = set(waited)
-        others = self._at_work() if waited & self.asking else set()
+        others = self._awaited() if waited & self.asking else set()
         return (waited | others) - self.asking
 
-    def _expects_more_requests(self) -> bool:
-        """Return whether a client is at work that may yet ask for a prediction.
+    def _can_predict(self) -> bool:
+        """Return whether there are requests for predictions to answer."""
+        due = self._requests.count
+        return bool(due) and not (due < self._instance_nb and self._expects_more_requests())
 
-        A batch is predicted once every client has asked or has nothing to do. So the requests in a
+    def _expects_more_requests(self) -> bool:
+        """Return whether a client makes an awaited row, and may yet ask for a prediction.
+
+        A batch is predicted once every client has asked or owes no row. So the requests in a
         batch depend on the environments, not on their speed: the rounding of a network's result
         may depend on the size of the batch.
         """
         if self._ending or not self._requests.batches:
             return False
         numbers, asking = range(1, self._instance_nb + 1), self._requests.asking
-        return any(n not in asking and self._is_at_work(n) for n in numbers)
+        return any(n not in asking and self._is_awaited(n) for n in numbers)
 
-    def _at_work(self) -> set[int]:
-        return {n for n in range(1, self._instance_nb + 1) if self._is_at_work(n)}
+    def _awaited(self) -> set[int]:
+        return {n for n in range(1, self._instance_nb + 1) if self._is_awaited(n)}
 
-    def _is_at_work(self, number: int) -> bool:
+    def _is_awaited(self, number: int) -> bool:
         peer = self.peers.get(number)
-        if peer is None or not peer.is_at_work:
+        if peer is None or not peer.is_awaited:
             return peer is None
         return peer.vacant or not peer.is_lost or self._replaces(number, peer.failure)
 

@@ -27,6 +27,10 @@ Request: TypeAlias = tuple[Peer, int, Sample]
 class ServiceRequests:
     """Answers the requests of clients; those for predictions are collected and answered together.
 
+    A request for a prediction is *due* when the run waits for the row that its environment is
+    making. Until then it is held, so that what a network answers does not depend on how far clients
+    run ahead.
+
     If the services have a method ``predict_batch(batch) -> batch``, simultaneous requests with the
     same fields go through it as one batch. Otherwise each goes through `predict`.
 
@@ -49,12 +53,12 @@ class ServiceRequests:
 
     @property
     def count(self) -> int:
-        """How many instances wait for a prediction."""
-        return len(self._waiting)
+        """How many instances wait for a prediction that is due."""
+        return len(self._waiting) - sum(peer.is_ahead for peer, _, _ in self._waiting)
 
     @property
     def asking(self) -> set[int]:
-        """The instances that wait for a prediction."""
+        """The instances that wait for a prediction, due or held."""
         return {peer.instance_id for peer, _, _ in self._waiting}
 
     def take(self, peer: Peer, frame: Frame) -> None:
@@ -107,8 +111,9 @@ class ServiceRequests:
         self._waiting = [request for request in self._waiting if request[0] is not peer]
 
     def predict(self) -> bool:
-        """Answer the waiting requests for predictions; return whether all answers are sent."""
-        waiting, self._waiting = self._waiting, []
+        """Answer the due requests for predictions; return whether all answers are sent."""
+        waiting = [request for request in self._waiting if not request[0].is_ahead]
+        self._waiting = [request for request in self._waiting if request[0].is_ahead]
         if len(waiting) == 1:
             ((peer, number, sample),) = waiting
             self._answer(peer, number, "the prediction", self._services.predict, sample)
