@@ -24,6 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
@@ -35,6 +36,7 @@ from physx_core.fields import Field
 from physx_core.origin import install_hint
 from physx_core.parsing import parse_toml
 from physx_core.statistics import Normalization
+from physx_core.typing import Index
 
 FORMAT_VERSION = 2
 """Version of the description; version 1 has no checksums."""
@@ -42,6 +44,9 @@ NAME = "network"
 """Name of the checkpoints unless another one is given."""
 BEST = "best"
 DESCRIPTION = "checkpoint.toml"
+BUFFER = "buffer.bin"
+"""File with the state of the buffer that draws the batches: whole numbers of 8 bytes."""
+_WHOLE = np.dtype("<i8")
 _KEPT = (
     "network",
     "network_kwargs",
@@ -127,6 +132,7 @@ def save(
     fields: Mapping[str, Field],
     normalization: Mapping[str, Normalization],
     progress: Progress,
+    buffer: Index | None = None,
     *,
     best: bool = False,
 ) -> Path:
@@ -142,6 +148,7 @@ def save(
         fields: The dataset's fields.
         normalization: Normalization of the transformation.
         progress: Progress of the training.
+        buffer: State of the buffer that draws its batches, if there is one.
         best: Replace ``<network_name>_best``, to predict with or to start from, without the state
             that a resumed training needs.
 
@@ -161,7 +168,10 @@ def save(
         elif not numbers and not path.is_dir():  # whoever made it may not have waited for the disk
             files.sync_folder(network_dir.parent)
         _clear(network_dir, name)
-        _write(partial, description, network, None if best else optimization)
+        if best:
+            _write(partial, description, network)
+        else:
+            _write(partial, description, network, optimization, buffer)
         _publish(partial, path)
     except BaseException as error:
         cause = error if isinstance(error, OSError) else error.__cause__
@@ -203,7 +213,8 @@ def _write(
     partial: Path,
     description: Mapping[str, Any],
     network: Network,
-    optimization: Optimization | None,
+    optimization: Optimization | None = None,
+    buffer: Index | None = None,
 ) -> None:
     """Write the files of a checkpoint to a new folder, and wait until they are on the disk."""
     files.create_folder(partial, sync=False)
@@ -211,6 +222,9 @@ def _write(
     described = _describe_files(partial)
     if optimization is not None and optimization.state_file:
         optimization.save_state(partial / optimization.state_file)
+        described |= _describe_files(partial, described)
+    if buffer is not None:
+        _write_new(partial / BUFFER, np.asarray(buffer, _WHOLE).tobytes())
         described |= _describe_files(partial, described)
     _write_description(partial / DESCRIPTION, {**description, "files": described})
     for file in (*described, DESCRIPTION):
@@ -331,12 +345,16 @@ def _write_description(path: Path, plain: Mapping[str, Any]) -> None:
     import tomli_w
 
     body = tomli_w.dumps(plain).encode()
+    _write_new(path, body + _END.format(crc32(body)).encode())
+    files.start_sync(path)
+
+
+def _write_new(path: Path, content: bytes) -> None:
     descriptor = files.create_new(path)
     try:
-        files.write_at(descriptor, body + _END.format(crc32(body)).encode(), 0)
+        files.write_at(descriptor, content, 0)
     finally:
         files.close(descriptor)
-    files.start_sync(path)
 
 
 # Finding ----------------------------------------------------------------------------------------
@@ -448,6 +466,23 @@ def read(path: Path, *, content: bool = True) -> Checkpoint:
             problem = error
     text = f"{path} cannot be read: {problem}. {problem.advice}"
     raise CheckpointError(text) from problem
+
+
+def read_buffer(found: Checkpoint) -> Index:
+    """Return the state of the buffer that draws a training's batches, from its checkpoint.
+
+    Raises:
+        CheckpointError: If the checkpoint has none, or was replaced meanwhile.
+    """
+    try:
+        content = files.read_content(found.path / BUFFER, _LARGEST)
+    except OSError as error:
+        raise CheckpointError(
+            f"{found.path / BUFFER} cannot be read: {error.strerror or error}. The training cannot "
+            "be resumed there. Use another checkpoint."
+        ) from error
+    check_unchanged(found)
+    return np.frombuffer(content[: len(content) // 8 * 8], _WHOLE).astype(np.int64)
 
 
 def check_unchanged(found: Checkpoint) -> None:

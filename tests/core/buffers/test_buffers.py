@@ -44,7 +44,7 @@ def test_buffers_keep_and_draw_what_the_model_says(run, resumed_at):
     kept, uses, arrived = {}, {}, 0  # slot to row, row to number of uses, number of rows
     for batch in range(batch_nb):
         if batch in resumed_at:
-            state = {key: value.copy() for key, value in buffer.state.items()}
+            state = buffer.state
             buffer = make(name, batch_size, batch_nb, seed, **options)
             buffer.restore(state)
         needed = buffer.needed(batch)
@@ -67,6 +67,8 @@ def test_buffers_keep_and_draw_what_the_model_says(run, resumed_at):
         assert name == "fifo" or len(set(draw.rows.tolist())) == batch_size
         for row in draw.rows.tolist():
             uses[row] += 1
+        if name != "fifo":
+            assert set(buffer.kept.tolist()) == held
         assert buffer.uses[list(kept)].tolist() == [uses[row] for row in kept.values()]
         assert name != "fifo" or max(uses.values()) <= views
     needed = max(watermark, -(-batch_nb * batch_size // views))
@@ -158,7 +160,7 @@ def test_a_state_of_other_options_is_refused():
     state = make("window", 4, 10, capacity=20).state
     for change in ({"capacity": 30}, {}):
         buffer = make("window", 4, 10, **{"capacity": 20, **change})
-        wrong = state if change else {**state, "rows": state["rows"] + 5}
+        wrong = state if change else state - 5
         with pytest.raises(ValueError, match="other options|have not arrived"):
             buffer.restore(wrong)
 

@@ -26,13 +26,21 @@ class Fifo(MixingBuffer):
         """Number of rows for which there must be a slot, if each waits for its last use."""
         return self.watermark * self.views
 
+    @property
+    def kept(self) -> Index:
+        """Numbers of the rows that wait: see `Buffer.kept`."""
+        return self.rows[self._waiting()]
+
     def place(self, count: int, random: np.random.Generator) -> Index:
         """Return slots of no row or of a finished one: see `Buffer.place`."""
         return np.flatnonzero((self.rows < 0) | (self.uses >= self.views))[:count]
 
     def draw(self, random: np.random.Generator) -> Index:
         """Return slots of waiting rows, different ones if there are enough."""
-        waiting = np.flatnonzero((self.rows >= 0) & (self.uses < self.views))
+        waiting = self._waiting()
         if len(waiting) < self.batch_size:
             waiting = np.repeat(waiting, self.views - self.uses[waiting])
         return random.choice(waiting, self.batch_size, replace=False)
+
+    def _waiting(self) -> Index:
+        return np.flatnonzero((self.rows >= 0) & (self.uses < self.views))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from physx_core.errors import UsageError
-from physx_core.typing import Array, Index
+from physx_core.typing import Index
 
 _STREAM = 2
 
@@ -81,6 +81,11 @@ class Buffer(ABC):
             batch: Number of the batch, from 0 over the whole run.
         """
 
+    @property
+    def total(self) -> int:
+        """Number of rows that the whole run needs."""
+        return self.needed(self.batch_nb - 1) if self.batch_nb else 0
+
     def place(self, count: int, random: np.random.Generator) -> Index:
         """Return the slots of the next rows, whose former rows are dropped.
 
@@ -123,23 +128,27 @@ class Buffer(ABC):
         return Draw(placed, drawn, rows)
 
     @property
-    def state(self) -> dict[str, Array]:
-        """What `restore` needs to continue from here, as arrays."""
-        return {"arrived": np.array(self.arrived), "rows": self.rows, "uses": self.uses}
+    def kept(self) -> Index:
+        """Numbers of the rows that batches are drawn from."""
+        return self.rows[self.rows >= 0]
 
-    def restore(self, state: dict[str, Array]) -> None:
+    @property
+    def state(self) -> Index:
+        """What `restore` needs to continue from here, as whole numbers."""
+        return np.concatenate([[self.arrived], self.rows, self.uses])
+
+    def restore(self, state: Index) -> None:
         """Continue from a `state` of a buffer with the same options; called after `begin`.
 
         Raises:
             ValueError: If it is not the state of such a buffer.
         """
-        arrived, rows, uses = state["arrived"], state["rows"], state["uses"]
-        for array, shape in ((arrived, ()), (rows, self.rows.shape), (uses, self.uses.shape)):
-            if array.shape != shape or array.dtype != np.int64:
-                raise ValueError("it is the state of a buffer with other options")
-        if not (np.all(rows < arrived) and np.all(rows >= -1) and np.all(uses >= 0)):
+        if state.shape != (1 + 2 * self.capacity,):
+            raise ValueError("it is the state of a buffer with other options")
+        rows, uses = state[1 : self.capacity + 1], state[self.capacity + 1 :]
+        if not (np.all(rows < state[0]) and np.all(rows >= -1) and np.all(uses >= 0)):
             raise ValueError("it contains rows that have not arrived")
-        self.arrived, self.rows, self.uses = int(arrived), rows.copy(), uses.copy()
+        self.arrived, self.rows, self.uses = int(state[0]), rows.copy(), uses.copy()
 
     def _slots(self, method: str, slots: Index, count: int) -> Index:
         slots = np.asarray(slots)

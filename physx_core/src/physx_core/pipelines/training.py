@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 from physx_core import checkpoint
 from physx_core.checkpoint import Progress
+from physx_core.components.buffer import Buffer
 from physx_core.components.group import Group
 from physx_core.components.network import Network
 from physx_core.config import (
@@ -24,10 +25,12 @@ from physx_core.config import (
     to_plain,
 )
 from physx_core.dataset import Dataset
-from physx_core.errors import DivergedError
+from physx_core.errors import ConfigError, DivergedError
 from physx_core.observers import statistics_observers
 from physx_core.pipelines.interrupt import Interrupt, Terminated, deferred_interrupt
 from physx_core.pipelines.learning.blocks import Block
+from physx_core.pipelines.learning.components import create
+from physx_core.pipelines.learning.drawn_rows import DrawnRows
 from physx_core.pipelines.learning.feeder import Feeder
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.resuming import (
@@ -70,7 +73,7 @@ class Training(NewSessionPipeline):
     - an existing dataset (``dataset_config.existing_dir``), which is only read, or the session's
       own one;
     - environments, which generate samples in the first epoch, stored and reused in later ones, or
-      in every epoch with ``always_produce``;
+      in every epoch with ``always_produce``; ``online`` says how they make up batches meanwhile;
     - an existing dataset by way of environments, with ``load_samples``: the session gets its own
       copy of the dataset; in the first epoch, or in every one with ``only_first_epoch=False``, each
       stored sample goes through an environment, whose result is trained on and replaces the sample
@@ -107,6 +110,14 @@ class Training(NewSessionPipeline):
     """Batches in an epoch; None: as many as needed to use each stored sample once."""
     seed: int | None = at_least(0, None)
     """Seed of the network's initial parameters and of the order of samples; None: a random one."""
+    online: str | type[Any] = "physx/stream"
+    """Buffer that decides which rows a batch holds while environments generate them:
+    "physx/stream", each row once, in order; "physx/reservoir", "physx/window" or "physx/fifo",
+    batches drawn at random from the rows kept in memory; or that of a plugin."""
+    online_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the buffer: ``capacity``, number of rows kept in memory;
+    ``watermark``, number of rows before the first batch; ``views``, how many times a row is used on
+    average. All rows are stored, whatever is kept in memory."""
     validation_every: int = at_least(0, 1)
     """Number of epochs between validations, if the dataset has a validation mode or
     `validation_split` holds samples back; 0: never."""
@@ -240,6 +251,8 @@ class Training(NewSessionPipeline):
         self.batch_id += 1
         values = self._record.add(self.losses)
         number = self.epoch_id * (self._epoch_batches or 0) + self.batch_id
+        if self.data.produces and self.data.online is not None:
+            values |= self.data.online.recent_statistics()
         self.observers.scalars(values, number, "batch")
         self.observers.advance(1)
         if self._leads and time.monotonic() > self._checked + _SESSION_INTERVAL:
@@ -336,7 +349,9 @@ class Training(NewSessionPipeline):
             self.best.state,
             self._record.state,
         )
-        return self.learner.save(self.session.network_dir, progress, best=best)
+        online = self.data.online
+        state = online.state() if online is not None and self.data.produces else None
+        return self.learner.save(self.session.network_dir, progress, state, best=best)
 
     def _end_early(self, interrupt: Interrupt) -> None:
         self.save_checkpoint()
@@ -398,6 +413,7 @@ class Training(NewSessionPipeline):
             last = read_last_checkpoint(session, name, environment)
             config, environment = without_copied_dataset(session, config), None
         self._start_from(last)
+        buffer = self._create_buffer()
         self._network_class.set_seed(self._resumed.seed)
         self.learner = Learner(self.network_config, trains=True, stops_at_nan=self.on_nan == "stop")
         if config.existing_dir is not None:  # a missing dataset leaves no session behind
@@ -414,7 +430,7 @@ class Training(NewSessionPipeline):
         if environment is not None:
             if environment.as_tcp_ip_client and not environment.load_samples:
                 feeder = Feeder[Block]()
-            source = self._open_environments(resources, environment, dataset, feeder)
+            source = self._open_environments(resources, environment, dataset, feeder, buffer)
         self.data = TrainingData(
             dataset,
             source,
@@ -424,6 +440,8 @@ class Training(NewSessionPipeline):
             seed=self._resumed.seed,
             environment=environment,
             data_type=self.network_config.data_type,
+            buffer=buffer,
+            drawn=self._open_drawn_rows(resources, buffer) if source is not None else None,
             feeder=feeder,
             ahead=type(self).batch_condition is Training.batch_condition
             and type(self).batch_produce is Training.batch_produce,
@@ -459,6 +477,27 @@ class Training(NewSessionPipeline):
         self._record = TrainingRecord(self._resumed.record)
         self.best = BestEpoch(self._resumed.best, self.min_improvement)
 
+    def _create_buffer(self) -> Buffer:
+        environment = self.environment_config
+        buffer: Buffer = create("buffer", self.online, self.online_kwargs, Buffer)
+        produces = environment is not None and not environment.load_samples
+        if not produces and buffer.capacity and not self.resume:
+            raise ConfigError(
+                f"Training.online is {self.online!r}, which mixes rows while environments generate "
+                "them, but none do here: name an environment that does, or leave online out."
+            )
+        always = environment is not None and environment.always_produce
+        batch_nb = (self.batch_nb or 0) * (self.epoch_nb if always else 1)
+        buffer.begin(self.batch_size * self.group.size, batch_nb, self._resumed.seed)
+        return buffer
+
+    def _open_drawn_rows(self, resources: contextlib.ExitStack, buffer: Buffer) -> DrawnRows | None:
+        if not buffer.capacity:
+            return None
+        return resources.enter_context(
+            contextlib.closing(DrawnRows(self.session, buffer.batch_size))
+        )
+
     def _open_session(self) -> Session:
         made = None
         if self._leads:
@@ -485,6 +524,8 @@ class Training(NewSessionPipeline):
             yield f"smallest loss {self.best.loss:.6g}, after epoch {self.best.epoch}"
         if self.environment_config is not None:
             yield describe_samples(self.data.dataset.directory)
+        if self.data.online is not None:
+            yield from self.data.online.describe()
         if self.checkpoint_path is not None:
             yield f"checkpoint: {self.checkpoint_path}"
 
@@ -524,6 +565,7 @@ class Training(NewSessionPipeline):
         config: EnvironmentConfig,
         dataset: Dataset,
         feeder: Feeder[Block] | None,
+        buffer: Buffer,
     ) -> Source:
         seed = self._resumed.seed if config.seed is None else config.seed
         dataset.update_info(**describe_environment(config, seed))
@@ -535,15 +577,8 @@ class Training(NewSessionPipeline):
             predict=self._predict if feeder is None else feeder.calling(self._predict),
             show=None if feeder is None else feeder.telling(self.observers.events),
             run_ahead=0 if config.load_samples else None,
-            total=self._generated_rows(config),
+            total=None if config.load_samples or not self.batch_nb else buffer.total,
         )
-
-    def _generated_rows(self, config: EnvironmentConfig) -> int | None:
-        """Return how many rows the environments generate in all; None: unknown."""
-        if config.load_samples or self.batch_nb is None:
-            return None
-        epochs = self.epoch_nb if config.always_produce else 1
-        return epochs * self.batch_nb * self.batch_size * self.group.size
 
     def _predict(self, batch: Batch) -> Batch:
         """Answer `Environment.get_prediction`; before the first batch with the step's shapes."""

@@ -33,7 +33,7 @@ from physx_core.plugins import import_component
 from physx_core.plugins.networks import resolve_network
 from physx_core.plugins.references import check_recorded, is_of_plugin, is_recorded_as
 from physx_core.statistics import Normalization
-from physx_core.typing import Array, Batch, Tensors
+from physx_core.typing import Array, Batch, Index, Tensors
 
 
 class _Step(NamedTuple):
@@ -321,7 +321,14 @@ class Learner:
         prediction = self.network.predict(self.transformation.transform_before_prediction(inputs))
         return self.transformation.transform_before_apply(prediction)
 
-    def save(self, network_dir: Path, progress: checkpoint.Progress, *, best: bool = False) -> Path:
+    def save(
+        self,
+        network_dir: Path,
+        progress: checkpoint.Progress,
+        buffer: Index | None = None,
+        *,
+        best: bool = False,
+    ) -> Path:
         """Write the next checkpoint, or the best one, and return its folder."""
         return checkpoint.save(
             network_dir,
@@ -331,6 +338,7 @@ class Learner:
             self.fields,
             self.transformation.normalization,
             progress,
+            buffer,
             best=best,
         )
 

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from itertools import repeat
 
 import numpy as np
 
+from physx_core.components.buffer import Buffer
 from physx_core.config import DatasetConfig, EnvironmentConfig
 from physx_core.dataset import Dataset, Subset
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import RESERVED, Field
 from physx_core.pipelines.learning.blocks import Block, Blocks
+from physx_core.pipelines.learning.drawn_rows import DrawnRows
 from physx_core.pipelines.learning.feeder import Feeder
+from physx_core.pipelines.learning.online import OnlineBatches
 from physx_core.pipelines.storage import other_samples, record_rejected
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.sources.source import Source
@@ -42,6 +44,7 @@ class TrainingData:
         dataset: Dataset to read batches from, and to store generated ones in.
         source: The environments; None if only the dataset is read.
         batches_read: Number of batches read from the dataset.
+        online: The batches of rows that environments generate; None if they generate none.
         parts: The samples to train on and those held back, ``training`` and ``validation``; empty
             if none are held back.
     """
@@ -57,6 +60,8 @@ class TrainingData:
         seed: int,
         environment: EnvironmentConfig | None,
         data_type: str,
+        buffer: Buffer,
+        drawn: DrawnRows | None = None,
         feeder: Feeder[Block] | None = None,
         ahead: bool = True,
     ) -> None:
@@ -71,6 +76,8 @@ class TrainingData:
             seed: Seed of the order of samples.
             environment: Configuration of the source; None without one.
             data_type: Floating type of the batches that are read.
+            buffer: Decides what batches hold while environments generate; it has begun.
+            drawn: Where to write which rows the buffer drew.
             feeder: Has a thread that has the environments generate batches ahead of the training;
                 None: they are generated when they are taken.
             ahead: Whether all batches of an epoch will be taken, so that they may be generated
@@ -103,14 +110,14 @@ class TrainingData:
             )
         self.parts = self._split(replay)
         self._stored: StoredRows | None = None
-        self._blocks: Blocks | None = None
-        self._block: Block | None = None
+        self.online: OnlineBatches | None = None
+        self._names: Sequence[str] = ()
         if source is not None and replay:
             self._stored = self._stored_rows(source)
         elif source is not None:
-            self._blocks = Blocks(
-                source, dataset, self._mode, normalize=config.normalize, feeder=feeder
-            )
+            blocks = Blocks(source, dataset, self._mode, normalize=config.normalize, feeder=feeder)
+            first = self._count(self._mode)
+            self.online = OnlineBatches(blocks, buffer, data_type, drawn, first)
 
     def _split(self, replay: bool) -> dict[str, Subset]:
         share = self._config.validation_split
@@ -145,9 +152,10 @@ class TrainingData:
             epoch_id: Index of the epoch, from 0.
             names: Fields of the batches that are read from the dataset.
         """
+        self._names = names
         self._uses_source = self.source is not None and (epoch_id == 0 or self._always)
-        if self._uses_source and self._blocks is not None and self._ahead:
-            self._blocks.expect(repeat(self._batch_size, self._batch_nb or 0))
+        if self._uses_source and self.online is not None and self._ahead:
+            self.online.expect(self._batch_nb or 0)
         if not self._uses_source and self._reader is None:
             part = self.parts.get("training")
             batches = part.batches if part else partial(self.dataset.batches, self._mode)
@@ -164,9 +172,8 @@ class TrainingData:
 
     def next_batch(self) -> Batch:
         """Return the next batch in physical units; generated ones are stored already."""
-        if self._uses_source and self._blocks is not None:
-            self._block = self._blocks.next(self._batch_size)
-            return self._block.rows
+        if self._uses_source and self.online is not None:
+            return self.online.next(self._names)
         if self._uses_source and self.source is not None and self._stored is not None:
             with record_rejected(self.source, self.dataset):
                 return self._replay(self.source, self._stored)
@@ -186,8 +193,8 @@ class TrainingData:
 
     def close(self) -> None:
         """End what generates batches ahead, before the source is closed."""
-        if self._blocks is not None:
-            self._blocks.close()
+        if self.online is not None:
+            self.online.close()
 
     def skip(self, batches: int) -> None:
         """Skip batches that a training read before it was interrupted."""
@@ -218,8 +225,8 @@ class TrainingData:
     @property
     def fields(self) -> Mapping[str, Field]:
         """The stored fields by name; those of the environments until something is stored."""
-        if self._block is not None:
-            return self._block.fields
+        if self.online is not None and self.online.number:
+            return self.online.block.fields
         if self.source is not None and not self._count(self._mode):
             return {field.name: field for field in self.source.fields}
         return self.dataset.fields(self._mode)
@@ -227,8 +234,8 @@ class TrainingData:
     def normalization(self) -> dict[str, Normalization]:
         """Return the normalization by field; empty if nothing is to be normalized."""
         self._changed = False
-        if self.produces and self._block is not None:
-            return self._block.normalization
+        if self.produces and self.online is not None and self.online.number:
+            return self.online.block.normalization
         if not self._config.normalize or not self._count(self._mode):
             return {}
         if self.parts:

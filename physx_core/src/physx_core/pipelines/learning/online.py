@@ -1,0 +1,179 @@
+"""OnlineBatches: the batches of a training while environments generate its rows."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from physx_core.components.buffer import Buffer
+from physx_core.pipelines.learning.blocks import Block, Blocks
+from physx_core.pipelines.learning.drawn_rows import DrawnRows
+from physx_core.pipelines.learning.row_store import RowStore
+from physx_core.typing import Batch, Index
+
+_INTERVAL = 1.0
+
+
+class OnlineBatches:
+    """Takes as many rows as the buffer needs for each batch, and draws the batch from those it has.
+
+    Attributes:
+        block: The last block of rows.
+        number: Number of batches drawn since the run began.
+        rows: Numbers of the last batch's rows since the run began.
+    """
+
+    def __init__(
+        self, blocks: Blocks, buffer: Buffer, data_type: str, drawn: DrawnRows | None, first: int
+    ) -> None:
+        """Start with the first batch.
+
+        Args:
+            blocks: The rows.
+            buffer: Decides what batches hold; it has begun.
+            data_type: Floating type of the batches of a buffer that keeps rows.
+            drawn: Where to write which rows these are.
+            first: Number in the dataset of the run's first row.
+        """
+        self.block = Block()
+        self.number = 0
+        self.rows: Index = np.zeros(0, np.intp)
+        self._blocks, self._buffer, self._data_type = blocks, buffer, data_type
+        self._drawn, self._first = drawn, first
+        self._store: RowStore | None = None
+        self._arrived = 0
+        self._meter = _Meter()
+
+    def next(self, names: Sequence[str]) -> Batch:
+        """Return the next batch, in physical units; valid until the next call.
+
+        Args:
+            names: Fields that a batch contains if the buffer keeps rows; otherwise all.
+
+        Raises:
+            PhysxError: If an environment fails, or rows cannot be stored.
+        """
+        buffer, number = self._buffer, self.number
+        count = buffer.needed(number) - self._arrived
+        with self._meter.waiting():
+            block = self.block = self._blocks.next(count)
+        self._meter.count(count)
+        self._arrived += count
+        self.number += 1
+        if not buffer.capacity:
+            self.rows = np.arange(self._arrived - count, self._arrived)
+            return block.rows
+        draw = buffer.take(number, count)
+        if self._store is None:
+            self._store = RowStore(
+                buffer.capacity, buffer.batch_size, block.fields, names, self._data_type
+            )
+        if count:
+            self._store.put(draw.placed, block.rows)
+        self.rows = draw.rows
+        if self._drawn is not None:
+            self._drawn.append(self._first + draw.rows)
+        return self._store.take(draw.drawn)
+
+    def expect(self, batches: int) -> None:
+        """Announce that this many batches will be taken."""
+        needed = [self._arrived]
+        needed += [self._buffer.needed(self.number + batch) for batch in range(batches)]
+        self._blocks.expect(after - before for before, after in itertools.pairwise(needed))
+
+    def close(self) -> None:
+        """Have no more rows generated, before the environments are closed."""
+        self._blocks.close()
+
+    def state(self) -> Index | None:
+        """Return the buffer's state for a checkpoint; None: it keeps nothing."""
+        if not self._buffer.capacity:
+            return None
+        if self._drawn is not None:
+            self._drawn.sync()
+        return self._buffer.state
+
+    def recent_statistics(self) -> dict[str, float]:
+        """Return how the buffer and both sides are doing, once a second; otherwise nothing.
+
+        ``online/rows_kept`` and ``online/mean_age`` of the buffer, the age in rows that came since;
+        ``online/views``, how many times a row was used on average; and of the time since the last
+        call: ``online/rows_per_s``, ``online/batches_per_s``, and ``online/learner_waits``, the
+        share of it in which the learner waited for rows.
+        """
+        rates = self._meter.read_recent()
+        if not rates or not self._buffer.capacity:
+            return rates
+        kept = self._buffer.kept
+        return {
+            "online/rows_kept": float(len(kept)),
+            "online/mean_age": self._arrived - float(kept.mean()) if len(kept) else 0.0,
+            "online/views": self._views,
+            **rates,
+        }
+
+    def describe(self) -> Iterable[str]:
+        """Return a line on the epochs in which environments generated."""
+        if self.number:
+            total = self._meter.read()
+            yield (
+                f"while environments generated: {total['online/rows_per_s']:.4g} rows/s, "
+                f"{total['online/batches_per_s']:.4g} batches/s, each row used {self._views:.2f} "
+                f"times on average; the learner waited {100 * total['online/learner_waits']:.0f} % "
+                "of the time"
+            )
+
+    @property
+    def _views(self) -> float:
+        return self.number * self._buffer.batch_size / max(1, self._arrived)
+
+
+class _State(NamedTuple):
+    time: float
+    rows: int
+    batches: int
+    waited: float
+
+
+class _Meter:
+    """Rates of a run, and how long its learner waited for rows."""
+
+    def __init__(self) -> None:
+        self._first = self._last = self._now = _State(time.monotonic(), 0, 0, 0.0)
+
+    @contextlib.contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Count the time of the body as waiting."""
+        began = time.monotonic()
+        if not self._now.batches:
+            self._first = self._last = _State(began, 0, 0, 0.0)
+        yield
+        ended = time.monotonic()
+        self._now = self._now._replace(time=ended, waited=self._now.waited + ended - began)
+
+    def count(self, rows: int) -> None:
+        """Count a batch, and the rows that arrived for it."""
+        now = self._now
+        self._now = now._replace(rows=now.rows + rows, batches=now.batches + 1)
+
+    def read_recent(self) -> dict[str, float]:
+        """Return the rates since the last call; empty if that was less than a second ago."""
+        if self._now.time < self._last.time + _INTERVAL:
+            return {}
+        last, self._last = self._last, self._now
+        return self.read(last)
+
+    def read(self, since: _State | None = None) -> dict[str, float]:
+        """Return the rates since some moment; None: the start."""
+        now, before = self._now, since or self._first
+        seconds = max(now.time - before.time, 1e-9)
+        return {
+            "online/rows_per_s": (now.rows - before.rows) / seconds,
+            "online/batches_per_s": (now.batches - before.batches) / seconds,
+            "online/learner_waits": (now.waited - before.waited) / seconds,
+        }
