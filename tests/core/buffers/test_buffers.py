@@ -44,13 +44,14 @@ def test_buffers_keep_and_draw_what_the_model_says(run, resumed_at):
     kept, uses, arrived = {}, {}, 0  # slot to row, row to number of uses, number of rows
     for batch in range(batch_nb):
         if batch in resumed_at:
-            state = buffer.state
+            state = buffer.state(batch)
             buffer = make(name, batch_size, batch_nb, seed, **options)
-            buffer.restore(state)
+            buffer.restore(batch, state)
         needed = buffer.needed(batch)
         assert needed >= max(arrived, watermark)
-        before = set(kept.values())
+        before, state = set(kept.values()), buffer.state(batch)
         draw = buffer.take(batch, needed - arrived)
+        assert np.array_equal(buffer.state(batch), state)
         for slot in draw.placed.tolist():
             kept[slot], uses[arrived] = arrived, 0
             arrived += 1
@@ -86,7 +87,7 @@ def test_a_run_that_is_made_longer_continues_with_the_rows_that_are_there(run, m
         short.take(batch, short.needed(batch) - arrived)
         arrived = short.needed(batch)
     longer = make(name, batch_size, batch_nb + more, seed, **options)
-    longer.restore(short.state)
+    longer.restore(batch_nb, short.state(batch_nb))
     for batch in range(batch_nb, batch_nb + more):
         count = longer.needed(batch) - longer.arrived
         assert count >= 0
@@ -157,12 +158,12 @@ def test_an_unknown_option_is_an_error_that_lists_the_others():
 
 
 def test_a_state_of_other_options_is_refused():
-    state = make("window", 4, 10, capacity=20).state
+    state = make("window", 4, 10, capacity=20).state(0)
     for change in ({"capacity": 30}, {}):
         buffer = make("window", 4, 10, **{"capacity": 20, **change})
         wrong = state if change else state - 5
         with pytest.raises(ValueError, match="other options|have not arrived"):
-            buffer.restore(wrong)
+            buffer.restore(0, wrong)
 
 
 class Faulty(Buffer):

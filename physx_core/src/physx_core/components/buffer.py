@@ -54,6 +54,8 @@ class Buffer(ABC):
     rows: Index
     uses: Index
     _seed: int = 0
+    _taken: int = 0
+    _before: tuple[int, Index, Index, Index, Index]
 
     def begin(self, batch_size: int, batch_nb: int, seed: int) -> None:
         """Start empty; called once before everything else.
@@ -67,7 +69,7 @@ class Buffer(ABC):
             ConfigError: If the buffer's options do not fit these numbers.
         """
         self.batch_size, self.batch_nb, self._seed = batch_size, batch_nb, seed
-        self.arrived = 0
+        self.arrived = self._taken = 0
         self.rows = np.full(self.capacity, -1, np.int64)
         self.uses = np.zeros(self.capacity, np.int64)
 
@@ -114,17 +116,19 @@ class Buffer(ABC):
             UsageError: If `place` or `draw` return anything but the slots that they should.
         """
         random = np.random.default_rng([self._seed, _STREAM, batch])
-        placed: Index = np.zeros(0, np.intp)
+        arrived, placed = self.arrived, np.zeros(0, np.intp)
         if count:
             placed = self._slots("place", self.place(count, random), count)
-            self.rows[placed] = np.arange(self.arrived, self.arrived + count)
-            self.uses[placed] = 0
-            self.arrived += count
+        before = self.rows[placed], self.uses[placed]
+        self.rows[placed] = np.arange(arrived, arrived + count)
+        self.uses[placed] = 0
+        self.arrived += count
         drawn = self._slots("draw", self.draw(random), self.batch_size)
         rows = self.rows[drawn]
         if rows.min() < 0:
             raise UsageError(f"{type(self).__name__}.draw() returned a slot without a row.")
         np.add.at(self.uses, drawn, 1)
+        self._taken, self._before = batch + 1, (arrived, placed, *before, drawn)
         return Draw(placed, drawn, rows)
 
     @property
@@ -132,13 +136,26 @@ class Buffer(ABC):
         """Numbers of the rows that batches are drawn from."""
         return self.rows[self.rows >= 0]
 
-    @property
-    def state(self) -> Index:
-        """What `restore` needs to continue from here, as whole numbers."""
-        return np.concatenate([[self.arrived], self.rows, self.uses])
+    def state(self, batches: int) -> Index:
+        """Return what `restore` needs to continue after some batches, as whole numbers.
 
-    def restore(self, state: Index) -> None:
+        Args:
+            batches: Number of batches: all that were taken since the run began, or all but the
+                last one.
+        """
+        arrived, rows, uses = self.arrived, self.rows.copy(), self.uses.copy()
+        if batches < self._taken:
+            arrived, placed, rows_before, uses_before, drawn = self._before
+            np.subtract.at(uses, drawn, 1)
+            rows[placed], uses[placed] = rows_before, uses_before
+        return np.concatenate([[arrived], rows, uses])
+
+    def restore(self, batches: int, state: Index) -> None:
         """Continue from a `state` of a buffer with the same options; called after `begin`.
+
+        Args:
+            batches: Number of batches after which that was the state.
+            state: The state.
 
         Raises:
             ValueError: If it is not the state of such a buffer.
@@ -149,6 +166,7 @@ class Buffer(ABC):
         if not (np.all(rows < state[0]) and np.all(rows >= -1) and np.all(uses >= 0)):
             raise ValueError("it contains rows that have not arrived")
         self.arrived, self.rows, self.uses = int(state[0]), rows.copy(), uses.copy()
+        self._taken = batches
 
     def _slots(self, method: str, slots: Index, count: int) -> Index:
         slots = np.asarray(slots)

@@ -154,6 +154,7 @@ class Training(NewSessionPipeline):
     _epoch_batches: int | None = field(init=False, repr=False, default=None)
     _is_savable: bool = field(init=False, repr=False, default=False)
     _met_nan: bool = field(init=False, repr=False, default=False)
+    _blocks: int = field(init=False, repr=False, default=0)
 
     def execute(self) -> None:
         """Train. However the training ends, the network trained so far is a checkpoint to resume.
@@ -252,6 +253,7 @@ class Training(NewSessionPipeline):
         values = self._record.add(self.losses)
         number = self.epoch_id * (self._epoch_batches or 0) + self.batch_id
         if self.data.produces and self.data.online is not None:
+            self._blocks = self.data.online.number
             values |= self.data.online.recent_statistics()
         self.observers.scalars(values, number, "batch")
         self.observers.advance(1)
@@ -350,7 +352,9 @@ class Training(NewSessionPipeline):
             self._record.state,
         )
         online = self.data.online
-        state = online.state() if online is not None and self.data.produces else None
+        state = None
+        if online is not None and self.data.produces:
+            state = online.state(self._blocks)
         return self.learner.save(self.session.network_dir, progress, state, best=best)
 
     def _end_early(self, interrupt: Interrupt) -> None:

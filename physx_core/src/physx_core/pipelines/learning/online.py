@@ -5,12 +5,15 @@ from __future__ import annotations
 import contextlib
 import itertools
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from physx_core.components.buffer import Buffer
+from physx_core.dataset import Dataset
+from physx_core.errors import CheckpointError
+from physx_core.fields import Field
 from physx_core.pipelines.learning.blocks import Block, Blocks
 from physx_core.pipelines.learning.drawn_rows import DrawnRows
 from physx_core.pipelines.learning.row_store import RowStore
@@ -70,15 +73,48 @@ class OnlineBatches:
             return block.rows
         draw = buffer.take(number, count)
         if self._store is None:
-            self._store = RowStore(
-                buffer.capacity, buffer.batch_size, block.fields, names, self._data_type
-            )
+            self._store = self._allocate(block.fields, names)
         if count:
             self._store.put(draw.placed, block.rows)
         self.rows = draw.rows
         if self._drawn is not None:
             self._drawn.append(self._first + draw.rows)
         return self._store.take(draw.drawn)
+
+    def resume(
+        self, number: int, state: Index, dataset: Dataset, mode: str, names: Sequence[str]
+    ) -> None:
+        """Continue after some batches, with the buffer as it was then.
+
+        The blocks continue there, too, and so does the record of drawn rows.
+
+        Args:
+            number: Number of batches drawn.
+            state: State of the buffer then; empty if it keeps nothing.
+            dataset: Has all rows that had arrived then.
+            mode: Their mode.
+            names: Fields that a batch contains if the buffer keeps rows.
+
+        Raises:
+            CheckpointError: If it is not a state of this buffer.
+        """
+        buffer = self._buffer
+        self.number = number
+        self._arrived = buffer.needed(number - 1) if number else 0
+        if not number or not buffer.capacity:
+            return
+        try:
+            buffer.restore(number, state)
+        except ValueError as error:
+            raise CheckpointError(
+                f"The training cannot be resumed: the state of its buffer does not fit "
+                f"{type(buffer).__name__}, as {error}. Resume with the same online, online_kwargs "
+                "and batch_size."
+            ) from error
+        self._arrived = buffer.arrived
+        self._store = self._allocate(dataset.fields(mode), names)
+        slots = np.flatnonzero(buffer.rows >= 0)
+        self._store.read(slots, dataset, mode, self._first + buffer.rows[slots])
 
     def expect(self, batches: int) -> None:
         """Announce that this many batches will be taken."""
@@ -90,13 +126,17 @@ class OnlineBatches:
         """Have no more rows generated, before the environments are closed."""
         self._blocks.close()
 
-    def state(self) -> Index | None:
-        """Return the buffer's state for a checkpoint; None: it keeps nothing."""
+    def state(self, batches: int) -> Index | None:
+        """Return the buffer's state for a checkpoint; None: it keeps nothing.
+
+        Args:
+            batches: Number of batches that were learned from: all, or all but the last one.
+        """
         if not self._buffer.capacity:
             return None
         if self._drawn is not None:
             self._drawn.sync()
-        return self._buffer.state
+        return self._buffer.state(batches)
 
     def recent_statistics(self) -> dict[str, float]:
         """Return how the buffer and both sides are doing, once a second; otherwise nothing.
@@ -127,6 +167,10 @@ class OnlineBatches:
                 f"times on average; the learner waited {100 * total['online/learner_waits']:.0f} % "
                 "of the time"
             )
+
+    def _allocate(self, fields: Mapping[str, Field], names: Sequence[str]) -> RowStore:
+        buffer = self._buffer
+        return RowStore(buffer.capacity, buffer.batch_size, fields, names, self._data_type)
 
     @property
     def _views(self) -> float:
