@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Sequence
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -103,7 +103,10 @@ class Environment:
         step_index: Number of finished steps.
         episode_index: Index of the current trajectory, from 0.
         sample_episode: Index of the trajectory of the last training data.
+        runs_programs: Whether arguments name programs to run, so that no file may give them.
     """
+
+    runs_programs: ClassVar[bool] = False
 
     def __init__(
         self,
