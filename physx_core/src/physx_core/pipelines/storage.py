@@ -143,23 +143,16 @@ def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) 
 
 
 def reject_environments(environment: EnvironmentConfig) -> None:
-    """Reject environments in a training of several processes."""
-    replays = environment.load_samples
-    if environment.always_produce or (replays and not environment.only_first_epoch):
-        advice = (
-            "take part in every epoch. Leave out always_produce and only_first_epoch=False, or "
-            "train in one process."
-        )
-    else:
-        what = "send the stored samples through them" if replays else "generate the samples"
-        advice = (
-            f"take part in the first epoch. First {what} in one process, with epoch_nb=1; then "
-            "continue in several with resume=True (physx train --resume)."
-        )
-    raise ConfigError(
-        "Several processes train on stored samples only, each on its share, but environments "
-        f"would {advice}"
+    """Reject environments that replay samples in a training of several processes."""
+    if not environment.load_samples:
+        return
+    advice = (
+        "First send the stored samples through them in one process, with epoch_nb=1; then continue "
+        "in several with resume=True (physx train --resume)."
     )
+    if not environment.only_first_epoch:
+        advice = "Leave out only_first_epoch=False, or train in one process."
+    raise ConfigError(f"Environments cannot replay samples for several processes. {advice}")
 
 
 def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:

@@ -79,16 +79,18 @@ class Training(NewSessionPipeline):
       stored sample goes through an environment, whose result is trained on and replaces the sample
       in the copy: see `TrainingData`. Without ``existing_dir`` the session's own samples are used.
 
-    Several processes started by ``torchrun`` train one network together on stored samples: each
-    takes its share of every batch, which is ``batch_size`` times the number of processes, and the
-    first one writes the session. If environments generate or replay the samples of the first epoch,
-    train that epoch in one process, then continue in several with ``resume``.
+    Several processes started by ``torchrun`` train one network together: each takes its share of
+    every batch, which is ``batch_size`` times the number of processes. The first one writes the
+    session; it has the environments, and passes on each one's share of what they generate. If they
+    replay the samples of the first epoch, train that epoch in one process, then continue in several
+    with ``resume``.
 
     Attributes:
         group: The processes that train together.
         learner: The network, its transformation and its optimization.
         data: Source of the batches.
-        batch: The current batch, in physical units.
+        batch: The current batch, in physical units; in one of several processes only its share
+            while environments generate.
         epoch_id: Number of finished epochs.
         batch_id: Number of finished batches of the current epoch.
         losses: The result of `Optimization.transform_loss` for the current batch, as numbers.
@@ -238,7 +240,7 @@ class Training(NewSessionPipeline):
             DivergedError: If the loss or a gradient is not finite, with ``on_nan="stop"``.
         """
         try:
-            self.losses = self.learner.optimize(self.batch)
+            self.losses = self.learner.optimize(self.batch, self.data.weight)
         except DivergedError as error:
             raise self._diverged(f"{error}", self.batch_id + 1) from None
         if self.on_nan == "continue" and not math.isfinite(self.losses["loss"]):
@@ -423,15 +425,12 @@ class Training(NewSessionPipeline):
         if config.existing_dir is not None:  # a missing dataset leaves no session behind
             Dataset.open(config.existing_dir).close()
         self.session = session or self._open_session()
-        make = open_existing if environment is None else open_own
-        dataset = resources.enter_context(make(self.session, config))
-        if environment is not None:
-            copy_existing(dataset, config)
+        dataset = resources.enter_context(self._open_dataset(config, environment))
         self._record_config(self._resumed.seed)
         further = statistics_observers(self.statistics, self.statistics_kwargs, environment)
         self._observe(resources, environment, further if self._leads else ())
         source = feeder = None
-        if environment is not None:
+        if environment is not None and self._leads:
             if environment.as_tcp_ip_client and not environment.load_samples:
                 feeder = Feeder[Block]()
             source = self._open_environments(resources, environment, dataset, feeder, buffer)
@@ -446,6 +445,7 @@ class Training(NewSessionPipeline):
             data_type=self.network_config.data_type,
             buffer=buffer,
             drawn=self._open_drawn_rows(resources, buffer) if source is not None else None,
+            group=self.group,
             feeder=feeder,
             ahead=type(self).batch_condition is Training.batch_condition
             and type(self).batch_produce is Training.batch_produce,
@@ -480,6 +480,18 @@ class Training(NewSessionPipeline):
         self.checkpoint_path = last.path if last else None
         self._record = TrainingRecord(self._resumed.record)
         self.best = BestEpoch(self._resumed.best, self.min_improvement)
+
+    def _open_dataset(
+        self, config: DatasetConfig, environment: EnvironmentConfig | None
+    ) -> Dataset:
+        """Open the dataset; only the leading process writes to the one that rows are added to."""
+        if environment is None:
+            return open_existing(self.session, config)
+        if self._leads:
+            dataset = open_own(self.session, config)
+            copy_existing(dataset, config)
+        self.group.tell(None)
+        return dataset if self._leads else open_existing(self.session, config)
 
     def _create_buffer(self) -> Buffer:
         environment = self.environment_config

@@ -157,10 +157,14 @@ class Learner:
             raise UsageError("This network was created for prediction and cannot be trained.")
         return self.optimization
 
-    def optimize(self, batch: Batch) -> dict[str, float]:
+    def optimize(self, batch: Batch, weight: float | None = None) -> dict[str, float]:
         """Train on a batch and return the statistics of the step, ``loss`` first.
 
         In a group of processes each trains on its share; the statistics are those of the batch.
+
+        Args:
+            batch: The batch, the same in all processes, or this process's share of it.
+            weight: Weight of that share in the mean over the whole batch; None: it is the batch.
 
         Raises:
             DivergedError: If the loss or a gradient is not finite, unless
@@ -171,7 +175,9 @@ class Learner:
             self._is_between_steps = False
             self.network.set_train()
         optimization, group = self._trainer(), self.group
-        share, weight = (batch, 1.0) if group.size == 1 else group.share_of(batch)
+        share = batch
+        if weight is None:
+            share, weight = (batch, 1.0) if group.size == 1 else group.share_of(batch)
         step = self._compute_loss(optimization, share)
         loss, stops = step.loss, optimization.stops_at_nan
         if stops and isinstance(loss, (float, np.floating)) and not math.isfinite(loss):

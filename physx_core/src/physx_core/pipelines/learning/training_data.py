@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 
 from physx_core.components.buffer import Buffer
+from physx_core.components.group import Group
 from physx_core.config import DatasetConfig, EnvironmentConfig
 from physx_core.dataset import Dataset, Subset
 from physx_core.dataset.store.definitions import compare_fields
@@ -17,6 +18,7 @@ from physx_core.pipelines.learning.blocks import Block, Blocks
 from physx_core.pipelines.learning.drawn_rows import DrawnRows
 from physx_core.pipelines.learning.feeder import Feeder
 from physx_core.pipelines.learning.online import OnlineBatches
+from physx_core.pipelines.learning.sharing import SharedBatches
 from physx_core.pipelines.storage import other_samples, record_rejected
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.sources.source import Source
@@ -62,6 +64,7 @@ class TrainingData:
         data_type: str,
         buffer: Buffer,
         drawn: DrawnRows | None = None,
+        group: Group,
         feeder: Feeder[Block] | None = None,
         ahead: bool = True,
     ) -> None:
@@ -78,13 +81,15 @@ class TrainingData:
             data_type: Floating type of the batches that are read.
             buffer: Decides what batches hold while environments generate; it has begun.
             drawn: Where to write which rows the buffer drew.
+            group: The processes that train together; only the leading one has the environments.
             feeder: Has a thread that has the environments generate batches ahead of the training;
                 None: they are generated when they are taken.
             ahead: Whether all batches of an epoch will be taken, so that they may be generated
                 ahead.
         """
         replay = environment is not None and environment.load_samples
-        if source is not None and batch_nb is None and not replay:
+        generates = environment is not None and not replay
+        if generates and batch_nb is None:
             raise ConfigError(
                 "Training.batch_nb is missing: it is the number of batches to generate in an epoch."
             )
@@ -100,9 +105,9 @@ class TrainingData:
         self._data_type = data_type
         self._mode = config.mode
         self._reader: Iterator[Batch] | None = None
-        self._uses_source = source is not None
+        self._has_source = self._uses_source = source is not None or generates
         self._changed = False
-        if source is None and not self._count(self._mode):
+        if not self._has_source and not self._count(self._mode):
             raise DatasetError(
                 f'The dataset in {dataset.directory} has no samples of mode "{self._mode}" to '
                 f"train on. It has: {listed(dataset.modes)}."
@@ -118,12 +123,15 @@ class TrainingData:
             blocks = Blocks(source, dataset, self._mode, normalize=config.normalize, feeder=feeder)
             first = self._count(self._mode)
             self.online = OnlineBatches(blocks, buffer, data_type, drawn, first)
+        self._shared: SharedBatches | None = None
+        if generates and group.size > 1:
+            self._shared = SharedBatches(group, self.online, source.fields if source else ())
 
     def _split(self, replay: bool) -> dict[str, Subset]:
         share = self._config.validation_split
         if not share:
             return {}
-        if self.source is not None and not replay:
+        if self._has_source and not replay:
             raise ConfigError(
                 "DatasetConfig.validation_split holds back stored samples, but environments "
                 'generate these. Generate the samples first, or others in the mode "validation".'
@@ -153,10 +161,12 @@ class TrainingData:
             names: Fields of the batches that are read from the dataset.
         """
         self._names = names
-        self._uses_source = self.source is not None and (epoch_id == 0 or self._always)
+        self._uses_source = self._has_source and (epoch_id == 0 or self._always)
         if self._uses_source and self.online is not None and self._ahead:
             self.online.expect(self._batch_nb or 0)
         if not self._uses_source and self._reader is None:
+            if self._shared is not None:
+                self._shared.finish(self.dataset)
             part = self.parts.get("training")
             batches = part.batches if part else partial(self.dataset.batches, self._mode)
             self._reader = batches(
@@ -171,7 +181,12 @@ class TrainingData:
         return self._batch_nb or -(-self._samples // self._batch_size)
 
     def next_batch(self) -> Batch:
-        """Return the next batch in physical units; generated ones are stored already."""
+        """Return the next batch in physical units; generated ones are stored already.
+
+        In a group of processes each gets its share of a generated batch, whose `weight` is known.
+        """
+        if self._uses_source and self._shared is not None:
+            return self._shared.next(self._names)
         if self._uses_source and self.online is not None:
             return self.online.next(self._names)
         if self._uses_source and self.source is not None and self._stored is not None:
@@ -202,6 +217,11 @@ class TrainingData:
             self.next_batch()
 
     @property
+    def weight(self) -> float | None:
+        """Weight of the last batch if it is this process's share of one; None: it is a whole."""
+        return self._shared.weight if self._shared is not None and self._uses_source else None
+
+    @property
     def produces(self) -> bool:
         """Whether environments generate new samples in the current epoch."""
         return self._uses_source and self._stored is None
@@ -225,6 +245,8 @@ class TrainingData:
     @property
     def fields(self) -> Mapping[str, Field]:
         """The stored fields by name; those of the environments until something is stored."""
+        if self._shared is not None:
+            return self._shared.block.fields
         if self.online is not None and self.online.number:
             return self.online.block.fields
         if self.source is not None and not self._count(self._mode):
@@ -234,6 +256,8 @@ class TrainingData:
     def normalization(self) -> dict[str, Normalization]:
         """Return the normalization by field; empty if nothing is to be normalized."""
         self._changed = False
+        if self.produces and self._shared is not None:
+            return self._shared.block.normalization
         if self.produces and self.online is not None and self.online.number:
             return self.online.block.normalization
         if not self._config.normalize or not self._count(self._mode):
