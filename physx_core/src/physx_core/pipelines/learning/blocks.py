@@ -69,6 +69,11 @@ class Blocks:
         if feeder is not None:
             feeder.start(lambda count: self._make(count, copies=True), source.cancel)
 
+    @property
+    def waited(self) -> float | None:
+        """Time in s for which the environments waited; None: whenever the network learns."""
+        return None if self._feeder is None else self._feeder.waited
+
     def expect(self, counts: Iterable[int]) -> None:
         """Announce the sizes of the blocks that will be taken after those announced before."""
         if self._feeder is not None:

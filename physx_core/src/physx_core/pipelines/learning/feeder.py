@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -60,6 +61,9 @@ class Feeder(Generic[T]):
     with `calling` or `telling`: the feeder's thread then has it called there, when the training
     waits for the next item. Items and these calls keep their order: when a call is made, all items
     made before it were taken, and the training is done with them.
+
+    Attributes:
+        waited: Time in s for which nothing was made because there was no room for it.
     """
 
     def __init__(self) -> None:
@@ -69,6 +73,7 @@ class Feeder(Generic[T]):
         self._counts: deque[int] = deque()
         self._taken = self._expected = 0
         self._items = self._nbytes = 0  # that wait to be taken
+        self.waited = 0.0
         self._closes = False
         self._thread: threading.Thread | None = None
 
@@ -180,7 +185,10 @@ class Feeder(Generic[T]):
         try:
             while True:
                 with self._changed:
-                    self._wait_until(lambda: self._counts and self._has_room())
+                    self._wait_until(lambda: self._counts)
+                    began = time.monotonic()
+                    self._wait_until(self._has_room)
+                    self.waited += time.monotonic() - began
                     count = self._counts.popleft()
                 item = self._make(count)
                 with self._changed:

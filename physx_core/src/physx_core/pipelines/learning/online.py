@@ -65,7 +65,7 @@ class OnlineBatches:
         count = buffer.needed(number) - self._arrived
         with self._meter.waiting():
             block = self.block = self._blocks.next(count)
-        self._meter.count(count)
+        self._meter.count(count, self._blocks.waited)
         self._arrived += count
         self.number += 1
         if not buffer.capacity:
@@ -143,8 +143,9 @@ class OnlineBatches:
 
         ``online/rows_kept`` and ``online/mean_age`` of the buffer, the age in rows that came since;
         ``online/views``, how many times a row was used on average; and of the time since the last
-        call: ``online/rows_per_s``, ``online/batches_per_s``, and ``online/learner_waits``, the
-        share of it in which the learner waited for rows.
+        call: ``online/rows_per_s``, ``online/batches_per_s``, and the shares of it in which the
+        network waited for rows, ``online/network_waits``, and the environments for the network,
+        ``online/environments_wait``.
         """
         rates = self._meter.read_recent()
         if not rates or not self._buffer.capacity:
@@ -164,8 +165,8 @@ class OnlineBatches:
             yield (
                 f"while environments generated: {total['online/rows_per_s']:.4g} rows/s, "
                 f"{total['online/batches_per_s']:.4g} batches/s, each row used {self._views:.2f} "
-                f"times on average; the learner waited {100 * total['online/learner_waits']:.0f} % "
-                "of the time"
+                f"times on average; the network waited {100 * total['online/network_waits']:.0f} % "
+                f"of the time, the environments {100 * total['online/environments_wait']:.0f} %"
             )
 
     def _allocate(self, fields: Mapping[str, Field], names: Sequence[str]) -> RowStore:
@@ -182,28 +183,37 @@ class _State(NamedTuple):
     rows: int
     batches: int
     waited: float
+    held_back: float
 
 
 class _Meter:
-    """Rates of a run, and how long its learner waited for rows."""
+    """Rates of a run, and how long both sides waited."""
 
     def __init__(self) -> None:
-        self._first = self._last = self._now = _State(time.monotonic(), 0, 0, 0.0)
+        self._first = self._last = self._now = _State(time.monotonic(), 0, 0, 0.0, 0.0)
 
     @contextlib.contextmanager
     def waiting(self) -> Iterator[None]:
         """Count the time of the body as waiting."""
         began = time.monotonic()
         if not self._now.batches:
-            self._first = self._last = _State(began, 0, 0, 0.0)
+            self._first = self._last = _State(began, 0, 0, 0.0, 0.0)
         yield
         ended = time.monotonic()
         self._now = self._now._replace(time=ended, waited=self._now.waited + ended - began)
 
-    def count(self, rows: int) -> None:
-        """Count a batch, and the rows that arrived for it."""
+    def count(self, rows: int, held_back: float | None) -> None:
+        """Count a batch.
+
+        Args:
+            rows: Number of rows that arrived for it.
+            held_back: Time in s for which the environments have waited so far; None: whenever the
+                network did not.
+        """
         now = self._now
-        self._now = now._replace(rows=now.rows + rows, batches=now.batches + 1)
+        if held_back is None:
+            held_back = now.time - self._first.time - now.waited
+        self._now = now._replace(rows=now.rows + rows, batches=now.batches + 1, held_back=held_back)
 
     def read_recent(self) -> dict[str, float]:
         """Return the rates since the last call; empty if that was less than a second ago."""
@@ -219,5 +229,6 @@ class _Meter:
         return {
             "online/rows_per_s": (now.rows - before.rows) / seconds,
             "online/batches_per_s": (now.batches - before.batches) / seconds,
-            "online/learner_waits": (now.waited - before.waited) / seconds,
+            "online/network_waits": (now.waited - before.waited) / seconds,
+            "online/environments_wait": (now.held_back - before.held_back) / seconds,
         }

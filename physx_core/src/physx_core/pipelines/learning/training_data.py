@@ -116,6 +116,7 @@ class TrainingData:
         self.parts = self._split(replay)
         self._stored: StoredRows | None = None
         self.online: OnlineBatches | None = None
+        self._shared: SharedBatches | None = None
         self._names: Sequence[str] = ()
         if source is not None and replay:
             self._stored = self._stored_rows(source)
@@ -123,7 +124,6 @@ class TrainingData:
             blocks = Blocks(source, dataset, self._mode, normalize=config.normalize, feeder=feeder)
             first = self._count(self._mode)
             self.online = OnlineBatches(blocks, buffer, data_type, drawn, first)
-        self._shared: SharedBatches | None = None
         if generates and group.size > 1:
             self._shared = SharedBatches(group, self.online, source.fields if source else ())
 
