@@ -17,7 +17,13 @@ WARNINGS = ("-Wall", "-Wextra", "-Werror", "-pedantic")
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g")
 
 
-def compiler(name):
+@pytest.fixture(scope="session")
+def compiler():
+    """Return a function that skips the test where a compiler is missing, but not in CI."""
+    return _compiler
+
+
+def _compiler(name):
     """Return a compiler; the test is skipped where it is missing, but not in CI."""
     if shutil.which(name) is None and os.environ.get("CI") != "true":
         pytest.skip(f"the compiler {name} is not installed")
@@ -36,7 +42,7 @@ def build(tmp_path_factory):
         if using == "gfortran":
             inputs = [INCLUDE / "physx.f90", INCLUDE / "physx_fortran.c", *inputs]
             flags = (*flags, "-J", str(folder))
-        command = [compiler(using), "-O2", *flags, f"-I{INCLUDE}", *map(str, inputs)]
+        command = [_compiler(using), "-O2", *flags, f"-I{INCLUDE}", *map(str, inputs)]
         done = subprocess.run([*command, "-o", str(program)], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         return str(program)

@@ -57,7 +57,7 @@ class ExternalProgram(Environment):
         if own := self._own_parameters().keys() & self._fixed.keys():
             raise ConfigError(f"The parameters {listed(own)} are given by physx: choose others.")
         self._process: ProgramProcess | None = None
-        self._declared: list[Field] = []
+        self._declared: Sequence[Field] = ()
         self._seed: int | None = None
         self._is_new = True  # whether the episode has no sample yet
 
@@ -106,7 +106,7 @@ class ExternalProgram(Environment):
         if process is not None:
             process.close()
 
-    def _start(self) -> tuple[ProgramProcess, list[Field]]:
+    def _start(self) -> tuple[ProgramProcess, Sequence[Field]]:
         """Start the program; return it and the fields that it declares."""
         variables = {"PHYSX_INSTANCE": str(self.instance_id)}
         process = ProgramProcess(self._command, variables, self._timeout)

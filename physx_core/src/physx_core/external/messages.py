@@ -8,13 +8,13 @@ but headers.
 from __future__ import annotations
 
 import enum
+import functools
 import math
 import struct
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from physx_core.errors import ConfigError
 from physx_core.fields import RESERVED, Field
 from physx_core.typing import Array, Sample
 
@@ -81,7 +81,7 @@ class Message(NamedTuple):
 
     kind: Kind
     given: Sample
-    wanted: list[Field]
+    wanted: tuple[Field, ...]
 
 
 def parse_header(data: bytes | bytearray) -> Header:
@@ -106,7 +106,8 @@ def parse_header(data: bytes | bytearray) -> Header:
     return Header(Kind(kind), count, size)
 
 
-def parse_descriptions(header: Header, data: bytes | bytearray) -> tuple[list[Field], list[Field]]:
+@functools.lru_cache(maxsize=16)  # all samples of a program have the same
+def parse_descriptions(header: Header, data: bytes) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
     """Return the arrays whose data follow, and those that are wanted.
 
     Raises:
@@ -128,12 +129,16 @@ def parse_descriptions(header: Header, data: bytes | bytearray) -> tuple[list[Fi
             f"described arrays of {size} bytes, but announced {header.size}, or wants more than "
             f"{_LARGEST}."
         )
-    return given, wanted
+    return tuple(given), tuple(wanted)
 
 
 def _parse_description(parts: tuple[Any, ...], may_be_open: bool) -> Field:
     raw, number, rank, _, *shape = parts
     name = raw.partition(b"\0")[0].decode("ascii", errors="replace")
+    if not name.isidentifier() or name in RESERVED:
+        raise MalformedMessageError(
+            f"named an array {name!r}, which is no identifier, or a name that physx uses itself."
+        )
     if number not in _TYPES:
         raise MalformedMessageError(f'gave the array "{name}" the unknown type {number}.')
     if not (0 <= rank <= _MOST_AXES or (rank == _OPEN and may_be_open)):
@@ -142,12 +147,7 @@ def _parse_description(parts: tuple[Any, ...], may_be_open: bool) -> Field:
     dtype = _TYPES[number]
     if axes and not (min(axes) >= 0 and math.prod(axes) * dtype.itemsize <= _LARGEST):
         raise MalformedMessageError(f'gave the array "{name}" the shape {axes}.')
-    if name in RESERVED:
-        raise MalformedMessageError(f'named an array "{name}", a name that physx uses itself.')
-    try:
-        return Field(name, axes, dtype)
-    except ConfigError as error:
-        raise MalformedMessageError(f"named an array {name!r}. {error}") from None
+    return Field(name, axes, dtype)
 
 
 def check_values(field: Field, values: Array) -> None:

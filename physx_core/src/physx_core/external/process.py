@@ -28,7 +28,6 @@ from physx_core.external.messages import (
 from physx_core.processes import ChildProcess, OutputTail, TemporaryFolder, describe_exit
 from physx_core.typing import Array
 
-Buffer = TypeVar("Buffer", bytearray, memoryview)
 Result = TypeVar("Result")
 
 _TICK = 0.1  # s between looks at whether a silent program still runs
@@ -78,14 +77,15 @@ class ProgramProcess(Closeable):
         """
         try:
             header = parse_header(self._read(bytearray(HEADER.size)))
-            described = self._read(bytearray(header.arrays * DESCRIPTION.size))
-            given, wanted = parse_descriptions(header, described)
+            place = header.arrays * DESCRIPTION.size
+            content = self._read(bytearray(place + header.size))
+            given, wanted = parse_descriptions(header, bytes(content[:place]))
             values = {}
             for field in given:
-                array = values[field.name] = np.empty(field.shape or (), field.numpy_dtype)
-                if array.size:
-                    self._read(array.reshape(-1).view(np.uint8).data)
-                check_values(field, array)
+                shape = field.shape or ()
+                values[field.name] = np.ndarray(shape, field.numpy_dtype, content, place)
+                check_values(field, values[field.name])
+                place += field.nbytes
         except MalformedMessageError as error:
             raise self.error(str(error)) from None
         return Message(header.kind, values, wanted)
@@ -164,7 +164,7 @@ class ProgramProcess(Closeable):
             self._connection, _ = self._attempt(listener.accept)
             self._connection.settimeout(_TICK)
 
-    def _read(self, into: Buffer) -> Buffer:
+    def _read(self, into: bytearray) -> bytearray:
         """Fill a buffer with what the program sends."""
         rest = memoryview(into)
         while rest:
