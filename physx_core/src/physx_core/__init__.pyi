@@ -10,6 +10,8 @@ from .components import Launcher as Launcher
 from .components import Network as Network
 from .components import Observer as Observer
 from .components import Optimization as Optimization
+from .components import Parameter as Parameter
+from .components import Sampler as Sampler
 from .components import Transformation as Transformation
 from .components import Visualizer as Visualizer
 from .config import DatasetConfig as DatasetConfig

@@ -15,6 +15,7 @@ from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, deriv
 from physx_core.pipelines.run_description import (
     describe_dataset,
     describe_environment_config,
+    describe_failed_sets,
     describe_samples,
 )
 from physx_core.pipelines.storage import describe_environment, open_own, record_rejected
@@ -148,6 +149,7 @@ class DataGeneration(NewSessionPipeline):
         rate = count * self.batch_size / duration
         yield f"{count} of {self.batch_nb} batches in {duration:.2f} s, {rate:.0f} samples/s"
         yield describe_samples(self.dataset.directory)
+        yield from describe_failed_sets(self.source)
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         path = shlex.quote(str(self.session.path))

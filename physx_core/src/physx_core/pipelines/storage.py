@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from physx_core import files
-from physx_core.config import WRONG, DatasetConfig, EnvironmentConfig, to_plain
+from physx_core.config import SETS, WRONG, DatasetConfig, EnvironmentConfig, to_plain
 from physx_core.dataset import Dataset
 from physx_core.dataset.store.locks import LOCK
 from physx_core.dataset.store.manifest_file import FILE
@@ -191,10 +191,13 @@ def is_copy(directory: Path) -> bool:
 
 @contextlib.contextmanager
 def record_rejected(source: Source, dataset: Dataset | None) -> Iterator[None]:
-    """Store the samples that `check_sample` rejects during the body, in the mode "wrong".
+    """Store what a source makes beside the rows of a batch.
 
-    They are stored after the body's batch, also if too many of them end the run. If the batch
-    fails for another reason, they are not stored either.
+    These are the samples that `check_sample` rejects during the body, in the mode "wrong", and the
+    sets of parameters that begin in its batch, in the mode "parameters". They are stored after the
+    body's batch. The rejected samples are stored also if too many of them end the run, and sets
+    with which a simulation failed also if that ends it. If the batch fails for another reason, they
+    are not stored either.
 
     Args:
         source: Generates the batch.
@@ -202,10 +205,15 @@ def record_rejected(source: Source, dataset: Dataset | None) -> Iterator[None]:
     """
     try:
         yield
-    except WrongSamplesError:
-        _store_rejected(source, dataset)
+    except PhysxError as error:
+        if isinstance(error, WrongSamplesError):
+            _store_rejected(source, dataset)
+        source.sets.note_failed()
+        with contextlib.suppress(PhysxError):  # the run's own error matters more
+            _store_sets(source, dataset)
         raise
     _store_rejected(source, dataset)
+    _store_sets(source, dataset)
 
 
 def _store_rejected(source: Source, dataset: Dataset | None) -> None:
@@ -213,6 +221,19 @@ def _store_rejected(source: Source, dataset: Dataset | None) -> None:
     if rows and dataset is not None:
         dataset.define_fields(WRONG, source.fields)
         dataset.append(WRONG, rows, checked=True)
+
+
+def _store_sets(source: Source, dataset: Dataset | None) -> None:
+    sets, failed = source.sets.pop()
+    if dataset is None or not (sets or failed):
+        return
+    dataset.define_fields(SETS, source.sets.fields)
+    if sets:
+        dataset.append(SETS, sets)
+    if failed:
+        first = dataset.num_samples(SETS) - source.sets.count
+        index = [first + place for place in failed]
+        dataset.update(SETS, index, {"failed": [True] * len(index)})
 
 
 def describe_environment(config: EnvironmentConfig, seed: int) -> dict[str, Any]:
@@ -226,6 +247,7 @@ def describe_environment(config: EnvironmentConfig, seed: int) -> dict[str, Any]
         "env_kwargs": plain["env_kwargs"],
         "num_clients": config.num_clients,
         "simulations_per_step": config.simulations_per_step,
+        **{name: plain[name] for name in ("sampler", "sampler_kwargs") if plain.get(name)},
         "seed": seed,
         "versions": installed_versions(),
     }

@@ -41,7 +41,11 @@ from physx_core.pipelines.learning.resuming import (
 from physx_core.pipelines.learning.training_data import TrainingData
 from physx_core.pipelines.learning.training_record import BestEpoch, TrainingRecord
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
-from physx_core.pipelines.run_description import describe_samples, describe_training
+from physx_core.pipelines.run_description import (
+    describe_failed_sets,
+    describe_samples,
+    describe_training,
+)
 from physx_core.pipelines.storage import (
     check_sources,
     copy_existing,
@@ -524,6 +528,7 @@ class Training(NewSessionPipeline):
     def _plan(self) -> Iterable[str]:
         if self.data.dataset.modes:
             yield describe_samples(self.data.dataset.directory)
+            yield from describe_failed_sets(self.data.source)
         if self.group.size > 1:
             total, each, count = self.batch_size * self.group.size, self.batch_size, self.group.size
             yield f"batches of {total} samples, {each} in each of {count} processes"

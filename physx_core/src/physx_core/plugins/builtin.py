@@ -29,3 +29,15 @@ def physx_buffers() -> Components:
 def physx_transformations() -> Components:
     """Return the transformation of networks that name none."""
     return {"identity": "physx_core.components.transformation:Transformation"}
+
+
+@hookimpl
+def physx_samplers() -> Components:
+    """Return the samplers, which are imported when a run uses them."""
+    return {
+        "uniform": "physx_core.samplers.uniform:Uniform",
+        "sobol": "physx_core.samplers.sequences:Sobol",
+        "latin_hypercube": "physx_core.samplers.sequences:LatinHypercube",
+        "grid": "physx_core.samplers.grid:Grid",
+        "table": "physx_core.samplers.table:Table",
+    }

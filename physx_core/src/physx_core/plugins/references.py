@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         Launcher,
         Network,
         Optimization,
+        Sampler,
         Transformation,
         Visualizer,
     )
@@ -59,6 +60,8 @@ def resolve(kind: Literal["launcher"], reference: Any) -> Callable[..., Launcher
 @overload
 def resolve(kind: Literal["buffer"], reference: Any) -> Callable[..., Buffer]: ...
 @overload
+def resolve(kind: Literal["sampler"], reference: Any) -> Callable[..., Sampler]: ...
+@overload
 def resolve(kind: Literal["backend"], reference: Any) -> Backend: ...
 @overload
 def resolve(kind: str, reference: Any) -> Any: ...
@@ -69,7 +72,7 @@ def resolve(kind: str, reference: Any) -> Any:
 
     Args:
         kind: ``environment``, ``network``, ``optimization``, ``transformation``, ``visualizer``,
-            ``backend``, ``launcher`` or ``buffer``.
+            ``backend``, ``launcher``, ``buffer`` or ``sampler``.
         reference: ``"plugin/name"``; ``"plugin"`` where it has just one of the kind;
             ``"package.module:Class"``; ``"script.py:Class"``; or the class itself.
 

@@ -21,6 +21,7 @@ from physx_core.net.values import encode
 from physx_core.rows import ROW_FIELDS, concatenate
 from physx_core.sources.source import Source, check_stored
 from physx_core.typing import Batch
+from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.row_codec import row_bytes
 from physx_core.workers.server.client_group import ClientGroup
 
@@ -64,7 +65,8 @@ class ClientSource(Source):
             accept_all: Whether samples that `check_sample` rejects count like the others.
         """
         self.instance_nb = config.num_clients
-        self._group = ClientGroup(config, services, seed, accept_all=accept_all)
+        self.sets = ParameterSets(config, seed)
+        self._group = ClientGroup(config, services, seed, self.sets, accept_all=accept_all)
         self._rejections = 0
         if config.record_wrong_samples:
             self._rejections = config.max_wrong_samples_per_step + 1
@@ -94,6 +96,8 @@ class ClientSource(Source):
             first = self._group.peer(1).fields
             for number in range(2, self.instance_nb + 1):
                 self._agree(number, first, self._group.peer(number).fields)
+            peers = map(self._group.peer, range(1, self.instance_nb + 1))
+            self.sets.begin([peer.parameters for peer in peers])
         except BaseException:
             self._failed = True
             raise
@@ -132,7 +136,9 @@ class ClientSource(Source):
         except BaseException:
             self._failed = True
             raise
-        return {name: array[:size] for name, array in self._out.items()}
+        rows = {name: array[:size] for name, array in self._out.items()}
+        self.sets.note(rows)
+        return rows
 
     def apply(self, prediction: Batch, *, at_once: bool = True) -> None:
         """Pass predictions to the instances: see `Source.apply`.
@@ -269,6 +275,8 @@ class ClientSource(Source):
             earlier = [number for number in owing if self._next_row(number) < row]
             if not (earlier and self._rejections and isinstance(failed[row], WrongSamplesError)):
                 self._failed_row = row
+                number = row % self.instance_nb + 1
+                self.sets.fail(number, self._group.peer(number).episode, failed[row])
                 raise failed[row]
             return earlier  # rows rejected before it are needed too
         return owing

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Sequence
+from functools import partial
 
 from physx_core.components.environment import Services
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import UsageError
+from physx_core.errors import PhysxError, UsageError
 from physx_core.fields import Field
 from physx_core.rows import ROW_FIELDS, RowBuffer, concatenate, copy_row, infer_shapes
 from physx_core.sources.source import Source, check_stored
-from physx_core.typing import Batch
+from physx_core.typing import Batch, Sample
 from physx_core.workers.instance import Instance, instance_arguments
+from physx_core.workers.parameter_sets import ParameterSets, next_step
+
+_LOG = logging.getLogger("physx")
 
 
 class LocalSource(Source):
@@ -37,13 +42,16 @@ class LocalSource(Source):
         self.instance_nb = config.num_clients
         self._services = services
         self._config = config
-        self._instances = [
-            Instance(**instance_arguments(config, number, seed, accept_all))
+        self._arguments = [
+            instance_arguments(config, number, seed, accept_all)
             for number in range(1, self.instance_nb + 1)
         ]
+        self.sets = ParameterSets(config, seed)
+        self._instances = [Instance(**arguments) for arguments in self._arguments]
         self._buffer: RowBuffer | None = None
         self._next = 0
         self._last = range(0)
+        self._last_steps = [-1] * self.instance_nb
 
     @property
     def fields(self) -> list[Field]:
@@ -56,7 +64,8 @@ class LocalSource(Source):
     def open(self) -> None:
         """Create the instances' environments: see `Source.open`."""
         for instance in self._instances:
-            instance.open(self._services, draw=self._config.visualizer is not None)
+            self._open(instance)
+        self.sets.begin([instance.parameters for instance in self._instances])
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:
         """Return the next rows: see `Source.batch`."""
@@ -69,18 +78,60 @@ class LocalSource(Source):
             buffer.clear()
             if buffer.capacity < size:
                 buffer = self._buffer = RowBuffer(buffer.fields[: -len(ROW_FIELDS)], size)
-        instances, count = self._instances, self.instance_nb
+        count = self.instance_nb
         self._last = range(self._next, self._next + size)
         for row in range(size):
-            instance = instances[self._next % count]
-            sample = instance.step(None if stored is None else copy_row(stored, row))
-            if buffer is None:
-                buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
-            buffer.put(sample, instance.instance_id, instance.last_episode, instance.last_step)
+            place = self._next % count
+            while True:
+                given = None if stored is None else copy_row(stored, row)
+                try:
+                    self._make_row(self._instances[place], given, size)
+                    break
+                except PhysxError as error:
+                    self._redraw(place, error)
             self._next += 1
+        buffer = self._buffer
         if buffer is None:
             raise UsageError(f"A batch must have at least one row, not {size}.")
-        return buffer.take()
+        rows = buffer.take()
+        self.sets.note(rows)
+        return rows
+
+    def _open(self, instance: Instance) -> None:
+        draw = self._config.visualizer is not None
+        instance.open(self._services, draw, partial(self.sets.choose, instance.instance_id))
+
+    def _make_row(self, instance: Instance, stored: Sample | None, size: int) -> None:
+        sample = instance.step(stored)
+        if self._buffer is None:
+            self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
+        self._buffer.put(
+            sample,
+            instance.instance_id,
+            instance.last_episode,
+            instance.last_step,
+            finite=self._config.redraw > 0,
+        )
+        self._last_steps[instance.instance_id - 1] = instance.last_step
+
+    def _redraw(self, place: int, error: PhysxError) -> None:
+        """Continue with an instance's next parameters, or raise the error of its simulation."""
+        former = self._instances[place]
+        episode = -1 if former.environment is None else former.environment.episode_index
+        if not self.sets.can_redraw(place + 1, error):
+            self.sets.fail(place + 1, episode, error)
+            raise error
+        text = str(error).partition("\n")[0].rstrip(".")
+        _LOG.warning("%s. %s", text, self.sets.redraw(place + 1, episode, error))
+        with contextlib.suppress(PhysxError):
+            former.close()
+        instance = self._instances[place] = Instance(
+            **self._arguments[place],
+            first_step=next_step(self._last_steps[place], error),
+            first_episode=episode + 1,
+        )
+        instance.rejected = former.rejected
+        self._open(instance)
 
     def pop_rejected(self) -> Batch:
         """Return the rejected samples: see `Source.pop_rejected`."""

@@ -10,6 +10,7 @@ from typing import Self
 from physx_core.errors import PhysxError, UsageError
 from physx_core.fields import Field
 from physx_core.typing import Batch
+from physx_core.workers.parameter_sets import ParameterSets
 
 
 class Source(ABC):
@@ -21,9 +22,12 @@ class Source(ABC):
 
     Attributes:
         instance_nb: Number of instances.
+        sets: The sets of parameters that the instances are given; those whose first rows are in the
+            last batch can be taken from it.
     """
 
     instance_nb: int
+    sets: ParameterSets
     _is_canceled = False
 
     @property

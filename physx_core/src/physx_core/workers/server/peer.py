@@ -5,16 +5,36 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
+from typing import NamedTuple
 
+from physx_core.components.parameter import Parameter
 from physx_core.errors import PhysxError
 from physx_core.fields import Field
 from physx_core.net.connection import Connection
-from physx_core.net.frames import FrameReader
+from physx_core.net.frames import FrameReader, Kind, pack
 from physx_core.net.handshake import HANDSHAKE_LIMIT
 from physx_core.workers.row_codec import RejectedRows, RowQueue
 from physx_core.workers.server.journal import Journal
 
 _PIECE = 1 << 16
+
+
+class Origin(NamedTuple):
+    """Where the clients of an instance begin: how much others had sent before.
+
+    Attributes:
+        rows: Number of rows.
+        rejected: Number of rejected rows.
+        shown: Number of messages with drawing events.
+        step: Number of the first step.
+        episode: Number of the first episode; None: that of the environment.
+    """
+
+    rows: int = 0
+    rejected: int = 0
+    shown: int = 0
+    step: int = 0
+    episode: int | None = None
 
 
 class Peer(Connection):
@@ -42,6 +62,10 @@ class Peer(Connection):
         requests: How many requests it sent.
         shown: How many messages with drawing events arrived in all.
         journal: Messages for a client that takes its place; None if none can.
+        parameters: The parameters that its environment defines.
+        episode: Last episode that it was given parameters for; -1: none.
+        origin: Where a client that takes its place begins.
+        slow_until: Episode before which that client sends each row at once.
     """
 
     reader: FrameReader
@@ -68,6 +92,10 @@ class Peer(Connection):
         self.has_vanished = self.finished = self.vacant = self.has_told_fields = False
         self.requests = self.shown = 0
         self.journal: Journal | None = None
+        self.parameters: list[Parameter] = []
+        self.episode = -1
+        self.origin = Origin()
+        self.slow_until = 0
         self._arrived = 0  # of a long frame, when the peer was last heard of
         self._next_order: int | None = None  # of the journal's, for this client; None: it had all
 
@@ -96,7 +124,21 @@ class Peer(Connection):
         self.rejected, self.rejected_limit = former.rejected, former.rejected_limit
         self.row_fields, self.last_step = former.row_fields, former.last_step
         self.shown, self.journal = former.shown, former.journal
+        self.episode, self.origin = former.episode, former.origin
+        self.slow_until = former.slow_until
         self._next_order = None if self.journal is None else 0
+
+    def move_origin(self, step: int) -> None:
+        """Have a client that takes its place begin with the next episode, at the next row.
+
+        Args:
+            step: Number of its first step.
+        """
+        self.origin = Origin(self.received, self.rejected.count, self.shown, step, self.episode + 1)
+        if self.journal is not None:
+            self.journal.close()
+            self.journal = Journal()
+            self.journal.record(pack(Kind.CREDIT, number=self.granted))
 
     def hear(self, *, whole: bool) -> None:
         """Note a sign of life: a whole frame, or a good piece of a long one.

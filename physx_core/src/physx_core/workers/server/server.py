@@ -24,12 +24,13 @@ from physx_core.net.strangers import Handshakes
 from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.peer import Peer
-from physx_core.workers.server.service_requests import ServiceRequests
+from physx_core.workers.server.service_requests import Choose, ServiceRequests
 from physx_core.workers.server.validation import (
     check_environment_fields,
     check_row_fields,
     check_rows,
     parse_fields,
+    parse_parameters,
 )
 
 _HANDSHAKE_TIME = 5.0
@@ -37,6 +38,7 @@ _SPIN_TIME = 5e-5  # for the next requests of clients that were just answered
 _MAX_STRANGERS = 128
 _TURNS = 64
 _LONG = 1 << 16
+_REQUESTS = (Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW, Kind.CHOOSE)
 
 
 class Server:
@@ -55,6 +57,7 @@ class Server:
         services: Services,
         setup: Callable[[Peer], bytes],
         token: str,
+        choose: Choose,
         replaces: Callable[[int, PhysxError | None], bool] = lambda number, error: False,
     ) -> None:
         """Keep the arguments; `open` starts to listen.
@@ -66,6 +69,7 @@ class Server:
             services: The services of the run, for the environments.
             setup: Returns the payload that tells an instance's client what to run.
             token: Secret of the run.
+            choose: Chooses the parameters of an instance's episode.
             replaces: Whether another client takes the place of one that failed with an error, or
                 left without one.
         """
@@ -73,7 +77,7 @@ class Server:
         self.token = token
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
         self._spin_time = _SPIN_TIME if has_core_for_each(instance_nb) else 0.0
-        self._requests = ServiceRequests(services)
+        self._requests = ServiceRequests(services, choose)
         self._setup, self._replaces = setup, replaces
         self._ending = self._has_news = False
         self._listener = Listener[Peer](self._meet, self._give_up)
@@ -81,6 +85,7 @@ class Server:
             token, _HANDSHAKE_TIME, _MAX_STRANGERS, self._drop, self._listener.timers
         )
         self._dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
+            Kind.PARAMETERS: _take_parameters,
             Kind.READY: _take_ready,
             Kind.FIELDS: _take_fields,
             Kind.ROWS: _take_rows,
@@ -88,7 +93,7 @@ class Server:
             Kind.ERROR: _take_error,
             Kind.BYE: self._take_bye,
             Kind.AGAIN: _take_again,
-            **dict.fromkeys((Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW), self._requests.take),
+            **dict.fromkeys(_REQUESTS, self._requests.take),
         }
 
     def open(self) -> None:
@@ -296,6 +301,12 @@ class Server:
             raise ConnectionRefusedByPeerError("It reported its end, but nobody ended the run.")
         peer.finished = peer.failure is None
         self._drop(peer)  # for which it waits
+
+
+def _take_parameters(peer: Peer, frame: Frame) -> None:
+    if peer.fields or peer.parameters:
+        raise ConnectionRefusedByPeerError("It defined its parameters twice, or too late.")
+    peer.parameters = parse_parameters(frame.payload)
 
 
 def _take_ready(peer: Peer, frame: Frame) -> None:

@@ -14,12 +14,14 @@ from physx_core.net.remote_errors import encode_error
 from physx_core.net.values import pack_value
 from physx_core.typing import Batch, Sample
 from physx_core.workers.server.peer import Peer
-from physx_core.workers.server.validation import parse_events, parse_values
+from physx_core.workers.server.validation import parse_episode, parse_events, parse_values
 
 _MOST_UNREAD = 1 << 26
 _KEPT = "the kept parameters"
 
 Signature: TypeAlias = tuple[tuple[str, tuple[int, ...], str], ...]
+Choose: TypeAlias = Callable[[int, int], dict[str, Any]]
+"""Returns the parameters for an instance's episode, by name."""
 Request: TypeAlias = tuple[Peer, int, Sample]
 """A request for a prediction: the client, the number of the request, and the sample."""
 
@@ -38,13 +40,15 @@ class ServiceRequests:
         batches: Whether requests for predictions are answered as one batch.
     """
 
-    def __init__(self, services: Services) -> None:
+    def __init__(self, services: Services, choose: Choose) -> None:
         """Keep the services.
 
         Args:
             services: The services of the run.
+            choose: Chooses the parameters of an instance's episode.
         """
         self._services = services
+        self._choose = choose
         self._predict_batch: Callable[[Batch], Batch] | None = getattr(
             services, "predict_batch", None
         )
@@ -86,10 +90,19 @@ class ServiceRequests:
         elif frame.kind is Kind.LOAD:
             load = self._services.load_parameters
             self._answer(peer, frame.number, _KEPT, load, peer.instance_id)
+        elif frame.kind is Kind.CHOOSE:
+            self._answer_choice(peer, frame)
         else:
             events = parse_events(frame.payload)
             peer.shown += 1
             self._services.show(peer.instance_id, frame.number, events)
+
+    def _answer_choice(self, peer: Peer, frame: Frame) -> None:
+        if not peer.parameters:
+            raise ConnectionRefusedByPeerError("It asked for parameters, but defined none.")
+        episode = parse_episode(frame.payload, peer.episode)
+        self._answer(peer, frame.number, "the parameters", self._choose, peer.instance_id, episode)
+        peer.episode = episode
 
     def _keep(self, peer: Peer, frame: Frame) -> None:
         """Keep a request for `predict`; it replaces one that its environment abandoned."""

@@ -1,0 +1,92 @@
+"""Sampler: base class of what chooses the parameters of the next simulations."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from physx_core.components.parameter import Parameter, Point, random_of, values_at
+from physx_core.errors import ConfigError
+from physx_core.typing import Array
+
+
+class Sampler(ABC):
+    """Chooses sets of parameters; a plugin offers its own with the hook ``physx_samplers``.
+
+    The constructor takes the entries of `EnvironmentConfig.sampler_kwargs`; `begin` follows. Sets
+    are numbered from 0: set k is for episode ``k // instance_nb`` of instance ``k % instance_nb``
+    (from 0 here). They are asked for in any order, and a set is asked for again when a run is
+    continued, so what `ask` returns may depend only on the arguments of `begin`, on the set's
+    number, and on what was told.
+
+    Attributes:
+        learns: Whether it is told the losses of the samples that its sets led to.
+        parameters: The parameters to choose.
+        seed: Seed of the run.
+        size: Number of elements of all parameters.
+    """
+
+    learns: ClassVar[bool] = False
+    parameters: Sequence[Parameter]
+    seed: Sequence[int]
+    size: int
+
+    def begin(self, parameters: Sequence[Parameter], seed: Sequence[int]) -> None:
+        """Take the parameters that the environment defines.
+
+        Args:
+            parameters: The parameters.
+            seed: Seed of the run.
+
+        Raises:
+            ConfigError: If the sampler cannot choose them.
+        """
+        self.parameters, self.seed = list(parameters), list(seed)
+        self.size = sum(parameter.size for parameter in parameters)
+
+    @abstractmethod
+    def ask(self, number: int) -> Mapping[str, Any]:
+        """Return the values of a set by the parameters' names.
+
+        Args:
+            number: Number of the set, from 0.
+        """
+
+    def values(self, point: Point) -> dict[str, Any]:
+        """Return the parameters' values at a point of the unit cube.
+
+        A point that is uniform in the cube has values of the parameters' distributions.
+
+        Args:
+            point: Shape (size,), each from 0 to 1.
+        """
+        return values_at(self.parameters, point)
+
+    def random(self, number: int) -> np.random.Generator:
+        """Return random numbers that only the seed and the number of a set determine."""
+        return random_of(self.seed, number, 1)
+
+
+def checked(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that a sampler chose, after checking that they fit the parameters.
+
+    Raises:
+        ConfigError: If a value is missing, unknown, not finite, or of another shape or type.
+    """
+    names = [parameter.name for parameter in parameters]
+    if not isinstance(values, Mapping) or set(values) != set(names):
+        given = list(values) if isinstance(values, Mapping) else values
+        raise ConfigError(f"The sampler chose {given}, but the parameters are {names}.")
+    fitting: dict[str, Any] = {}
+    for parameter in parameters:
+        try:
+            array: Array = parameter.field.convert(values[parameter.name])
+        except Exception as error:
+            raise ConfigError(f"The sampler's choice does not fit: {error}") from error
+        if not np.isfinite(array).all():
+            raise ConfigError(f'The sampler chose "{parameter.name}" = {array}, not finite.')
+        fitting[parameter.name] = array if parameter.shape else array.item()
+    return fitting

@@ -1,0 +1,255 @@
+"""ParameterSets: the sets of parameters that a source's environments are given."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from physx_core.components.environment import options_of
+from physx_core.components.parameter import SET_FIELDS, Parameter
+from physx_core.components.sampler import Sampler, checked
+from physx_core.config import EnvironmentConfig
+from physx_core.errors import (
+    ClientError,
+    ConfigError,
+    EnvironmentFailedError,
+    FieldsMismatchError,
+    NotFiniteError,
+    PhysxError,
+    UnknownOptionError,
+    UsageError,
+    WrongSamplesError,
+)
+from physx_core.fields import Field
+from physx_core.plugins import resolve
+from physx_core.typing import Batch
+
+_DEFAULT = "physx/uniform"
+_OF_PARAMETERS = (EnvironmentFailedError, ClientError, NotFiniteError, WrongSamplesError)
+"""Failures of a simulation that its parameters may have caused."""
+
+
+class ParameterSets:
+    """Has a sampler choose sets, and keeps them until the rows of their episodes are stored.
+
+    Set k is for episode ``k // instance_nb`` of instance ``k % instance_nb + 1``.
+
+    Attributes:
+        parameters: The parameters that the environment defines.
+        failures: Number of each set whose simulation failed, and how.
+        count: Number of sets that were found to begin.
+    """
+
+    def __init__(self, config: EnvironmentConfig, seed: Sequence[int]) -> None:
+        """Create the sampler.
+
+        Args:
+            config: Names the sampler, the number of instances, and how many sets may fail.
+            seed: Seed of the run.
+        """
+        if config.redraw and config.load_samples:
+            raise ConfigError(
+                "EnvironmentConfig.redraw draws new parameters, but load_samples replays stored "
+                "samples: leave redraw out."
+            )
+        self.parameters: list[Parameter] = []
+        self.failures: dict[int, str] = {}
+        self.count = 0
+        self._config, self._seed = config, list(seed)
+        self._instance_nb = config.num_clients
+        self._sampler = _make_sampler(config)
+        self._redraws = [0] * self._instance_nb
+        self._waiting: list[dict[int, Mapping[str, Any]]] = [{} for _ in self._redraws]
+        self._stored: dict[int, int] = {}  # number of an instance's present set to its place
+        self._begun: list[dict[str, Any]] = []
+        self._failed: list[int] = []
+
+    def begin(self, definitions: Sequence[Sequence[Parameter]]) -> None:
+        """Take what the instances define.
+
+        Args:
+            definitions: The parameters of each instance.
+
+        Raises:
+            ConfigError: If there is a sampler but no parameter, or the sampler cannot choose them.
+            FieldsMismatchError: If the instances define different parameters.
+        """
+        first = list(definitions[0])
+        for number, other in enumerate(definitions[1:], 2):
+            if list(other) != first:
+                mine, theirs = ({p.name: p for p in one} for one in (first, other))
+                raise FieldsMismatchError(
+                    f"Instances 1 and {number} define different parameters",
+                    {
+                        name: f"{mine.get(name, 'not defined')} and "
+                        f"{theirs.get(name, 'not defined')}"
+                        for name in {**mine, **theirs}
+                        if mine.get(name) != theirs.get(name)
+                    }
+                    or {"order": f"{list(mine)} and {list(theirs)}"},
+                )
+        if not first and (self._config.sampler is not None or self._config.redraw):
+            option = "sampler" if self._config.sampler is not None else "redraw"
+            raise ConfigError(
+                f"EnvironmentConfig.{option} is set, but the environment defines no parameters: "
+                "call define_parameters() in its create() and implement reset_parameters(), or "
+                f"leave {option} out."
+            )
+        self.parameters = first
+        if first:
+            self._sampler.begin(first, self._seed)
+
+    @property
+    def fields(self) -> list[Field]:
+        """Fields of the record of the sets."""
+        return [*SET_FIELDS, *(parameter.field for parameter in self.parameters)]
+
+    def choose(self, instance_id: int, episode: int) -> dict[str, Any]:
+        """Return the values of the parameters for an episode of an instance.
+
+        Raises:
+            ConfigError: If the sampler fails, or what it chooses does not fit the parameters.
+        """
+        if not self.parameters:
+            raise UsageError("Parameters can be chosen once all instances have defined them.")
+        number = self._number(instance_id, episode)
+        values = self._ask(number)
+        self._waiting[instance_id - 1][number] = values
+        return dict(values)
+
+    def _ask(self, number: int) -> dict[str, Any]:
+        try:
+            return checked(self.parameters, self._sampler.ask(number))
+        except PhysxError:
+            raise
+        except Exception as error:
+            name = type(self._sampler).__name__
+            raise ConfigError(
+                f"The sampler {name} raised in ask({number}): {type(error).__name__}: {error}."
+            ) from error
+
+    def can_redraw(self, instance_id: int, error: PhysxError) -> bool:
+        """Return whether an instance may continue with its next set after a failure."""
+        return (
+            isinstance(error, _OF_PARAMETERS)
+            and bool(self._waiting[instance_id - 1])
+            and self._redraws[instance_id - 1] < self._config.redraw
+        )
+
+    def redraw(self, instance_id: int, episode: int, error: PhysxError) -> str:
+        """Note that the simulation of an episode failed, and that the next set takes its place.
+
+        Returns:
+            What happened, in a sentence.
+        """
+        self._redraws[instance_id - 1] += 1
+        self.fail(instance_id, episode, error)
+        number = self._number(instance_id, episode)
+        return (
+            f"The parameters were set {number} ({self._describe(number)}). The instance continues "
+            f"with its next set. Redraw {self._redraws[instance_id - 1]} of {self._config.redraw}."
+        )
+
+    def fail(self, instance_id: int, episode: int, error: PhysxError) -> None:
+        """Note that the simulation of an episode failed, if its parameters may be the reason."""
+        number = self._number(instance_id, episode)
+        if isinstance(error, _OF_PARAMETERS) and number in self._waiting[instance_id - 1]:
+            self.failures[number] = f"{self._describe(number)}: {str(error).partition(chr(10))[0]}"
+
+    def _number(self, instance_id: int, episode: int) -> int:
+        return episode * self._instance_nb + instance_id - 1
+
+    def _describe(self, number: int) -> str:
+        values = self._waiting[number % self._instance_nb][number]
+        return ", ".join(f"{name}={value}" for name, value in values.items())
+
+    def note(self, batch: Batch) -> None:
+        """Find the sets that begin in a batch of rows, in the order of their first rows.
+
+        A set that failed before its first row comes before the next one of its instance.
+        """
+        self._begun, self._failed = [], []
+        if not self.parameters:
+            return
+        numbers = np.asarray(batch["episode"], np.int64) * self._instance_nb + batch["env_id"] - 1
+        found, first = np.unique(numbers, return_index=True)
+        for number in found[np.argsort(first)].tolist():
+            waiting = self._waiting[number % self._instance_nb]
+            for earlier in [known for known in waiting if known < number]:
+                self._settle(earlier, waiting)
+            if number in waiting and number not in self._stored:
+                self._stored[number] = self.count
+                self._add(number, waiting[number], failed=False)
+
+    def note_failed(self) -> None:
+        """Find the sets that failed and that no later row follows, at the end of a run."""
+        self._begun, self._failed = [], []
+        for waiting in self._waiting:
+            for number in [known for known in waiting if known in self.failures]:
+                self._settle(number, waiting)
+
+    def pop(self) -> tuple[Batch, list[int]]:
+        """Return and clear what was found last.
+
+        Returns:
+            The record of the sets that begin, field name to array; and the places, in the record of
+            the whole run, of earlier sets that failed.
+        """
+        begun, failed = self._begun, self._failed
+        self._begun, self._failed = [], []
+        columns = {
+            field.name: np.array([one[field.name] for one in begun], field.numpy_dtype)
+            for field in self.fields
+        }
+        return (columns if begun else {}), failed
+
+    def _settle(self, number: int, waiting: dict[int, Mapping[str, Any]]) -> None:
+        """Account for a set that gets no more rows."""
+        values = waiting.pop(number)
+        place = self._stored.pop(number, None)
+        if number not in self.failures:
+            return
+        if place is None:
+            self._add(number, values, failed=True)
+        else:
+            self._failed.append(place)
+
+    def _add(self, number: int, values: Mapping[str, Any], *, failed: bool) -> None:
+        episode, instance = divmod(number, self._instance_nb)
+        identity = {"set": number, "env_id": instance + 1, "episode": episode, "failed": failed}
+        self._begun.append({**identity, **values})
+        self.count += 1
+
+
+def next_step(last_step: int, error: PhysxError) -> int:
+    """Return the number of the first step after those of a simulation that failed.
+
+    Args:
+        last_step: Step of its last row, -1 if it made none.
+        error: How it failed.
+    """
+    return max(last_step, getattr(error, "step", -1)) + 1
+
+
+def _make_sampler(config: EnvironmentConfig) -> Sampler:
+    reference = config.sampler or _DEFAULT
+    make = resolve("sampler", reference)
+    name = reference if isinstance(reference, str) else getattr(make, "__name__", repr(make))
+    if config.sampler is None and config.sampler_kwargs:
+        raise ConfigError("EnvironmentConfig.sampler_kwargs is given without a sampler.")
+    if inspect.isabstract(make):
+        raise ConfigError(f"The sampler {name} is not complete: it does not implement ask().")
+    try:
+        sampler = make(**config.sampler_kwargs)
+    except TypeError as error:
+        known = options_of(make) if isinstance(make, type) else list(config.sampler_kwargs)
+        unknown = config.sampler_kwargs.keys() - set(known)
+        if unknown:
+            raise UnknownOptionError(f'The sampler "{name}"', unknown, known) from error
+        raise ConfigError(f'The sampler "{name}" rejects its arguments: {error}.') from error
+    if not isinstance(sampler, Sampler):
+        raise ConfigError(f"EnvironmentConfig.sampler: {name} is not a Sampler.")
+    return sampler
