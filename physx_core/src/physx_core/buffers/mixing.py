@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
+from numpy.typing import NDArray
 
 from physx_core.components.buffer import Buffer
 from physx_core.errors import ConfigError
 from physx_core.typing import Index
+
+Mask: TypeAlias = NDArray[np.bool_]
 
 
 class MixingBuffer(Buffer):
@@ -80,3 +85,23 @@ class MixingBuffer(Buffer):
     def draw(self, random: np.random.Generator) -> Index:
         """Return different slots of rows, each with the same probability."""
         return random.choice(self.held, self.batch_size, replace=False)
+
+    def is_allowed(self, slots: Index | slice) -> Mask:
+        """Return which of some slots `pick` may return."""
+        return self.rows[slots] >= 0
+
+    def pick(self, count: int, random: np.random.Generator) -> Index:
+        """Return different slots of those allowed, each with the same probability.
+
+        A few candidates are enough unless few slots are allowed; then all are looked at. The result
+        is empty if fewer than `count` are allowed.
+        """
+        candidates = random.integers(0, self.capacity, 4 * count)
+        candidates = candidates[self.is_allowed(candidates)]
+        first = np.sort(np.unique(candidates, return_index=True)[1])
+        if len(first) >= count:
+            return candidates[first[:count]]
+        allowed = np.flatnonzero(self.is_allowed(slice(None)))
+        if len(allowed) < count:
+            return allowed[:0]
+        return random.choice(allowed, count, replace=False)

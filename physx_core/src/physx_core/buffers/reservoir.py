@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from physx_core.buffers.mixing import MixingBuffer
+from physx_core.buffers.mixing import Mask, MixingBuffer
 from physx_core.typing import Index
 
 
@@ -21,7 +21,11 @@ class Reservoir(MixingBuffer):
         count -= len(empty)
         if not count:
             return empty
-        used = np.flatnonzero(self.uses)
-        if len(used) < count:  # the run was made longer, and many rows arrive at once
-            used = np.flatnonzero(self.rows >= 0)
-        return np.concatenate([empty, random.choice(used, count, replace=False)])
+        picked = self.pick(count, random)
+        if len(picked) < count:  # the run was made longer, and many rows arrive at once
+            picked = random.choice(self.capacity, count, replace=False)
+        return np.concatenate([empty, picked])
+
+    def is_allowed(self, slots: Index | slice) -> Mask:
+        """Return which of some slots have a used row."""
+        return self.uses[slots] > 0
