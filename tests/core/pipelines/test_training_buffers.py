@@ -178,7 +178,7 @@ def test_an_interrupted_run_leaves_the_state_of_its_buffer_in_the_checkpoint():
     assert len(drawn) == found.progress.batch == 7
     assert state[0] == 20
     uses = dict(zip(state[1:17].tolist(), state[17:].tolist(), strict=True))
-    counts = np.bincount(drawn.ravel())
+    counts = np.bincount(drawn.ravel(), minlength=20)
     assert all(counts[row] == number for row, number in uses.items())
     assert (found.path / BUFFER).is_file()
 
