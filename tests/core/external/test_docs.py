@@ -39,9 +39,9 @@ def run(commands):
     return done.stderr
 
 
-def rows_of(session):
+def rows_of(session, mode="training"):
     with Dataset.open(f"sessions/{session}/dataset") as dataset:
-        return {name: dataset["training"][name][:] for name in dataset["training"]}
+        return {name: dataset[mode][name][:] for name in dataset[mode]}
 
 
 def test_the_program_in_c(compiler):
@@ -54,6 +54,8 @@ def test_the_program_in_c(compiler):
     before = (rows["env_id"] == 1) & (rows["step"] % 100 < 99)
     np.testing.assert_array_equal(rows["state"][goes_on], rows["next_state"][before])
     assert set(rows["episode"]) == set(range(5))
+    run(block("", "physx/sobol"))
+    assert len({*rows_of("data_generation_1", "parameters")["stiffness"]}) == 10
 
 
 def test_the_program_in_fortran(compiler):

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from physx_core.components.environment import Environment
-from physx_core.errors import ConfigError, SampleError, listed, nearest
+from physx_core.components.parameter import Parameter
+from physx_core.errors import ConfigError, SampleError, UnknownOptionError, listed, nearest
 from physx_core.external.messages import Kind, Message
 from physx_core.external.process import ProgramProcess
 from physx_core.fields import Field
+
+_OPTIONS = {field.name: field for field in dataclasses.fields(Parameter) if field.name != "name"}
 
 
 class ExternalProgram(Environment):
@@ -27,6 +31,7 @@ class ExternalProgram(Environment):
         *,
         program: str | Sequence[str],
         parameters: Mapping[str, Any] | None = None,
+        ranges: Mapping[str, Sequence[Any] | Mapping[str, Any]] | None = None,
         additional: Sequence[str] = (),
         timeout: float = 50.0,
         **kwargs: Any,
@@ -38,6 +43,8 @@ class ExternalProgram(Environment):
             parameters: Numbers and arrays that the program may ask for by name, beside
                 ``seed`` (from 0 to 2**31 - 1, another one for each episode), ``instance_id``,
                 ``instance_nb`` and ``episode``.
+            ranges: Parameters that are chosen for each episode by the run's sampler, or drawn: name
+                to ``[low, high]``, or to a table of the arguments of `Parameter`.
             additional: Names of fields that are stored, but not for networks to read.
             timeout: How long the program may keep the environment waiting, in s. If it is shorter
                 than that of `EnvironmentConfig`, an error says what the program did.
@@ -54,8 +61,14 @@ class ExternalProgram(Environment):
             )
         self._command, self._timeout = list(command), timeout
         self._fixed, self._additional_names = dict(parameters or {}), list(additional)
-        if own := self._own_parameters().keys() & self._fixed.keys():
-            raise ConfigError(f"The parameters {listed(own)} are given by physx: choose others.")
+        self._ranges = [_as_parameter(name, given) for name, given in (ranges or {}).items()]
+        self._chosen: dict[str, Any] = {}
+        names = [*self._own_parameters(), *self._fixed, *(each.name for each in self._ranges)]
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise ConfigError(
+                f"The parameters {listed(twice)} are given more than once: in parameters, in "
+                f"ranges, or by physx, which gives {listed(self._own_parameters())}."
+            )
         self._process: ProgramProcess | None = None
         self._declared: Sequence[Field] = ()
         self._seed: int | None = None
@@ -63,6 +76,7 @@ class ExternalProgram(Environment):
 
     def create(self) -> None:
         """Start the program."""
+        self.define_parameters(self._ranges)
         self._process, self._declared = self._start()
 
     def init_database(self) -> None:
@@ -77,6 +91,10 @@ class ExternalProgram(Environment):
         chosen = [field for field in self._declared if field.name in self._additional_names]
         self.define_training_fields([field for field in self._declared if field not in chosen])
         self.define_additional_fields(chosen)
+
+    def reset_parameters(self, **values: Any) -> None:
+        """Keep the values for when the program asks for them."""
+        self._chosen = values
 
     def step(self) -> None:
         """Take the program's next sample, and answer what it asks before it."""
@@ -150,7 +168,8 @@ class ExternalProgram(Environment):
             self._begin_episode()
         if self._seed is None:
             self._seed = int(self.rng.integers(2**31))
-        values = {**self._fixed, **self._own_parameters(), "seed": self._seed}
+        own = {**self._own_parameters(), "seed": self._seed}
+        values = {**self._fixed, **self._chosen, **own}
         process.answer([_convert(process, "parameter", values, field) for field in message.wanted])
 
     def _answer_prediction(self, process: ProgramProcess, message: Message) -> None:
@@ -162,6 +181,19 @@ class ExternalProgram(Environment):
 
 def _is_word(value: Any) -> bool:
     return isinstance(value, str) and bool(value) and "\0" not in value
+
+
+def _as_parameter(name: str, given: Any) -> Parameter:
+    if isinstance(given, Mapping):
+        if unknown := given.keys() - _OPTIONS.keys():
+            raise UnknownOptionError(f'The range of the parameter "{name}"', unknown, _OPTIONS)
+        return Parameter(name, **given)
+    if isinstance(given, Sequence) and not isinstance(given, str) and len(given) == 2:
+        return Parameter(name, *given)
+    raise ConfigError(
+        f"ranges must have [low, high] or a table such as {{low=0.1, high=10.0, distribution="
+        f'"log_uniform"}} for the parameter "{name}", not {given!r}.'
+    )
 
 
 def _convert(process: ProgramProcess, what: str, values: Mapping[str, Any], field: Field) -> Any:

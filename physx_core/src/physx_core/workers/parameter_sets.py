@@ -19,6 +19,7 @@ from physx_core.errors import (
     FieldsMismatchError,
     NotFiniteError,
     PhysxError,
+    ProgramError,
     UnknownOptionError,
     UsageError,
     WrongSamplesError,
@@ -28,7 +29,9 @@ from physx_core.plugins import resolve
 from physx_core.typing import Batch
 
 _DEFAULT = "physx/uniform"
-_OF_PARAMETERS = (EnvironmentFailedError, ClientError, NotFiniteError, WrongSamplesError)
+_OF_PARAMETERS = (
+    *(EnvironmentFailedError, ClientError, ProgramError, NotFiniteError, WrongSamplesError),
+)
 """Failures of a simulation that its parameters may have caused."""
 
 

@@ -53,6 +53,10 @@ int main(int argc, char **argv)
         over = physx_parameters(&run, wanted, 2);
         start(u, n, seed);
         for (step = 0; !over && step < steps; step++) {
+            if (alpha > 0.25 && step == 1) {
+                fprintf(stderr, "%g is unstable\n", alpha);
+                return 3;
+            }
             advance(u, next, n, alpha);
             over = (asks && physx_predict(&run, input, 1, output, 1)) ||
                    physx_send(&run, sample, fields);

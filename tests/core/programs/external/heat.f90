@@ -35,6 +35,7 @@ program heat
         if (over == 0) over = physx_parameters(run, wanted)
         call start(u, seed)
         do step = 0, steps - 1
+            if (alpha > 0.25_real64 .and. step == 1) stop 3
             call advance(u, next, alpha)
             if (over == 0 .and. asks) over = physx_predict(run, input, output)
             if (over == 0) over = physx_send(run, sample(:fields))
