@@ -196,6 +196,7 @@ def test_statistics_say_how_the_buffer_and_both_sides_are_doing(capfd):
     )
     training.execute()
     said = capfd.readouterr().err
+    assert "generate 80 samples; batches are drawn from up to 40 of them, once there are 20" in said
     assert "each row used 3.00 times on average" in said
     assert "rows/s" in said and "the network waited" in said and "the environments" in said
 

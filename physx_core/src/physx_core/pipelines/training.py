@@ -529,6 +529,8 @@ class Training(NewSessionPipeline):
         if self.data.dataset.modes:
             yield describe_samples(self.data.dataset.directory)
             yield from describe_failed_sets(self.data.source)
+        if self.data.online is not None:
+            yield from self.data.online.announce()
         if self.group.size > 1:
             total, each, count = self.batch_size * self.group.size, self.batch_size, self.group.size
             yield f"batches of {total} samples, {each} in each of {count} processes"

@@ -158,6 +158,15 @@ class OnlineBatches:
             **rates,
         }
 
+    def announce(self) -> Iterable[str]:
+        """Return a line on what will be generated, if the buffer keeps rows."""
+        buffer = self._buffer
+        if buffer.capacity:
+            yield (
+                f"environments generate {buffer.total} samples; batches are drawn from up to "
+                f"{buffer.capacity} of them, once there are {buffer.needed(0)}"
+            )
+
     def describe(self) -> Iterable[str]:
         """Return a line on the epochs in which environments generated."""
         if self.number:
