@@ -28,6 +28,8 @@ def test_the_median_of_a_distribution(parameter, middle):
     assert parameter.contains(low)
     assert parameter.contains(high)
     assert isinstance(low, type(middle))
+    assert parameter.quantile(parameter.share(middle)) == pytest.approx(middle)
+    assert parameter.share(middle) == pytest.approx([0.5])
 
 
 def test_integers_are_all_equally_likely_bounds_included():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ class Swing(Environment):
     def __init__(self, *, length=3, fails_above=1e9, how="raise", folder=".", **kwargs):
         super().__init__(**kwargs)
         self.length, self.fails_above, self.how = length, fails_above, how
+        self.pauses = random.Random(self.instance_id)
         self.died = Path(folder) / f"died_{self.instance_id}"
 
     def create(self):
@@ -48,6 +51,8 @@ class Swing(Environment):
                 noise = np.nan
             if self.how == "kill":
                 os.kill(os.getpid(), signal.SIGKILL)
+        if self.how == "slow":
+            time.sleep(self.pauses.random() ** 4 * 0.05)
         if self.how == "once" and self.step_index == 5 and not self.died.exists():
             self.died.touch()
             os.kill(os.getpid(), signal.SIGKILL)
@@ -55,6 +60,25 @@ class Swing(Environment):
 
     def check_sample(self):
         return self.how != "wrong" or self.stiffness <= self.fails_above or self.made == 1
+
+
+class Hard(Environment):
+    """A function of two parameters that is flat but for a narrow peak, which is hard to learn."""
+
+    def create(self):
+        self.define_parameters([Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)])
+
+    def init_database(self):
+        self.define_training_fields([Field("x", (2,)), Field("y", (1,))])
+
+    def reset_parameters(self, a, b):
+        self.at = np.array([a, b])
+
+    def step(self):
+        if self.step_index:
+            self.new_episode()
+        peak = 10 * np.exp(-np.sum((self.at - 0.8) ** 2) / 0.1**2)
+        self.set_training_data(x=self.at, y=[peak])
 
 
 class Plain(Environment):

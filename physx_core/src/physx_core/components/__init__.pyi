@@ -11,6 +11,7 @@ from .launcher import Launcher as Launcher
 from .network import Network as Network
 from .optimization import Optimization as Optimization
 from .parameter import Parameter as Parameter
+from .sampler import LearningSampler as LearningSampler
 from .sampler import Sampler as Sampler
 from .scene import Event as Event
 from .scene import Factory as Factory

@@ -166,6 +166,43 @@ class Parameter:
         value = value if low is None else max(value, low)
         return value if high is None else min(value, high)
 
+    def share(self, value: Any) -> Point:
+        """Return the shares of the distribution that lie below a value: the inverse of `quantile`.
+
+        Of an integer it is the middle of the shares whose quantile it is.
+
+        Args:
+            value: A value of the parameter's shape.
+
+        Returns:
+            From 0 to 1, shape (size,).
+        """
+        flat = np.ravel(np.asarray(value, np.float64))
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        if self.distribution == "normal":
+            shares = np.array([self._below(n, number) for n, number in enumerate(flat.tolist())])
+        elif self.distribution == "log_uniform":
+            shares = (np.log(flat) - np.log(low)) / (np.log(high) - np.log(low))
+        elif self.distribution == "integer":
+            shares = (flat - low + 0.5) / (high - low + 1)
+        else:
+            shares = (flat - low) / (high - low)
+        clipped: Point = np.clip(shares, 0.0, 1.0)
+        return clipped
+
+    def _below(self, element: int, value: float) -> float:
+        inside, below, above = (
+            bound
+            if number is None
+            else _STANDARD.cdf((number - self.mean[element]) / self.deviation[element])
+            for number, bound in (
+                (value, 0.5),
+                (None if self.low is None else self.low[element], 0.0),
+                (None if self.high is None else self.high[element], 1.0),
+            )
+        )
+        return (inside - below) / (above - below) if above > below else 0.5
+
     @property
     def is_bounded(self) -> bool:
         """Whether all values lie between two bounds."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from physx_core.components.parameter import Parameter, Point, random_of, values_at
 from physx_core.errors import ConfigError
-from physx_core.typing import Array
+from physx_core.typing import Array, Index
 
 
 class Sampler(ABC):
@@ -68,6 +68,51 @@ class Sampler(ABC):
     def random(self, number: int) -> np.random.Generator:
         """Return random numbers that only the seed and the number of a set determine."""
         return random_of(self.seed, number, 1)
+
+
+class LearningSampler(Sampler):
+    """A sampler that learns from the losses of a training's rows.
+
+    What a set may depend on is counted in batches, never in time: for a row of batch n these are
+    the losses of the batches before n - `delay`. So the simulations are the same in every run. With
+    a delay of 1 or more, clients generate the rows of a batch while the network learns from those
+    before.
+
+    Attributes:
+        delay: Number of batches before a row's own whose losses its set does not depend on yet.
+        memory: Number of sets, up to the latest one of which there are losses, that are told.
+    """
+
+    learns: ClassVar[bool] = True
+    delay: int = 1
+    memory: int = 512
+
+    def ask(self, number: int) -> Mapping[str, Any]:
+        """Return the values of a set that depends on no losses."""
+        return self.ask_after(number, 0)
+
+    @abstractmethod
+    def ask_after(self, number: int, batches: int) -> Mapping[str, Any]:
+        """Return the values of a set by the parameters' names.
+
+        Args:
+            number: Number of the set, from 0.
+            batches: Number of batches, from the first one on, whose losses it may depend on: those
+                told by now, or up to `delay` fewer.
+        """
+
+    @abstractmethod
+    def tell(
+        self, batches: int, numbers: Index, values: Sequence[Mapping[str, Any]], losses: Array
+    ) -> None:
+        """Learn from a batch.
+
+        Args:
+            batches: Number of batches told by now, this one included.
+            numbers: Numbers of the sets of which the batch holds rows, increasing.
+            values: Their values.
+            losses: Mean loss of the batch's rows of each set.
+        """
 
 
 def checked(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> dict[str, Any]:

@@ -244,9 +244,12 @@ class Training(NewSessionPipeline):
             DivergedError: If the loss or a gradient is not finite, with ``on_nan="stop"``.
         """
         try:
-            self.losses = self.learner.optimize(self.batch, self.data.weight)
+            by_row = self.data.wants_row_losses
+            self.losses = self.learner.optimize(self.batch, self.data.weight, by_row=by_row)
         except DivergedError as error:
             raise self._diverged(f"{error}", self.batch_id + 1) from None
+        if by_row:
+            self.data.tell(self.batch, self.learner.row_losses)
         if self.on_nan == "continue" and not math.isfinite(self.losses["loss"]):
             self._continue_after_nan()
         if self._leads and not self._is_savable:
@@ -528,7 +531,6 @@ class Training(NewSessionPipeline):
     def _plan(self) -> Iterable[str]:
         if self.data.dataset.modes:
             yield describe_samples(self.data.dataset.directory)
-            yield from describe_failed_sets(self.data.source)
         if self.data.online is not None:
             yield from self.data.online.announce()
         if self.group.size > 1:
@@ -547,6 +549,7 @@ class Training(NewSessionPipeline):
             yield f"smallest loss {self.best.loss:.6g}, after epoch {self.best.epoch}"
         if self.environment_config is not None:
             yield describe_samples(self.data.dataset.directory)
+            yield from describe_failed_sets(self.data.source)
         if self.data.online is not None:
             yield from self.data.online.describe()
         if self.checkpoint_path is not None:

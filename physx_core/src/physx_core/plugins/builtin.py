@@ -39,5 +39,6 @@ def physx_samplers() -> Components:
         "sobol": "physx_core.samplers.sequences:Sobol",
         "latin_hypercube": "physx_core.samplers.sequences:LatinHypercube",
         "grid": "physx_core.samplers.grid:Grid",
+        "active": "physx_core.samplers.active:Active",
         "table": "physx_core.samplers.table:Table",
     }

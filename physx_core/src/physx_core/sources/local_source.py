@@ -6,6 +6,7 @@ import contextlib
 import logging
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 from physx_core.components.environment import Services
 from physx_core.config import EnvironmentConfig
@@ -99,7 +100,10 @@ class LocalSource(Source):
 
     def _open(self, instance: Instance) -> None:
         draw = self._config.visualizer is not None
-        instance.open(self._services, draw, partial(self.sets.choose, instance.instance_id))
+        instance.open(self._services, draw, partial(self._choose, instance.instance_id))
+
+    def _choose(self, instance_id: int, episode: int) -> dict[str, Any]:
+        return self.sets.choose(instance_id, episode, self._next)
 
     def _make_row(self, instance: Instance, stored: Sample | None, size: int) -> None:
         sample = instance.step(stored)

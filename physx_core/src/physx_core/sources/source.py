@@ -83,6 +83,7 @@ class Source(ABC):
         Environments in this process finish the call.
         """
         self._is_canceled = True
+        self.sets.cancel()
 
     @abstractmethod
     def close(self) -> None:

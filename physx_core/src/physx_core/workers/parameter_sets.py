@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+import threading
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from physx_core.components.environment import options_of
 from physx_core.components.parameter import SET_FIELDS, Parameter
-from physx_core.components.sampler import Sampler, checked
+from physx_core.components.sampler import LearningSampler, Sampler, checked
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
     ClientError,
@@ -26,7 +28,7 @@ from physx_core.errors import (
 )
 from physx_core.fields import Field
 from physx_core.plugins import resolve
-from physx_core.typing import Batch
+from physx_core.typing import Array, Batch, Index
 
 _DEFAULT = "physx/uniform"
 _OF_PARAMETERS = (
@@ -41,6 +43,7 @@ class ParameterSets:
     Set k is for episode ``k // instance_nb`` of instance ``k % instance_nb + 1``.
 
     Attributes:
+        instance_nb: Number of instances.
         parameters: The parameters that the environment defines.
         failures: Number of each set whose simulation failed, and how.
         count: Number of sets that were found to begin.
@@ -62,12 +65,17 @@ class ParameterSets:
         self.failures: dict[int, str] = {}
         self.count = 0
         self._config, self._seed = config, list(seed)
-        self._instance_nb = config.num_clients
+        self.instance_nb = config.num_clients
         self._sampler = _make_sampler(config)
-        self._redraws = [0] * self._instance_nb
+        self._redraws = [0] * self.instance_nb
         self._waiting: list[dict[int, Mapping[str, Any]]] = [{} for _ in self._redraws]
         self._stored: dict[int, int] = {}  # number of an instance's present set to its place
         self._begun: list[dict[str, Any]] = []
+        self._needed: Callable[[int], int] | None = None
+        self._values: dict[int, Mapping[str, Any]] = {}  # of the sets that may be told
+        self._told, self._newest = 0, -1
+        self._changed = threading.Condition()
+        self._is_canceled = False
         self._failed: list[int] = []
 
     def begin(self, definitions: Sequence[Sequence[Parameter]]) -> None:
@@ -110,28 +118,107 @@ class ParameterSets:
         """Fields of the record of the sets."""
         return [*SET_FIELDS, *(parameter.field for parameter in self.parameters)]
 
-    def choose(self, instance_id: int, episode: int) -> dict[str, Any]:
+    @property
+    def learns(self) -> bool:
+        """Whether the sampler learns from losses of a training."""
+        return isinstance(self._sampler, LearningSampler) and bool(self.parameters)
+
+    def follow(self, needed: Callable[[int], int]) -> None:
+        """Have the sampler learn from a training.
+
+        Args:
+            needed: Returns how many rows must have arrived before a batch, which never decreases.
+        """
+        self._needed = needed
+
+    def tell(self, numbers: Index, losses: Array) -> None:
+        """Have the sampler learn from the next batch of the training.
+
+        Args:
+            numbers: Numbers of the sets of the batch's rows.
+            losses: Losses of these rows.
+        """
+        sampler = self._sampler
+        assert isinstance(sampler, LearningSampler)
+        found, places = np.unique(numbers, return_inverse=True)
+        means = np.bincount(places, losses) / np.bincount(places)
+        with self._changed:
+            self._newest = max(self._newest, int(found[-1]))
+            oldest = self._newest - sampler.memory
+            for number in [known for known in self._values if known <= oldest]:
+                del self._values[number]
+            kept = [place for place, number in enumerate(found.tolist()) if number in self._values]
+            values = [self._values[int(found[place])] for place in kept]
+            self._told += 1
+            sampler.tell(self._told, found[kept], values, means[kept])
+            self._changed.notify_all()
+
+    def cancel(self) -> None:
+        """Have a call of `choose` that waits for losses end soon, with an error."""
+        with self._changed:
+            self._is_canceled = True
+            self._changed.notify_all()
+
+    def is_ready(self, row: int) -> bool:
+        """Return whether the losses were told that a set for a row depends on."""
+        return not self.learns or self._told >= self._batches_for(row)
+
+    def _batches_for(self, row: int) -> int:
+        """Return how many batches a set may depend on that is asked for when a row is made."""
+        sampler, needed = self._sampler, self._needed
+        assert isinstance(sampler, LearningSampler)
+        if needed is None:
+            raise UsageError(
+                f"The sampler {type(sampler).__name__} learns from the losses of a training on the "
+                'samples that environments generate, and there is none here. Use "physx/sobol".'
+            )
+        end = 1
+        while needed(end - 1) <= row:
+            end *= 2
+        batch = bisect_right(range(end), row, key=needed)
+        return max(0, batch - sampler.delay)
+
+    def choose(self, instance_id: int, episode: int, row: int) -> dict[str, Any]:
         """Return the values of the parameters for an episode of an instance.
+
+        If they depend on losses that were not told yet, it waits for them, in a thread beside that
+        of the training.
+
+        Args:
+            instance_id: The instance.
+            episode: The episode.
+            row: Number, among all rows, of the one that the instance is making.
 
         Raises:
             ConfigError: If the sampler fails, or what it chooses does not fit the parameters.
+            UsageError: If the sampler learns, but nothing is trained.
         """
         if not self.parameters:
             raise UsageError("Parameters can be chosen once all instances have defined them.")
         number = self._number(instance_id, episode)
-        values = self._ask(number)
+        values = self._ask(number, row)
         self._waiting[instance_id - 1][number] = values
         return dict(values)
 
-    def _ask(self, number: int) -> dict[str, Any]:
+    def _ask(self, number: int, row: int) -> dict[str, Any]:
+        sampler = self._sampler
         try:
-            return checked(self.parameters, self._sampler.ask(number))
+            if not isinstance(sampler, LearningSampler):
+                return checked(self.parameters, sampler.ask(number))
+            batches = self._batches_for(row)
+            with self._changed:
+                self._changed.wait_for(lambda: self._is_canceled or self._told >= batches)
+                if self._is_canceled:
+                    raise UsageError("The training is being closed.")
+                values = checked(self.parameters, sampler.ask_after(number, batches))
+                self._values[number] = values
+                return values
         except PhysxError:
             raise
         except Exception as error:
-            name = type(self._sampler).__name__
+            name = type(sampler).__name__
             raise ConfigError(
-                f"The sampler {name} raised in ask({number}): {type(error).__name__}: {error}."
+                f"The sampler {name} raised for set {number}: {type(error).__name__}: {error}."
             ) from error
 
     def can_redraw(self, instance_id: int, error: PhysxError) -> bool:
@@ -163,10 +250,10 @@ class ParameterSets:
             self.failures[number] = f"{self._describe(number)}: {str(error).partition(chr(10))[0]}"
 
     def _number(self, instance_id: int, episode: int) -> int:
-        return episode * self._instance_nb + instance_id - 1
+        return episode * self.instance_nb + instance_id - 1
 
     def _describe(self, number: int) -> str:
-        values = self._waiting[number % self._instance_nb][number]
+        values = self._waiting[number % self.instance_nb][number]
         return ", ".join(f"{name}={value}" for name, value in values.items())
 
     def note(self, batch: Batch) -> None:
@@ -177,10 +264,10 @@ class ParameterSets:
         self._begun, self._failed = [], []
         if not self.parameters:
             return
-        numbers = np.asarray(batch["episode"], np.int64) * self._instance_nb + batch["env_id"] - 1
+        numbers = np.asarray(batch["episode"], np.int64) * self.instance_nb + batch["env_id"] - 1
         found, first = np.unique(numbers, return_index=True)
         for number in found[np.argsort(first)].tolist():
-            waiting = self._waiting[number % self._instance_nb]
+            waiting = self._waiting[number % self.instance_nb]
             for earlier in [known for known in waiting if known < number]:
                 self._settle(earlier, waiting)
             if number in waiting and number not in self._stored:
@@ -221,7 +308,7 @@ class ParameterSets:
             self._failed.append(place)
 
     def _add(self, number: int, values: Mapping[str, Any], *, failed: bool) -> None:
-        episode, instance = divmod(number, self._instance_nb)
+        episode, instance = divmod(number, self.instance_nb)
         identity = {"set": number, "env_id": instance + 1, "episode": episode, "failed": failed}
         self._begun.append({**identity, **values})
         self.count += 1

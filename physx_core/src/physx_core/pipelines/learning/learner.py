@@ -42,6 +42,7 @@ class _Step(NamedTuple):
     data: Tensors
     prediction: Tensors
     loss: Any
+    compared: tuple[Tensors, Tensors]
 
 
 class Learner:
@@ -54,6 +55,8 @@ class Learner:
         optimization: Improves the network; None if nothing is trained.
         fields: The fields that the network was bound to, by name.
         group: The processes that train the network together.
+        row_losses: Loss of each row of the last batch, shape (rows,), if `optimize` was asked for
+            them.
     """
 
     def __init__(
@@ -91,6 +94,7 @@ class Learner:
         self.optimization: Optimization | None = None
         self.fields: dict[str, Field] = {}
         self.group = Group()
+        self.row_losses: Array = np.zeros(0)
         self._is_between_steps = False
         if trains:
             self.optimization = self._create_optimization(config)
@@ -150,14 +154,17 @@ class Learner:
         targets = {name: data[name] for name in network.opt_fields}
         predicted = network.predict(transformation.transform_before_prediction(inputs))
         prediction, targets = transformation.transform_before_loss(predicted, targets)
-        return _Step(data, predicted, optimization.compute_loss(prediction, targets, data))
+        loss = optimization.compute_loss(prediction, targets, data)
+        return _Step(data, predicted, loss, (prediction, targets))
 
     def _trainer(self) -> Optimization:
         if self.optimization is None:
             raise UsageError("This network was created for prediction and cannot be trained.")
         return self.optimization
 
-    def optimize(self, batch: Batch, weight: float | None = None) -> dict[str, float]:
+    def optimize(
+        self, batch: Batch, weight: float | None = None, *, by_row: bool = False
+    ) -> dict[str, float]:
         """Train on a batch and return the statistics of the step, ``loss`` first.
 
         In a group of processes each trains on its share; the statistics are those of the batch.
@@ -165,6 +172,7 @@ class Learner:
         Args:
             batch: The batch, the same in all processes, or this process's share of it.
             weight: Weight of that share in the mean over the whole batch; None: it is the batch.
+            by_row: Whether to compute `row_losses`, too.
 
         Raises:
             DivergedError: If the loss or a gradient is not finite, unless
@@ -182,6 +190,8 @@ class Learner:
         loss, stops = step.loss, optimization.stops_at_nan
         if stops and isinstance(loss, (float, np.floating)) and not math.isfinite(loss):
             raise DivergedError(self._explain(f"the loss is {loss}", step))
+        if by_row:
+            self.row_losses = self._compute_row_losses(optimization, step)
         try:  # the mean of the weighted losses of a group is that of the batch
             optimization.optimize(loss if group.size == 1 else loss * (weight * group.size))
         except DivergedError as error:
@@ -192,6 +202,17 @@ class Learner:
             losses = dict(zip(losses, totals, strict=True))
         if stops and not math.isfinite(losses["loss"]):
             raise DivergedError(self._explain(f"the loss is {losses['loss']}", step))
+        return losses
+
+    def _compute_row_losses(self, optimization: Optimization, step: _Step) -> Array:
+        found = optimization.compute_row_losses(*step.compared, step.data)
+        losses: Array = self.network.tensor_to_numpy({"loss": found})["loss"].astype(np.float64)
+        rows = len(next(iter(step.data.values())))
+        if losses.shape != (rows,):
+            raise UsageError(
+                f"{type(optimization).__name__}.compute_row_losses() returned shape "
+                f"{losses.shape} for {rows} rows."
+            )
         return losses
 
     def _explain(self, found: str, step: _Step) -> str:

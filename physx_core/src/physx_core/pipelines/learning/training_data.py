@@ -23,7 +23,9 @@ from physx_core.pipelines.storage import other_samples, record_rejected
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.sources.source import Source
 from physx_core.statistics import Normalization
-from physx_core.typing import Batch
+from physx_core.typing import Array, Batch
+
+_IDENTITY = ("env_id", "episode")
 
 
 class TrainingData:
@@ -124,6 +126,12 @@ class TrainingData:
             blocks = Blocks(source, dataset, self._mode, normalize=config.normalize, feeder=feeder)
             first = self._count(self._mode)
             self.online = OnlineBatches(blocks, buffer, data_type, drawn, first)
+            source.sets.follow(buffer.needed)
+            if source.sets.learns and group.size > 1:
+                raise ConfigError(
+                    "A sampler that learns from losses works in one process: leave torchrun out, "
+                    'or choose another sampler, for example "physx/sobol".'
+                )
         if generates and group.size > 1:
             self._shared = SharedBatches(group, self.online, source.fields if source else ())
 
@@ -188,7 +196,8 @@ class TrainingData:
         if self._uses_source and self._shared is not None:
             return self._shared.next(self._names)
         if self._uses_source and self.online is not None:
-            return self.online.next(self._names)
+            names = [*self._names, *_IDENTITY] if self.wants_row_losses else self._names
+            return self.online.next(names)
         if self._uses_source and self.source is not None and self._stored is not None:
             with record_rejected(self.source, self.dataset):
                 return self._replay(self.source, self._stored)
@@ -215,6 +224,23 @@ class TrainingData:
         """Skip batches that a training read before it was interrupted."""
         for _ in range(batches):
             self.next_batch()
+
+    @property
+    def wants_row_losses(self) -> bool:
+        """Whether a sampler learns from the losses of the rows of the current epoch."""
+        return self.produces and self.source is not None and self.source.sets.learns
+
+    def tell(self, batch: Batch, losses: Array) -> None:
+        """Have the sampler learn from the last batch.
+
+        Args:
+            batch: The batch.
+            losses: Loss of each row, shape (rows,).
+        """
+        assert self.source is not None
+        episodes = np.asarray(batch["episode"], np.int64)
+        numbers = episodes * self.source.instance_nb + batch["env_id"] - 1
+        self.source.sets.tell(numbers, losses)
 
     @property
     def weight(self) -> float | None:

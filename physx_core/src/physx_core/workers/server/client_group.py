@@ -78,7 +78,7 @@ class ClientGroup:
             services,
             self._encode_setup,
             choose_token(config, self._launcher.by_hand),
-            sets.choose,
+            sets,
             self._replaces,
         )
 

@@ -21,10 +21,11 @@ from physx_core.net.liveness import is_loss
 from physx_core.net.remote_errors import decode_error, encode_error
 from physx_core.net.spin_wait import has_core_for_each
 from physx_core.net.strangers import Handshakes
+from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.peer import Peer
-from physx_core.workers.server.service_requests import Choose, ServiceRequests
+from physx_core.workers.server.service_requests import ServiceRequests
 from physx_core.workers.server.validation import (
     check_environment_fields,
     check_row_fields,
@@ -57,7 +58,7 @@ class Server:
         services: Services,
         setup: Callable[[Peer], bytes],
         token: str,
-        choose: Choose,
+        sets: ParameterSets,
         replaces: Callable[[int, PhysxError | None], bool] = lambda number, error: False,
     ) -> None:
         """Keep the arguments; `open` starts to listen.
@@ -69,7 +70,7 @@ class Server:
             services: The services of the run, for the environments.
             setup: Returns the payload that tells an instance's client what to run.
             token: Secret of the run.
-            choose: Chooses the parameters of an instance's episode.
+            sets: Chooses the instances' parameters.
             replaces: Whether another client takes the place of one that failed with an error, or
                 left without one.
         """
@@ -77,7 +78,7 @@ class Server:
         self.token = token
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
         self._spin_time = _SPIN_TIME if has_core_for_each(instance_nb) else 0.0
-        self._requests = ServiceRequests(services, choose)
+        self._requests = ServiceRequests(services, sets)
         self._setup, self._replaces = setup, replaces
         self._ending = self._has_news = False
         self._listener = Listener[Peer](self._meet, self._give_up)
@@ -136,6 +137,7 @@ class Server:
             spin: How long to look for it without sleeping before that, in s.
         """
         self._has_news = False
+        self._requests.choose()
         if self._can_predict():  # held requests that are due now
             timeout = 0.0
         for peer, events in self._listener.select(timeout, spin):
@@ -152,7 +154,7 @@ class Server:
 
     @property
     def asking(self) -> set[int]:
-        """The instances that wait for a prediction, due or held."""
+        """The instances that wait for a prediction or parameters, due or held."""
         return self._requests.asking
 
     def end(self) -> None:
