@@ -58,11 +58,11 @@ def heat(build):
 
 @pytest.fixture
 def heat_fortran(build):
-    """The heat equation in Fortran."""
-    return build("heat.f90", "-Wall", "-Wextra", "-Werror", using="gfortran")
+    """The heat equation in Fortran, with sanitizers."""
+    return build("heat.f90", *WARNINGS, *SANITIZERS, using="gfortran")
 
 
 @pytest.fixture
 def faulty(build):
     """A program that breaks in many ways."""
-    return build("faulty.c", "-std=c99", "-D_POSIX_C_SOURCE=200809L", *WARNINGS)
+    return build("faulty.c", "-std=c99", "-D_POSIX_C_SOURCE=200809L", *WARNINGS, *SANITIZERS)

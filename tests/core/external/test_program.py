@@ -188,6 +188,36 @@ def test_ranges_are_checked(local, ranges, text):
         source.batch(1)
 
 
+def test_arrays_that_no_socket_holds_at_once_arrive_whole(local, services, heat):
+    services.predict = lambda fields: {"next": 2.0 * np.asarray(fields["u"])}
+    kwargs = options(heat, 400, 2, 1, "ask")
+    rows = run(local("external/program", env_kwargs=kwargs), 3)
+    assert rows["u"].shape == (3, 400, 400) and np.ptp(rows["u"][0]) > 0.99
+    np.testing.assert_array_equal(rows["predicted"], 2.0 * rows["u"])
+    np.testing.assert_array_equal(rows["u"][1], rows["next"][0])
+
+
+def test_a_client_whose_program_fails_is_started_again(local, clients, heat):
+    command = f"exec {heat} {SIZE} {STEPS} 1"
+    rows = run(
+        local("external/program", env_kwargs=options("/bin/sh", "-c", command), num_clients=2), 14
+    )
+    fails = "if [ -e first -a ! -e again ]; then touch again; exit 3; fi; touch first"
+    script = f'if [ "$PHYSX_INSTANCE" = 2 ]; then {fails}; fi; {command}'
+    kwargs = options("/bin/sh", "-c", script)
+    others = run(clients("external/program", env_kwargs=kwargs, num_clients=2, restarts=1), 14)
+    assert Path("again").exists()
+    for name in rows:
+        assert rows[name].tobytes() == others[name].tobytes()
+
+
+def test_fields_may_have_units(local, heat):
+    kwargs = {**options(heat, 3, 2, 1), "units": {"u": "K"}}
+    with local("external/program", env_kwargs=kwargs) as source:
+        units = {field.name: field.unit for field in source.fields}
+    assert units["u"] == "K" and units["next"] == ""
+
+
 @pytest.mark.parametrize("as_clients", [False, True])
 def test_a_training_learns_from_a_program_that_asks_its_network(heat, as_clients):
     environment = EnvironmentConfig(
@@ -434,14 +464,12 @@ def test_a_program_is_a_list_of_texts(local, program):
 
 
 def test_arguments_that_do_not_fit_the_program_are_told(local, heat):
-    with (
-        pytest.raises(ConfigError, match='no field "alfa" to be additional. Did you mean "alpha"'),
-        local(
-            "external/program",
-            env_kwargs={**options(heat, 3, 3, 1), "additional": ["alfa"]},
-        ) as source,
-    ):
-        source.batch(1)
+    for wrong in ({"additional": ["alfa"]}, {"units": {"alfa": "m"}}):
+        with (
+            pytest.raises(ConfigError, match='declares no field "alfa". Did you mean "alpha"'),
+            local("external/program", env_kwargs={**options(heat, 3, 3, 1), **wrong}) as source,
+        ):
+            source.batch(1)
     with (
         pytest.raises(ConfigError, match="The parameters seed are given more than once"),
         local("external/program", env_kwargs=options(heat, seed=3)) as source,

@@ -33,6 +33,7 @@ class ExternalProgram(Environment):
         parameters: Mapping[str, Any] | None = None,
         ranges: Mapping[str, Sequence[Any] | Mapping[str, Any]] | None = None,
         additional: Sequence[str] = (),
+        units: Mapping[str, str] | None = None,
         timeout: float = 50.0,
         **kwargs: Any,
     ) -> None:
@@ -46,6 +47,7 @@ class ExternalProgram(Environment):
             ranges: Parameters that are chosen for each episode by the run's sampler, or drawn: name
                 to ``[low, high]``, or to a table of the arguments of `Parameter`.
             additional: Names of fields that are stored, but not for networks to read.
+            units: Units of fields by name.
             timeout: How long the program may keep the environment waiting, in s. If it is shorter
                 than that of `EnvironmentConfig`, an error says what the program did.
             kwargs: See `Environment`.
@@ -62,6 +64,7 @@ class ExternalProgram(Environment):
         self._command, self._timeout = list(command), timeout
         self._fixed, self._additional_names = dict(parameters or {}), list(additional)
         self._ranges = [_as_parameter(name, given) for name, given in (ranges or {}).items()]
+        self._units = dict(units or {})
         self._chosen: dict[str, Any] = {}
         names = [*self._own_parameters(), *self._fixed, *(each.name for each in self._ranges)]
         if twice := {name for name in names if names.count(name) > 1}:
@@ -81,16 +84,18 @@ class ExternalProgram(Environment):
 
     def init_database(self) -> None:
         """Define the fields that the program declared."""
-        names = [field.name for field in self._declared]
-        for name in self._additional_names:
-            if name not in names:
+        fields = {field.name: field for field in self._declared}
+        for name in (*self._additional_names, *self._units):
+            if name not in fields:
                 raise ConfigError(
-                    f'The program has no field "{name}" to be additional.{nearest(name, names)} '
-                    f"It has: {listed(names)}."
+                    f'The program declares no field "{name}".{nearest(name, fields)} '
+                    f"It declares: {listed(fields)}."
                 )
-        chosen = [field for field in self._declared if field.name in self._additional_names]
-        self.define_training_fields([field for field in self._declared if field not in chosen])
-        self.define_additional_fields(chosen)
+        for name, unit in self._units.items():
+            fields[name] = dataclasses.replace(fields[name], unit=unit)
+        additional = [fields.pop(name) for name in dict.fromkeys(self._additional_names)]
+        self.define_training_fields(fields.values())
+        self.define_additional_fields(additional)
 
     def reset_parameters(self, **values: Any) -> None:
         """Keep the values for when the program asks for them."""

@@ -43,6 +43,7 @@ program heat
         end do
     end do
     if (over == 0) over = physx_close(run)
+    deallocate (u, next, predicted, grid)
     if (over /= 0) stop 1
 
 contains

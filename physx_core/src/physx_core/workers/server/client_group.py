@@ -14,7 +14,13 @@ from typing import Any
 from physx_core.components.environment import Services
 from physx_core.components.launcher import ClientHandle, Launcher
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import ClientError, ConfigError, EnvironmentFailedError, PhysxError
+from physx_core.errors import (
+    ClientError,
+    ConfigError,
+    EnvironmentFailedError,
+    PhysxError,
+    ProgramError,
+)
 from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.net.tokens import choose_token
 from physx_core.net.values import encode
@@ -31,7 +37,7 @@ _TICK = 0.1
 _GRACE = 1.0
 _EXIT_TIME = 5.0
 _SAY_EVERY = 5.0
-_PASSING = (EnvironmentFailedError, ClientError)  # what may not come again
+_PASSING = (EnvironmentFailedError, ProgramError, ClientError)  # what may not come again
 _LOG = logging.getLogger("physx")
 
 
@@ -257,7 +263,7 @@ class ClientGroup:
         _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
         self.server.vacate(number)
         handle = self._handles.pop(number, None)
-        closes = isinstance(error, EnvironmentFailedError)  # and needs a moment for it
+        closes = not isinstance(error, ClientError)  # and needs a moment for it
         stop([] if handle is None else [handle], _GRACE if closes else 0.0)
         self._exits.pop(number, None)
         if not self._closing:
