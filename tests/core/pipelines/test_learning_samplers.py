@@ -29,6 +29,12 @@ class Recording(LearningSampler):
         share = self.told[batches] % 1
         return self.values(np.full(self.size, share))
 
+    def state(self, batches):
+        return np.array([[n, told] for n, told in self.told.items() if n <= batches]).ravel()
+
+    def restore(self, batches, state):
+        self.told = {int(n): told for n, told in state.reshape(-1, 2)}
+
     def tell(self, batches, numbers, values, losses):
         assert batches - 1 in self.told
         assert (np.diff(numbers) > 0).all()

@@ -154,3 +154,32 @@ def test_a_missing_library_names_the_extra_that_has_it(name, monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy.stats", None)
     with pytest.raises(MissingLibraryError, match=r"physx.core\[samplers\]"):
         begun(name)
+
+
+def test_an_active_sampler_continues_from_its_state():
+    """Told the same batches, a restored sampler chooses what the other one does."""
+    random = np.random.default_rng(0)
+    uniform = begun("uniform")
+    sampler, options = begun("active", memory=20), {"memory": 20, "seed": (3, 0, 0)}
+    batches = [np.unique(random.integers(0, 8, 5)) + 4 * n for n in range(20)]
+
+    def tell(one, number):
+        sets = batches[number]
+        one.tell(number + 1, sets, [uniform.ask(k) for k in sets], np.sin(sets) + 1)
+
+    for number in range(12):
+        tell(sampler, number)
+    for after in (12, 11):
+        restored = begun("active", **options)
+        restored.restore(after, sampler.state(after))
+        for number in range(after, 12):
+            tell(restored, number)
+        for k in range(50, 90):
+            for count in (12, 11):
+                assert flat(restored.ask_after(k, count)) == flat(sampler.ask_after(k, count))
+    with pytest.raises(ValueError, match="other"):
+        begun("active", **options).restore(7, sampler.state(12))
+    with pytest.raises(ValueError, match="other parameters"):
+        begun("active", [Parameter("a", [0] * 50, [1] * 50, shape=(50,))]).restore(
+            12, sampler.state(12)
+        )

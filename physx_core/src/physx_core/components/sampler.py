@@ -102,6 +102,26 @@ class LearningSampler(Sampler):
         """
 
     @abstractmethod
+    def state(self, batches: int) -> Array:
+        """Return what `restore` needs to continue after some batches, as numbers, shape (n,).
+
+        Args:
+            batches: Number of batches: all that were told, or all but the last one.
+        """
+
+    @abstractmethod
+    def restore(self, batches: int, state: Array) -> None:
+        """Continue from a `state` of a sampler with the same options; called after `begin`.
+
+        Args:
+            batches: Number of batches after which that was the state.
+            state: The state.
+
+        Raises:
+            ValueError: If it is not the state of such a sampler.
+        """
+
+    @abstractmethod
     def tell(
         self, batches: int, numbers: Index, values: Sequence[Mapping[str, Any]], losses: Array
     ) -> None:

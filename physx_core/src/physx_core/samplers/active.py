@@ -78,7 +78,7 @@ class Active(LearningSampler):
             np.concatenate([before.points[stays], points])[order],
             np.concatenate([before.losses[stays], losses])[order],
         )
-        for former in [known for known in self._known if known < batches - self.delay - 1]:
+        for former in [known for known in self._known if known < batches - self.delay - 2]:
             del self._known[former]
             self._weights.pop(former, None)
 
@@ -91,6 +91,39 @@ class Active(LearningSampler):
         center = known.points[np.searchsorted(weights, random.random(), side="right")]
         point = center + self._width * (2 * random.random(self.size) - 1)
         return self.values(1 - np.abs(1 - np.abs(point)))  # reflected at 0 and 1
+
+    def state(self, batches: int) -> Array:
+        """Return the known sets after the last batches: see `LearningSampler.state`."""
+        kept = {
+            n: one for n, one in self._known.items() if batches - self.delay - 1 <= n <= batches
+        }
+        parts = [
+            np.concatenate([[n, len(one.losses)], one.numbers, one.losses, one.points.ravel()])
+            for n, one in kept.items()
+        ]
+        return np.concatenate(parts)
+
+    def restore(self, batches: int, state: Array) -> None:
+        """Continue from a state: see `LearningSampler.restore`."""
+        known: dict[int, _Known] = {}
+        rest = np.asarray(state, np.float64)
+        while len(rest):
+            if (
+                len(rest) < 2
+                or not 0 <= rest[1] <= self.memory
+                or rest[0] not in range(batches + 1)
+            ):
+                raise ValueError("it is the state of a sampler with other options")
+            n, count = int(rest[0]), int(rest[1])
+            end = 2 + count * (2 + self.size)
+            if len(rest) < end:
+                raise ValueError("it is the state of a sampler of other parameters")
+            numbers, losses, points = np.split(rest[2:end], [count, 2 * count])
+            known[n] = _Known(numbers.astype(np.int64), points.reshape(count, self.size), losses)
+            rest = rest[end:]
+        if batches not in known:
+            raise ValueError("it is the state after other batches")
+        self._known, self._weights = known, {}
 
     def _weights_after(self, batches: int) -> Array:
         """Return the sums of the probabilities of the known sets up to each, the last one 1."""

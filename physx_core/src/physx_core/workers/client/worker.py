@@ -165,7 +165,9 @@ class RemoteServices:
 
     def choose(self, episode: int) -> dict[str, Any]:
         """Return the parameters of an episode."""
-        values: dict[str, Any] = self._ask(Kind.CHOOSE, {"episode": episode}, "the parameters")
+        self._producer.flush()
+        request = {"episode": episode, "row": self._producer.made}
+        values: dict[str, Any] = self._link.ask(Kind.CHOOSE, request, "the parameters")
         return values
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:

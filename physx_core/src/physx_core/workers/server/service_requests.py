@@ -15,7 +15,7 @@ from physx_core.net.values import pack_value
 from physx_core.typing import Batch, Sample
 from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.server.peer import Peer
-from physx_core.workers.server.validation import parse_episode, parse_events, parse_values
+from physx_core.workers.server.validation import parse_choice, parse_events, parse_values
 
 _MOST_UNREAD = 1 << 26
 _KEPT = "the kept parameters"
@@ -55,7 +55,7 @@ class ServiceRequests:
         )
         self.batches = self._predict_batch is not None
         self._waiting: list[Request] = []
-        self._choices: list[tuple[Peer, int, int]] = []
+        self._choices: list[tuple[Peer, int, tuple[int, int]]] = []
 
     @property
     def count(self) -> int:
@@ -102,8 +102,9 @@ class ServiceRequests:
     def _take_choice(self, peer: Peer, frame: Frame) -> None:
         if not peer.parameters:
             raise ConnectionRefusedByPeerError("It asked for parameters, but defined none.")
-        episode = parse_episode(frame.payload, peer.episode)
-        self._choices.append((peer, frame.number, episode))
+        episode, row = parse_choice(frame.payload, peer.episode, peer.received)
+        row = row * self._sets.instance_nb + peer.instance_id - 1
+        self._choices.append((peer, frame.number, (episode, row)))
         self.choose()
 
     def choose(self) -> None:
@@ -111,10 +112,9 @@ class ServiceRequests:
         if not self._choices:
             return
         waiting, self._choices = self._choices, []
-        for peer, number, episode in waiting:
-            row = peer.received * self._sets.instance_nb + peer.instance_id - 1
+        for peer, number, (episode, row) in waiting:
             if peer.is_ahead and not self._sets.is_ready(row):
-                self._choices.append((peer, number, episode))
+                self._choices.append((peer, number, (episode, row)))
                 continue
             choose = self._sets.choose
             self._answer(peer, number, "the parameters", choose, peer.instance_id, episode, row)

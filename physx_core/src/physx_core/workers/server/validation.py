@@ -58,18 +58,22 @@ def parse_parameters(payload: bytes | bytearray) -> list[Parameter]:
     return parameters
 
 
-def parse_episode(payload: bytes | bytearray, last: int) -> int:
-    """Return the episode whose parameters a message asks for.
+def parse_choice(payload: bytes | bytearray, last: int, received: int) -> tuple[int, int]:
+    """Return the episode whose parameters a message asks for, and the row that is being made.
 
     Args:
         payload: The message.
         last: Episode of the last such message, -1 if there was none.
+        received: How many rows of the instance arrived, or were there before.
     """
     plain = decode(payload)
-    episode = plain.get("episode") if isinstance(plain, dict) else None
+    given = plain if isinstance(plain, dict) else {}
+    episode, row = given.get("episode"), given.get("row")
     if type(episode) is not int or not last < episode < _MOST_EPISODES:
         raise ConnectionRefusedByPeerError("It asked for the parameters of an impossible episode.")
-    return episode
+    if type(row) is not int or not 0 <= row <= received:
+        raise ConnectionRefusedByPeerError("It asked for parameters at an impossible row.")
+    return episode, row
 
 
 def _is_field(plain: Any) -> bool:
