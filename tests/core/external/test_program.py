@@ -29,6 +29,7 @@ from physx_core.errors import (
     NotFiniteError,
     ProgramError,
 )
+from physx_core.pipelines import load_learner
 
 SIZE, STEPS = 5, 3
 
@@ -463,6 +464,16 @@ def test_a_program_is_a_list_of_texts(local, program):
         source.batch(1)
 
 
+@pytest.mark.parametrize("timeout", [0, -1.0, "long"])
+def test_a_timeout_is_a_number_of_seconds(local, timeout):
+    kwargs = {"program": "true", "timeout": timeout}
+    with (
+        pytest.raises(ConfigError, match="timeout must be a number of seconds above 0"),
+        local("external/program", env_kwargs=kwargs) as source,
+    ):
+        source.batch(1)
+
+
 def test_arguments_that_do_not_fit_the_program_are_told(local, heat):
     for wrong in ({"additional": ["alfa"]}, {"units": {"alfa": "m"}}):
         with (
@@ -559,3 +570,30 @@ def test_a_dataset_cannot_name_a_program_to_run(heat, capsys, named):
     assert main([*replay, "--session-name", "two", "--trust"]) == 1
     assert "never reads Environment.sample" in capsys.readouterr().err
     assert Path("ran").exists()
+
+
+def test_a_reservoir_and_active_sampling_learn_the_same_from_clients_as_in_process(heat):
+    weights = []
+    for as_clients in (False, True):
+        environment = EnvironmentConfig(
+            "external/program",
+            env_kwargs={"program": [heat, "4", "4", "3"], "ranges": {"alpha": [0.01, 0.2]}},
+            as_tcp_ip_client=as_clients,
+            num_clients=2,
+            sampler="physx/active",
+            seed=3,
+        )
+        training = Training(
+            NetworkConfig("toy/linear", network_kwargs={"net_fields": "u", "opt_fields": "next"}),
+            environment_config=environment,
+            epoch_nb=2,
+            batch_nb=15,
+            batch_size=6,
+            online="physx/reservoir",
+            online_kwargs={"capacity": 40, "watermark": 12, "views": 3},
+            seed=0,
+            quiet=True,
+        )
+        training.execute()
+        weights.append(load_learner(training.session.path).network.weights)
+    assert weights[0].any() and weights[0].tobytes() == weights[1].tobytes()

@@ -61,6 +61,8 @@ class ExternalProgram(Environment):
             raise ConfigError(
                 f'program must be a list of texts such as ["./heat", "0.1"], not {program!r}.'
             )
+        if not (isinstance(timeout, (int, float)) and timeout > 0):
+            raise ConfigError(f"timeout must be a number of seconds above 0, not {timeout!r}.")
         self._command, self._timeout = list(command), timeout
         self._fixed, self._additional_names = dict(parameters or {}), list(additional)
         self._ranges = [_as_parameter(name, given) for name, given in (ranges or {}).items()]
