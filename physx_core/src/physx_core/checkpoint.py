@@ -77,6 +77,7 @@ class Progress:
         batch: Number of finished batches of the next epoch.
         batches_read: Number of batches read from the dataset, in all epochs.
         seed: Seed of the training.
+        blocks: Number of batches whose rows environments generated.
         best: State of `BestEpoch`.
         record: State of `TrainingRecord`.
     """
@@ -85,6 +86,7 @@ class Progress:
     batch: int
     batches_read: int
     seed: int
+    blocks: int = 0
     best: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
 

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import random
+import signal
+import subprocess
+import sys
 import threading
 import time
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +22,14 @@ from physx_core import (
     NetworkConfig,
     Training,
     Visualizer,
+    checkpoint,
 )
 from physx_core.errors import EnvironmentFailedError
 from physx_core.sources import client_source
 from physx_core.toy import Linear
 
-PUPIL = f"{Path(__file__).parents[1] / 'programs' / 'online_envs.py'}:Pupil"
+PROGRAM = Path(__file__).parents[1] / "programs" / "online_run.py"
+PUPIL = f"{PROGRAM.with_name('online_envs.py')}:Pupil"
 
 
 class Recording(Linear):
@@ -67,7 +75,11 @@ def pupil(over_tcp=True, *, instances=3, delay=0.0, restarts=0, **options):
 
 def training(config, name, *, cls=Recorded, **options):
     chosen = {"epoch_nb": 2, "batch_nb": 8, "batch_size": 7, "seed": 3, "quiet": True, **options}
-    network = NetworkConfig(Recording, network_kwargs={"net_fields": "x", "opt_fields": "y"})
+    network = NetworkConfig(
+        Recording,
+        optimization=f"{PROGRAM}:Descending",
+        network_kwargs={"net_fields": "x", "opt_fields": "y"},
+    )
     return cls(network, DatasetConfig(normalize=True), config, session_name=name, **chosen)
 
 
@@ -233,3 +245,92 @@ def test_viewers_are_called_in_the_main_thread_and_see_a_batch_before_it_is_lear
         steps = {entry[1:] for entry in before if entry[0] == "events"}
         for row in range(7 * batch):
             assert (row % 3 + 1, row // 3) in steps
+
+
+# Resumed ------------------------------------------------------------------------------------------
+
+
+class Stopped(Recorded):
+    """Is interrupted after some batches, as by Ctrl-C."""
+
+    stop_after = 5
+
+    def batch_end(self):
+        super().batch_end()
+        if len(self.seen) == self.stop_after:
+            os.kill(os.getpid(), signal.SIGINT)
+
+
+def result(run, name):
+    normalization = run.learner.transformation.normalization
+    numbers = {name: item.to_dict() for name, item in normalization.items()}
+    return stored(name), run.learner.network.weights, numbers
+
+
+@pytest.mark.parametrize("options", [{}, {"refuse": 3, "record_wrong_samples": True}], ids=str)
+@pytest.mark.parametrize("always", [False, True])
+@pytest.mark.parametrize("over_tcp", [False, True])
+def test_an_interrupted_training_is_resumed_while_environments_generate(
+    over_tcp, always, options, nothing_stays_behind
+):
+    config = pupil(over_tcp, delay=0.01, always_produce=always, **options)
+    whole = training(config, "whole")
+    whole.execute()
+    stop = training(config, "stopped", cls=Stopped)
+    stop.stop_after = 11 if always else 5
+    with pytest.raises(KeyboardInterrupt):
+        stop.execute()
+    first = len(stored("stopped")["training"]["x"])
+    assert first >= 7 * stop.stop_after
+    assert over_tcp or first == 7 * stop.stop_after
+    again = training(config, "stopped", resume=True)
+    again.execute()
+    same(stop.seen + again.seen, whole.seen)
+    same(result(again, "stopped"), result(whole, "whole"))
+
+
+def killed(name, moments, *words):
+    """Run the program to its end, but kill it after each of some times in s; count the kills."""
+    kills = 0
+    for moment in [*moments, None]:
+        process = subprocess.Popen([sys.executable, str(PROGRAM), name, *words])
+        try:
+            assert process.wait(moment) == 0
+            break
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            kills += 1
+    return kills
+
+
+def last_checkpoint(name):
+    found = checkpoint.find(Path(f"sessions/{name}"), None, -1)
+    with zipfile.ZipFile(found.path / "parameters.npz") as file:
+        weights = file.read("weights.npy")
+    normalization = {field: item.to_dict() for field, item in found.normalization.items()}
+    return weights, normalization, found.progress
+
+
+def survives(random, kills, words):
+    began = time.monotonic()
+    assert not killed("whole", [], *words)
+    whole = time.monotonic() - began
+    count = killed("killed", [1.2 * whole * random.random() for _ in range(kills)], *words)
+    same(stored("killed"), stored("whole"))
+    assert last_checkpoint("killed") == last_checkpoint("whole")
+    return count
+
+
+@pytest.mark.parametrize("words", [("clients", "once"), ("clients", "always"), ("local", "once")])
+def test_a_training_that_is_killed_while_environments_generate_is_resumed_bit_for_bit(
+    words, nothing_stays_behind
+):
+    survives(random.Random(1), 3, words)
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("words", [("clients", "once"), ("clients", "always")])
+def test_a_training_survives_being_killed_at_any_moments(words, seed, nothing_stays_behind):
+    assert survives(random.Random(seed), 20, words) > 3

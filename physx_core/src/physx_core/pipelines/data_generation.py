@@ -18,7 +18,12 @@ from physx_core.pipelines.run_description import (
     describe_failed_sets,
     describe_samples,
 )
-from physx_core.pipelines.storage import describe_environment, open_own, record_rejected
+from physx_core.pipelines.storage import (
+    GENERATION,
+    describe_environment,
+    open_own,
+    record_rejected,
+)
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 
@@ -91,9 +96,8 @@ class DataGeneration(NewSessionPipeline):
             self.batch = self.source.batch(self.batch_size)
             if self.batch_id == 0:
                 self.dataset.define_fields(self._mode, self.source.fields)
-                self.dataset.update_info(
-                    **describe_environment(self.environment_config, self._seed)
-                )
+                described = describe_environment(self.environment_config, self._seed)
+                self.dataset.update_info(**described, **{GENERATION: None})
             self.dataset.append(self._mode, self.batch, checked=True)
 
     def batch_count(self) -> None:

@@ -25,6 +25,7 @@ from physx_core.pipelines.storage import remove_unused
 from physx_core.plugins import resolve
 from physx_core.session import Session
 from physx_core.sources.source import Source
+from physx_core.workers.instance import NOTHING, Skip
 
 _STREAMS = {"training": 0, "validation": 1, "prediction": 2}
 
@@ -234,6 +235,7 @@ class Pipeline(ABC):
         in_process: bool = False,
         replayed: Path | None = None,
         accept_all: bool = False,
+        skip: Skip = NOTHING,
     ) -> Source:
         """Open the environments, in this process or in clients.
 
@@ -250,6 +252,7 @@ class Pipeline(ABC):
             replayed: Folder of the dataset whose samples they replay; the parameters saved there
                 can be loaded. None: they generate new samples.
             accept_all: Whether samples that `check_sample` rejects count like the others.
+            skip: The rows that an earlier run has had: they are generated again, but not returned.
         """
         services = RunServices(
             self.session.dataset_dir, show or self.observers.events, predict, replayed
@@ -258,12 +261,18 @@ class Pipeline(ABC):
         if in_process or not config.as_tcp_ip_client:
             from physx_core.sources.local_source import LocalSource
 
-            source = LocalSource(config, services, seed, accept_all=accept_all)
+            source = LocalSource(config, services, seed, accept_all=accept_all, skip=skip)
         else:
             from physx_core.sources.client_source import ClientSource
 
             source = ClientSource(
-                config, services, seed, run_ahead=run_ahead, total=total, accept_all=accept_all
+                config,
+                services,
+                seed,
+                run_ahead=run_ahead,
+                total=total,
+                accept_all=accept_all,
+                skip=skip,
             )
         return resources.enter_context(source)
 

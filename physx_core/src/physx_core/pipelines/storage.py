@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ PARAMETERS = "parameters_{}.bin"
 """Name of the file beside a dataset that contains an instance's saved parameters."""
 LARGEST_PARAMETERS = 2**32
 """Bytes of such a file."""
+GENERATION = "generation"
+"""Entry of a dataset's info that describes the last training whose environments generated rows."""
 
 
 def open_own(session: Session, config: DatasetConfig) -> Dataset:
@@ -175,7 +177,8 @@ def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
         )
     dataset.merge(config.existing_dir)
     with Dataset.open(config.existing_dir) as existing:
-        dataset.update_info(**existing.info, copied_from=str(existing.directory))
+        info = {**existing.info, GENERATION: None, "copied_from": str(existing.directory)}
+        dataset.update_info(**info)
         for path in existing.directory.glob(PARAMETERS.format("*")):
             with files.storing(f"{path}, copied into the session,"):
                 content = files.read_content(path, LARGEST_PARAMETERS)
@@ -190,7 +193,9 @@ def is_copy(directory: Path) -> bool:
 
 
 @contextlib.contextmanager
-def record_rejected(source: Source, dataset: Dataset | None) -> Iterator[None]:
+def record_rejected(
+    source: Source, dataset: Dataset | None, earlier: Mapping[int, int] | None = None
+) -> Iterator[None]:
     """Store what a source makes beside the rows of a batch.
 
     These are the samples that `check_sample` rejects during the body, in the mode "wrong", and the
@@ -202,25 +207,35 @@ def record_rejected(source: Source, dataset: Dataset | None) -> Iterator[None]:
     Args:
         source: Generates the batch.
         dataset: Stores the samples; None: they are discarded.
+        earlier: Instance to the step of its last row before the batch, if a run was killed before
+            it stored what was rejected until then: that is stored first. None: nothing is left.
     """
     try:
         yield
     except PhysxError as error:
         if isinstance(error, WrongSamplesError):
-            _store_rejected(source, dataset)
+            _store_rejected(source, dataset, earlier)
         source.sets.note_failed()
         with contextlib.suppress(PhysxError):  # the run's own error matters more
             _store_sets(source, dataset)
         raise
-    _store_rejected(source, dataset)
+    _store_rejected(source, dataset, earlier)
     _store_sets(source, dataset)
 
 
-def _store_rejected(source: Source, dataset: Dataset | None) -> None:
+def _store_rejected(
+    source: Source, dataset: Dataset | None, earlier: Mapping[int, int] | None
+) -> None:
     rows = source.pop_rejected()
-    if rows and dataset is not None:
-        dataset.define_fields(WRONG, source.fields)
-        dataset.append(WRONG, rows, checked=True)
+    if not rows or dataset is None:
+        return
+    dataset.define_fields(WRONG, source.fields)
+    last = [(earlier or {}).get(number, -1) for number in rows["env_id"].tolist()]
+    is_left = rows["step"] < last
+    for chosen in (is_left, ~is_left):
+        if chosen.any():
+            part = {name: values[chosen] for name, values in rows.items()}
+            dataset.append(WRONG, part, checked=True)
 
 
 def _store_sets(source: Source, dataset: Dataset | None) -> None:

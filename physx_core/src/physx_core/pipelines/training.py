@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import shlex
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -34,8 +36,9 @@ from physx_core.pipelines.learning.drawn_rows import DrawnRows
 from physx_core.pipelines.learning.feeder import Feeder
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.resuming import (
+    Generation,
     can_resume,
-    read_last_checkpoint,
+    find_start,
     without_copied_dataset,
 )
 from physx_core.pipelines.learning.training_data import TrainingData
@@ -47,6 +50,7 @@ from physx_core.pipelines.run_description import (
     describe_training,
 )
 from physx_core.pipelines.storage import (
+    GENERATION,
     check_sources,
     copy_existing,
     describe_environment,
@@ -58,6 +62,7 @@ from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
+from physx_core.workers.instance import NOTHING, Skip
 
 _ADVICE = (
     "Lower the learning rate, normalize the data (DatasetConfig.normalize) or limit the gradients; "
@@ -141,8 +146,12 @@ class Training(NewSessionPipeline):
     """Keyword arguments of each observer, by its name; in a command ``rerun={mode="save"}``."""
     histograms_every: int = at_least(0, 0)
     """Number of epochs between histograms of weights and gradients; 0: none."""
+    checkpoint_every: int = at_least(0, 0)
+    """Number of batches between checkpoints within epochs, counted over all epochs; 0: none."""
     resume: bool = field(default=False, metadata={"recorded": False})
-    """Resume from the session's last checkpoint, up to `epoch_nb` epochs in total."""
+    """Resume from the session's last checkpoint, up to `epoch_nb` epochs in total. While
+    environments generate the samples, they generate those that are stored again, unless they depend
+    on predictions; without a checkpoint the training begins again with the stored samples."""
 
     kind: ClassVar[str] = "training"
     group: Group = field(init=False, repr=False, default_factory=Group)
@@ -161,6 +170,7 @@ class Training(NewSessionPipeline):
     _is_savable: bool = field(init=False, repr=False, default=False)
     _met_nan: bool = field(init=False, repr=False, default=False)
     _blocks: int = field(init=False, repr=False, default=0)
+    _generation: Generation | None = field(init=False, repr=False, default=None)
 
     def execute(self) -> None:
         """Train. However the training ends, the network trained so far is a checkpoint to resume.
@@ -191,8 +201,7 @@ class Training(NewSessionPipeline):
                             raise self._lacks_super("optimize")
                         self._count("batch_id", "batch_count")
                         self.batch_end()
-                        if self.group.any(bool(interrupt)) and self.batch_condition():
-                            self._end_early(interrupt)
+                        self._leave_batch(interrupt)
                     self._count("epoch_id", "epoch_count")
                     self.epoch_end()
                     if self.group.any(bool(interrupt)):
@@ -215,7 +224,8 @@ class Training(NewSessionPipeline):
         """Called before each epoch; decides how many batches it has."""
         begins = self.epoch_id == self._resumed.epoch
         self.batch_id = self._resumed.batch if begins else 0
-        self._epoch_batches = self.data.begin_epoch(self.epoch_id, self.learner.batch_fields)
+        names = self.learner.batch_fields
+        self._epoch_batches = self.data.begin_epoch(self.epoch_id, names, self.batch_id)
         if self.data.has_changed:
             self.learner.normalize(self.data.normalization())
         if begins:
@@ -260,15 +270,19 @@ class Training(NewSessionPipeline):
         """Count the batch and record its losses."""
         self.batch_id += 1
         values = self._record.add(self.losses)
-        number = self.epoch_id * (self._epoch_batches or 0) + self.batch_id
         if self.data.produces and self.data.online is not None:
             self._blocks = self.data.online.number
             values |= self.data.online.recent_statistics()
-        self.observers.scalars(values, number, "batch")
+        self.observers.scalars(values, self._number, "batch")
         self.observers.advance(1)
         if self._leads and time.monotonic() > self._checked + _SESSION_INTERVAL:
             checkpoint.check_session(self.session.network_dir)
             self._checked = time.monotonic()
+
+    @property
+    def _number(self) -> int:
+        """Number of finished batches of all epochs."""
+        return self.epoch_id * (self._epoch_batches or 0) + self.batch_id
 
     def batch_end(self) -> None:
         """Called after each batch."""
@@ -357,6 +371,7 @@ class Training(NewSessionPipeline):
             self.batch_id,
             self.data.batches_read,
             self._resumed.seed,
+            self._blocks,
             self.best.state,
             self._record.state,
         )
@@ -365,6 +380,13 @@ class Training(NewSessionPipeline):
         if online is not None and self.data.produces:
             state = online.state(self._blocks)
         return self.learner.save(self.session.network_dir, progress, state, best=best)
+
+    def _leave_batch(self, interrupt: Interrupt) -> None:
+        """Write a checkpoint if one is due, and end within an epoch after a signal."""
+        if self.checkpoint_every and self._number % self.checkpoint_every == 0:
+            self.save_checkpoint()
+        if self.group.any(bool(interrupt)) and self.batch_condition():
+            self._end_early(interrupt)
 
     def _end_early(self, interrupt: Interrupt) -> None:
         self.save_checkpoint()
@@ -387,9 +409,15 @@ class Training(NewSessionPipeline):
             error.add_note(f"The network could not be saved: {failure} Last checkpoint: {last}.")
         else:
             how = "from which resume=True (physx train --resume) continues"
-            if not can_resume(self.environment_config, self.epoch_id):
+            if not self._is_resumable:
                 how = "with which another training starts: NetworkConfig.network_dir"
             error.add_note(f"The network trained so far is {self.checkpoint_path}, {how}.")
+
+    @property
+    def _is_resumable(self) -> bool:
+        """Whether the training can be resumed from the last checkpoint."""
+        repeats = self._generation is not None and not self._generation.asks
+        return repeats or can_resume(self.environment_config, self.epoch_id)
 
     def _check_parameters(self) -> None:
         name = self.learner.network.find_not_finite() if self.on_nan == "stop" else ""
@@ -419,13 +447,19 @@ class Training(NewSessionPipeline):
         check_sources(config, environment)
         self._network_class: Any = Network
         self._prepare_network_class()
-        last = session = None
+        last = session = generation = None
         if self.resume:
             session = Session.existing(self.session_dir, self.session_name)
             name = self.network_config.network_name or checkpoint.NAME
-            last = read_last_checkpoint(session, name, environment)
-            config, environment = without_copied_dataset(session, config), None
-        self._start_from(last)
+            last, environment, generation = find_start(session, name, environment)
+            config = without_copied_dataset(session, config)
+            if environment is not None and self.group.size > 1:
+                raise ConfigError(
+                    "Several processes cannot resume a training while environments generate its "
+                    "samples. Resume it in one process, up to the end of the epochs in which they "
+                    "do; then continue in several."
+                )
+        self._start_from(last, generation)
         buffer = self._create_buffer()
         self._network_class.set_seed(self._resumed.seed)
         self.learner = Learner(self.network_config, trains=True, stops_at_nan=self.on_nan == "stop")
@@ -440,7 +474,8 @@ class Training(NewSessionPipeline):
         if environment is not None and self._leads:
             if environment.as_tcp_ip_client and not environment.load_samples:
                 feeder = Feeder[Block]()
-            source = self._open_environments(resources, environment, dataset, feeder, buffer)
+            skip = self._begin_generation(dataset, config.mode, environment, generation)
+            source = self._open_environments(resources, environment, dataset, feeder, buffer, skip)
         self.data = TrainingData(
             dataset,
             source,
@@ -453,15 +488,22 @@ class Training(NewSessionPipeline):
             buffer=buffer,
             drawn=self._open_drawn_rows(resources, buffer) if source is not None else None,
             group=self.group,
+            first=0 if self._generation is None else self._generation.first,
             feeder=feeder,
             ahead=type(self).batch_condition is Training.batch_condition
             and type(self).batch_produce is Training.batch_produce,
         )
         resources.callback(self.data.close)
+        if last is not None and self._resumed.blocks:
+            state = partial(checkpoint.read_buffer, last)
+            self.data.resume(self._resumed.blocks, state, self.learner.batch_fields)
         fields = self.data.fields
         shapes = [fields[name].shape for name in self.learner.batch_fields if name in fields]
         if not self.data.produces or None not in shapes:  # else bound with the first batch
-            self.learner.bind(fields, self.data.normalization())
+            known = self.data.normalization()
+            if last is not None and dataset.info.get(GENERATION) and config.existing_dir is None:
+                known = last.normalization  # to the last bit
+            self.learner.bind(fields, known)
         self._load_parameters(last)
         self.learner.join(self.group)
         self.learner.network.set_train()
@@ -479,11 +521,14 @@ class Training(NewSessionPipeline):
         if self.group.size > 1 and self.environment_config is not None and not self.resume:
             reject_environments(self.environment_config)
 
-    def _start_from(self, last: checkpoint.Checkpoint | None) -> None:
+    def _start_from(
+        self, last: checkpoint.Checkpoint | None, generation: Generation | None
+    ) -> None:
         """Start at the first epoch, or where a checkpoint was written."""
-        seed = self.group.tell(choose_seed(self.seed))
+        seed = self.group.tell(choose_seed(self.seed) if generation is None else generation.seed)
         self._resumed = last.progress if last else Progress(0, 0, 0, seed)
         self._saved = (self._resumed.epoch, self._resumed.batch)
+        self._blocks = self._resumed.blocks
         self.checkpoint_path = last.path if last else None
         self._record = TrainingRecord(self._resumed.record)
         self.best = BestEpoch(self._resumed.best, self.min_improvement)
@@ -518,7 +563,7 @@ class Training(NewSessionPipeline):
         if not buffer.capacity:
             return None
         return resources.enter_context(
-            contextlib.closing(DrawnRows(self.session, buffer.batch_size))
+            contextlib.closing(DrawnRows(self.session, buffer.batch_size, self._resumed.blocks))
         )
 
     def _open_session(self) -> Session:
@@ -565,7 +610,7 @@ class Training(NewSessionPipeline):
             words = [f"--network.{k} {shlex.quote(v)}" for k, v in named.items() if ":" in v]
             yield " ".join(["physx predict", path, "ENVIRONMENT --step-nb N", *words])
             yield f"physx stats {path}"
-        elif can_resume(self.environment_config, self.epoch_id):
+        elif self._is_resumable:
             yield f"physx train {path} --resume"
         else:
             yield f"physx train --config {path} --network.network-dir {path}"
@@ -592,10 +637,13 @@ class Training(NewSessionPipeline):
         dataset: Dataset,
         feeder: Feeder[Block] | None,
         buffer: Buffer,
+        skip: Skip,
     ) -> Source:
         seed = self._resumed.seed if config.seed is None else config.seed
         dataset.update_info(**describe_environment(config, seed))
         stored = dataset.num_samples("training") if "training" in dataset.modes else 0
+        if self._generation is not None:
+            stored = self._generation.offset
         return self._open_source(
             resources,
             config,
@@ -604,11 +652,29 @@ class Training(NewSessionPipeline):
             show=None if feeder is None else feeder.telling(self.observers.events),
             run_ahead=0 if config.load_samples else None,
             total=None if config.load_samples or not self.batch_nb else buffer.total,
+            skip=skip,
         )
+
+    def _begin_generation(
+        self, dataset: Dataset, mode: str, config: EnvironmentConfig, former: Generation | None
+    ) -> Skip:
+        """Keep what the environments' rows depend on; return those that an earlier run has had."""
+        if config.load_samples:
+            return NOTHING
+        seed, size = self._resumed.seed, self.batch_size * self.group.size
+        now = Generation.begin(dataset, mode, seed, size, self.batch_nb)
+        self._generation, self._dataset = former or now, dataset
+        if former is not None:
+            return former.resume(dataset, config, now)
+        now.store(dataset)
+        return NOTHING
 
     def _predict(self, batch: Batch) -> Batch:
         """Answer `Environment.get_prediction`; before the first batch with the step's shapes."""
         learner, data = self.learner, getattr(self, "data", None)
+        if self._generation is not None and not self._generation.asks:
+            self._generation = dataclasses.replace(self._generation, asks=True)
+            self._generation.store(self._dataset)
         if not learner.fields and data is not None:
             known = [name for name, field in data.fields.items() if field.shape is not None]
             if all(name in known for name in learner.batch_fields):

@@ -21,6 +21,7 @@ from physx_core.net.values import encode
 from physx_core.rows import ROW_FIELDS, concatenate
 from physx_core.sources.source import Source, check_stored
 from physx_core.typing import Batch
+from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.row_codec import row_bytes
 from physx_core.workers.server.client_group import ClientGroup
@@ -50,6 +51,7 @@ class ClientSource(Source):
         run_ahead: int | None = None,
         total: int | None = None,
         accept_all: bool = False,
+        skip: Skip = NOTHING,
     ) -> None:
         """Prepare the clients.
 
@@ -60,21 +62,24 @@ class ClientSource(Source):
             run_ahead: Number of rows that each client may generate before they are requested;
                 None: as many as fit in 4 MB. It must be 0 if predictions are applied, or stored
                 rows are replayed.
-            total: Number of rows that will be requested in all, beyond which no client generates
-                any; None: unknown.
+            total: Number of rows that will be requested in all, with those to skip, beyond which
+                no client generates any; None: unknown.
             accept_all: Whether samples that `check_sample` rejects count like the others.
+            skip: The rows that an earlier run has had: they are generated again, but not returned.
         """
         self.instance_nb = config.num_clients
-        self.sets = ParameterSets(config, seed)
-        self._group = ClientGroup(config, services, seed, self.sets, accept_all=accept_all)
+        self.sets = ParameterSets(config, seed, skip)
+        self._group = ClientGroup(
+            config, services, seed, self.sets, accept_all=accept_all, skip=skip
+        )
         self._rejections = 0
         if config.record_wrong_samples:
             self._rejections = config.max_wrong_samples_per_step + 1
         self._failed_row: int | None = None
         self._run_ahead, self._total = run_ahead, total
-        self._asked = 0
-        self._taken = [0] * self.instance_nb
-        self._first = 0
+        self._asked = self._first = skip.rows
+        self._taken = [skip.rows_of(n + 1, self.instance_nb) for n in range(self.instance_nb)]
+        self._agreeing = {1}
         self._opened: list[Field] = []
         self._table: list[Field] = []
         self._out: Batch = {}
@@ -260,8 +265,9 @@ class ClientSource(Source):
             if not missing:
                 continue
             if peer.rows.count:
-                if not taken:
+                if number not in self._agreeing:
                     self._agree(number, self._table, peer.row_fields)
+                    self._agreeing.add(number)
                 start = taken * self.instance_nb + number - 1 - self._first
                 moved = peer.rows.take(missing, self._out, start, self.instance_nb)
                 self._taken[number - 1] += moved

@@ -15,7 +15,7 @@ from physx_core.fields import Field
 from physx_core.rows import ROW_FIELDS, RowBuffer, concatenate, copy_row, infer_shapes
 from physx_core.sources.source import Source, check_stored
 from physx_core.typing import Batch, Sample
-from physx_core.workers.instance import Instance, instance_arguments
+from physx_core.workers.instance import NOTHING, Instance, Skip, instance_arguments
 from physx_core.workers.parameter_sets import ParameterSets, next_step
 
 _LOG = logging.getLogger("physx")
@@ -31,6 +31,7 @@ class LocalSource(Source):
         seed: Sequence[int],
         *,
         accept_all: bool = False,
+        skip: Skip = NOTHING,
     ) -> None:
         """Prepare the instances.
 
@@ -39,6 +40,7 @@ class LocalSource(Source):
             services: Serves the environments' requests.
             seed: Seed of all instances.
             accept_all: Whether samples that `check_sample` rejects count like the others.
+            skip: The rows that an earlier run has had: they are generated again, but not returned.
         """
         self.instance_nb = config.num_clients
         self._services = services
@@ -47,10 +49,11 @@ class LocalSource(Source):
             instance_arguments(config, number, seed, accept_all)
             for number in range(1, self.instance_nb + 1)
         ]
-        self.sets = ParameterSets(config, seed)
+        self.sets = ParameterSets(config, seed, skip)
         self._instances = [Instance(**arguments) for arguments in self._arguments]
         self._buffer: RowBuffer | None = None
         self._next = 0
+        self._skip = skip
         self._last = range(0)
         self._last_steps = [-1] * self.instance_nb
 
@@ -74,6 +77,7 @@ class LocalSource(Source):
             check_stored(stored, size)
         if self._config.record_wrong_samples:
             self.pop_rejected()
+        self._generate_again()
         buffer = self._buffer
         if buffer is not None:
             buffer.clear()
@@ -136,6 +140,22 @@ class LocalSource(Source):
         )
         instance.rejected = former.rejected
         self._open(instance)
+
+    def _generate_again(self) -> None:
+        """Step the instances through the rows that an earlier run has had."""
+        while self._next < self._skip.rows:
+            place = self._next % self.instance_nb
+            try:
+                self._instances[place].step()
+            except PhysxError as error:
+                self._redraw(place, error)
+                continue
+            self._last_steps[place] = self._instances[place].last_step
+            self._next += 1
+            if self._next == self._skip.rows:
+                for instance in self._instances:
+                    if instance.rejected is not None:
+                        instance.rejected.forget(self._skip.rejected_of(instance.instance_id))
 
     def pop_rejected(self) -> Batch:
         """Return the rejected samples: see `Source.pop_rejected`."""

@@ -7,7 +7,7 @@ import inspect
 import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from physx_core.components.environment import (
     Choose,
@@ -30,9 +30,37 @@ from physx_core.errors import (
 from physx_core.fields import Field
 from physx_core.plugins import resolve
 from physx_core.rows import RejectedSamples
-from physx_core.typing import Sample
+from physx_core.typing import Batch, Sample
 
 _STEPPING = ("reset_parameters", "step", "check_sample", "apply_prediction", "close")
+
+
+class Skip(NamedTuple):
+    """What an earlier run has had of the same instances, with the same seed.
+
+    Attributes:
+        rows: Number of rows of all instances together.
+        rejected: Number of rejected samples of each instance; empty: none.
+        sets: Number of sets of parameters.
+        begun: Fields ``env_id`` and ``episode`` of the rows; empty: not known.
+    """
+
+    rows: int = 0
+    rejected: tuple[int, ...] = ()
+    sets: int = 0
+    begun: Batch = {}  # noqa: RUF012 - never changed
+
+    def rows_of(self, number: int, instance_nb: int) -> int:
+        """Return how many of the rows an instance generated, counted from 1."""
+        return (self.rows - number + instance_nb) // instance_nb
+
+    def rejected_of(self, number: int) -> int:
+        """Return how many samples of an instance were rejected."""
+        return self.rejected[number - 1] if self.rejected else 0
+
+
+NOTHING = Skip()
+"""What a new run has had."""
 
 
 def instance_arguments(

@@ -29,6 +29,7 @@ from physx_core.errors import (
 from physx_core.fields import Field
 from physx_core.plugins import resolve
 from physx_core.typing import Array, Batch, Index
+from physx_core.workers.instance import NOTHING, Skip
 
 _DEFAULT = "physx/uniform"
 _OF_PARAMETERS = (
@@ -49,12 +50,15 @@ class ParameterSets:
         count: Number of sets that were found to begin.
     """
 
-    def __init__(self, config: EnvironmentConfig, seed: Sequence[int]) -> None:
+    def __init__(
+        self, config: EnvironmentConfig, seed: Sequence[int], skip: Skip = NOTHING
+    ) -> None:
         """Create the sampler.
 
         Args:
             config: Names the sampler, the number of instances, and how many sets may fail.
             seed: Seed of the run.
+            skip: What an earlier run has had, the records of its sets among it.
         """
         if config.redraw and config.load_samples:
             raise ConfigError(
@@ -66,6 +70,7 @@ class ParameterSets:
         self.count = 0
         self._config, self._seed = config, list(seed)
         self.instance_nb = config.num_clients
+        self._skip = skip
         self._sampler = _make_sampler(config)
         self._redraws = [0] * self.instance_nb
         self._waiting: list[dict[int, Mapping[str, Any]]] = [{} for _ in self._redraws]
@@ -264,7 +269,11 @@ class ParameterSets:
         self._begun, self._failed = [], []
         if not self.parameters:
             return
-        numbers = np.asarray(batch["episode"], np.int64) * self.instance_nb + batch["env_id"] - 1
+        skip, self._skip = self._skip, NOTHING
+        rows = {name: batch[name] for name in ("episode", "env_id")}
+        if skip.begun:
+            rows = {name: np.concatenate([skip.begun[name], rows[name]]) for name in rows}
+        numbers = np.asarray(rows["episode"], np.int64) * self.instance_nb + rows["env_id"] - 1
         found, first = np.unique(numbers, return_index=True)
         for number in found[np.argsort(first)].tolist():
             waiting = self._waiting[number % self.instance_nb]
@@ -273,6 +282,7 @@ class ParameterSets:
             if number in waiting and number not in self._stored:
                 self._stored[number] = self.count
                 self._add(number, waiting[number], failed=False)
+        del self._begun[: skip.sets]
 
     def note_failed(self) -> None:
         """Find the sets that failed and that no later row follows, at the end of a run."""

@@ -43,7 +43,7 @@ class DrawnRows:
         head = np.array([_MARK, batch_size], _NUMBER)
         with files.storing(f"{self._path}"):
             files.make_folder(self._path.parent)
-            if first and self._path.exists():
+            if self._path.exists():
                 self._descriptor = files.open_regular(self._path, os.O_RDWR)
             else:
                 self._descriptor = files.create_new(self._path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -82,16 +82,21 @@ class OnlineBatches:
         return self._store.take(draw.drawn)
 
     def resume(
-        self, number: int, state: Index, dataset: Dataset, mode: str, names: Sequence[str]
+        self,
+        number: int,
+        state: Callable[[], Index],
+        dataset: Dataset,
+        mode: str,
+        names: Sequence[str],
     ) -> None:
         """Continue after some batches, with the buffer as it was then.
 
-        The blocks continue there, too, and so does the record of drawn rows.
+        The blocks continue there, too; the record of drawn rows was opened there.
 
         Args:
-            number: Number of batches drawn.
-            state: State of the buffer then; empty if it keeps nothing.
-            dataset: Has all rows that had arrived then.
+            number: Number of batches drawn, at least one.
+            state: Returns the state of the buffer then; called if it keeps rows.
+            dataset: Has the rows that had arrived then.
             mode: Their mode.
             names: Fields that a batch contains if the buffer keeps rows.
 
@@ -100,11 +105,12 @@ class OnlineBatches:
         """
         buffer = self._buffer
         self.number = number
-        self._arrived = buffer.needed(number - 1) if number else 0
-        if not number or not buffer.capacity:
+        self._blocks.skip(self._counts(range(number)))
+        self._arrived = buffer.needed(number - 1)
+        if not buffer.capacity:
             return
         try:
-            buffer.restore(number, state)
+            buffer.restore(number, state())
         except ValueError as error:
             raise CheckpointError(
                 f"The training cannot be resumed: the state of its buffer does not fit "
@@ -118,9 +124,13 @@ class OnlineBatches:
 
     def expect(self, batches: int) -> None:
         """Announce that this many batches will be taken."""
-        needed = [self._arrived]
-        needed += [self._buffer.needed(self.number + batch) for batch in range(batches)]
-        self._blocks.expect(after - before for before, after in itertools.pairwise(needed))
+        self._blocks.expect(self._counts(range(self.number, self.number + batches)))
+
+    def _counts(self, batches: range) -> Iterator[int]:
+        """Return how many rows arrive for each of some batches, the next one first."""
+        needed = map(self._buffer.needed, batches)
+        pairs = itertools.pairwise(itertools.chain([self._arrived], needed))
+        return (after - before for before, after in pairs)
 
     def close(self) -> None:
         """Have no more rows generated, before the environments are closed."""

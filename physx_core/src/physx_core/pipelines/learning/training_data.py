@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -23,7 +23,7 @@ from physx_core.pipelines.storage import other_samples, record_rejected
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.sources.source import Source
 from physx_core.statistics import Normalization
-from physx_core.typing import Array, Batch
+from physx_core.typing import Array, Batch, Index
 
 _IDENTITY = ("env_id", "episode")
 
@@ -67,6 +67,7 @@ class TrainingData:
         buffer: Buffer,
         drawn: DrawnRows | None = None,
         group: Group,
+        first: int = 0,
         feeder: Feeder[Block] | None = None,
         ahead: bool = True,
     ) -> None:
@@ -84,6 +85,7 @@ class TrainingData:
             buffer: Decides what batches hold while environments generate; it has begun.
             drawn: Where to write which rows the buffer drew.
             group: The processes that train together; only the leading one has the environments.
+            first: Number of samples that the mode had before the first generated batch.
             feeder: Has a thread that has the environments generate batches ahead of the training;
                 None: they are generated when they are taken.
             ahead: Whether all batches of an epoch will be taken, so that they may be generated
@@ -123,8 +125,9 @@ class TrainingData:
         if source is not None and replay:
             self._stored = self._stored_rows(source)
         elif source is not None:
-            blocks = Blocks(source, dataset, self._mode, normalize=config.normalize, feeder=feeder)
-            first = self._count(self._mode)
+            blocks = Blocks(
+                source, dataset, self._mode, normalize=config.normalize, first=first, feeder=feeder
+            )
             self.online = OnlineBatches(blocks, buffer, data_type, drawn, first)
             source.sets.follow(buffer.needed)
             if source.sets.learns and group.size > 1:
@@ -161,17 +164,18 @@ class TrainingData:
         compare_fields(f'The environment cannot replay mode "{self._mode}", which', known, given)
         return rows
 
-    def begin_epoch(self, epoch_id: int, names: Sequence[str]) -> int:
+    def begin_epoch(self, epoch_id: int, names: Sequence[str], done: int = 0) -> int:
         """Prepare an epoch and return its number of batches.
 
         Args:
             epoch_id: Index of the epoch, from 0.
             names: Fields of the batches that are read from the dataset.
+            done: Number of its batches that were learned from already.
         """
         self._names = names
         self._uses_source = self._has_source and (epoch_id == 0 or self._always)
         if self._uses_source and self.online is not None and self._ahead:
-            self.online.expect(self._batch_nb or 0)
+            self.online.expect(max(0, (self._batch_nb or 0) - done))
         if not self._uses_source and self._reader is None:
             if self._shared is not None:
                 self._shared.finish(self.dataset)
@@ -219,6 +223,20 @@ class TrainingData:
         """End what generates batches ahead, before the source is closed."""
         if self.online is not None:
             self.online.close()
+
+    def resume(self, batches: int, state: Callable[[], Index], names: Sequence[str]) -> None:
+        """Continue after batches that were drawn while environments generated.
+
+        Args:
+            batches: Their number.
+            state: Returns the state of the buffer then; called if it keeps rows.
+            names: Fields of the batches.
+
+        Raises:
+            CheckpointError: If it is not a state of this buffer.
+        """
+        if self.online is not None:
+            self.online.resume(batches, state, self.dataset, self._mode, names)
 
     def skip(self, batches: int) -> None:
         """Skip batches that a training read before it was interrupted."""
@@ -273,7 +291,7 @@ class TrainingData:
         """The stored fields by name; those of the environments until something is stored."""
         if self._shared is not None:
             return self._shared.block.fields
-        if self.online is not None and self.online.number:
+        if self.online is not None and self.online.block.fields:
             return self.online.block.fields
         if self.source is not None and not self._count(self._mode):
             return {field.name: field for field in self.source.fields}
@@ -284,7 +302,7 @@ class TrainingData:
         self._changed = False
         if self.produces and self._shared is not None:
             return self._shared.block.normalization
-        if self.produces and self.online is not None and self.online.number:
+        if self.produces and self.online is not None and self.online.block.fields:
             return self.online.block.normalization
         if not self._config.normalize or not self._count(self._mode):
             return {}

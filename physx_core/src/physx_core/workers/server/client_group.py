@@ -26,7 +26,7 @@ from physx_core.net.tokens import choose_token
 from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate
-from physx_core.workers.instance import instance_arguments
+from physx_core.workers.instance import NOTHING, Skip, instance_arguments
 from physx_core.workers.launchers import stop
 from physx_core.workers.parameter_sets import ParameterSets, next_step
 from physx_core.workers.server.client_errors import exit_error, timeout_error
@@ -57,6 +57,7 @@ class ClientGroup:
         sets: ParameterSets,
         *,
         accept_all: bool = False,
+        skip: Skip = NOTHING,
     ) -> None:
         """Keep the arguments; `open` starts the clients.
 
@@ -66,10 +67,11 @@ class ClientGroup:
             seed: Seed of all instances.
             sets: Chooses the instances' parameters.
             accept_all: Whether samples that `check_sample` rejects count like the others.
+            skip: What an earlier run has had: clients generate it again, but do not send it.
         """
         self.config = config
         self._seed, self._sets = list(seed), sets
-        self._accepts_all = accept_all
+        self._accepts_all, self._skip = accept_all, skip
         self._launcher = _make_launcher(config)
         self._handles: dict[int, ClientHandle] = {}
         self._launched: dict[int, float] = {}
@@ -86,6 +88,7 @@ class ClientGroup:
             choose_token(config, self._launcher.by_hand),
             sets,
             self._replaces,
+            skip,
         )
 
     def open(self) -> None:
@@ -240,7 +243,18 @@ class ClientGroup:
         return passing and self._restarts[number] < self.config.restarts
 
     def _redraws_after(self, number: int, error: PhysxError | None) -> bool:
-        return error is not None and self._sets.can_redraw(number, error)
+        if error is None or self._repeats(number):
+            return False
+        return self._sets.can_redraw(number, error)
+
+    def _repeats(self, number: int) -> bool:
+        """Return whether a client has not yet got beyond the rows that an earlier run has had.
+
+        Which of them it fails at is not known, so no other can go on there with other parameters.
+        """
+        peer, rows = self.server.peers.get(number), self._skip.rows
+        had = self._skip.rows_of(number, self.config.num_clients)
+        return rows > 0 and (peer is None or peer.received <= had)
 
     def _lose(self, number: int, error: PhysxError, *, left: bool = False) -> None:
         """Have another client take the place of one that is lost.

@@ -21,6 +21,7 @@ from physx_core.net.liveness import is_loss
 from physx_core.net.remote_errors import decode_error, encode_error
 from physx_core.net.spin_wait import has_core_for_each
 from physx_core.net.strangers import Handshakes
+from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.journal import Journal
@@ -60,6 +61,7 @@ class Server:
         token: str,
         sets: ParameterSets,
         replaces: Callable[[int, PhysxError | None], bool] = lambda number, error: False,
+        skip: Skip = NOTHING,
     ) -> None:
         """Keep the arguments; `open` starts to listen.
 
@@ -73,13 +75,14 @@ class Server:
             sets: Chooses the instances' parameters.
             replaces: Whether another client takes the place of one that failed with an error, or
                 left without one.
+            skip: What an earlier run has had of the instances.
         """
         self.peers: dict[int, Peer] = {}
         self.token = token
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
         self._spin_time = _SPIN_TIME if has_core_for_each(instance_nb) else 0.0
         self._requests = ServiceRequests(services, sets)
-        self._setup, self._replaces = setup, replaces
+        self._setup, self._replaces, self._skip = setup, replaces, skip
         self._ending = self._has_news = False
         self._listener = Listener[Peer](self._meet, self._give_up)
         self._strangers = Handshakes[Peer](
@@ -280,7 +283,10 @@ class Server:
         self.peers[peer.instance_id] = peer
         if former is not None:
             peer.succeed(former)
-        elif self._replaces(peer.instance_id, None):
+        else:
+            peer.received = self._skip.rows_of(peer.instance_id, self._instance_nb)
+            peer.rejected.count = self._skip.rejected_of(peer.instance_id)
+        if former is None and self._replaces(peer.instance_id, None):
             peer.journal = Journal()
         peer.send(pack(Kind.SETUP, self._setup(peer)))
 
