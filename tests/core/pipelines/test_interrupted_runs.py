@@ -105,8 +105,8 @@ AGAIN = "next: physx train --config sessions/new --network.network-dir sessions/
 LEFT = {
     "generation": ["next: physx info sessions/new"],
     "training": [CHECKPOINT, "next: physx train sessions/new --resume"],
-    "online training": [CHECKPOINT, AGAIN],
-    "training with clients": [CHECKPOINT, AGAIN],
+    "online training": [CHECKPOINT, "next: physx train sessions/new --resume"],
+    "training with clients": [CHECKPOINT, "next: physx train sessions/new --resume"],
     "prediction": ["next: physx info sessions/trained"],
     "replay": ["session: sessions/new is removed, as the run kept nothing in it"],
 }
@@ -200,19 +200,31 @@ def test_an_environment_that_fails_leaves_a_checkpoint_and_the_error_names_it():
         Training(NETWORK, None, config, batch_nb=3, **OPTIONS).execute()
     place = Path("sessions/training/network/network_0")
     assert str(place) in caught.value.__notes__[-1]
-    assert "NetworkConfig.network_dir" in caught.value.__notes__[-1]
+    assert "from which resume=True" in caught.value.__notes__[-1]
     assert progress() == (1, 1)
     Training(NETWORK, batch_nb=3, resume=True, **OPTIONS).execute()
     assert progress(number=1) == (3, 0)
 
 
+class Asking(Failing):
+    """Moves as the network that learns predicts."""
+
+    def step(self):
+        super().step()
+        self.state = (
+            self.state + self.get_prediction(state=self.state, force=np.zeros(1))["next_state"]
+        )
+
+
 def test_a_training_that_cannot_be_resumed_says_how_to_go_on(capfd):
-    config = EnvironmentConfig(Failing, as_tcp_ip_client=False, seed=1)
+    config = EnvironmentConfig(Asking, as_tcp_ip_client=False, seed=1)
     with pytest.raises(EnvironmentFailedError) as caught:
         Training(NETWORK, None, config, batch_nb=9, **OPTIONS).execute()
     assert "NetworkConfig.network_dir" in caught.value.__notes__[-1]
     last = capfd.readouterr().err.splitlines()[-1]
     assert last == AGAIN.replace("new", "training")
+    with pytest.raises(ConfigError, match=r"depend on what the network predicted .*network_dir"):
+        Training(NETWORK, None, config, batch_nb=9, resume=True, **OPTIONS).execute()
     words = last.removeprefix("next: physx ").split()
     assert main([*words, "--environment.environment", "toy/spring", "--batch-nb", "1"]) == 0
     assert progress("training_1") == (3, 0)
