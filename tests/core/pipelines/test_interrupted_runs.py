@@ -223,7 +223,7 @@ def test_a_training_that_cannot_be_resumed_says_how_to_go_on(capfd):
     assert "NetworkConfig.network_dir" in caught.value.__notes__[-1]
     last = capfd.readouterr().err.splitlines()[-1]
     assert last == AGAIN.replace("new", "training")
-    with pytest.raises(ConfigError, match=r"depend on what the network predicted .*network_dir"):
+    with pytest.raises(ConfigError, match=r"depend on the network that learns.*network_dir"):
         Training(NETWORK, None, config, batch_nb=9, resume=True, **OPTIONS).execute()
     words = last.removeprefix("next: physx ").split()
     assert main([*words, "--environment.environment", "toy/spring", "--batch-nb", "1"]) == 0

@@ -416,7 +416,7 @@ class Training(NewSessionPipeline):
     @property
     def _is_resumable(self) -> bool:
         """Whether the training can be resumed from the last checkpoint."""
-        repeats = self._generation is not None and not self._generation.asks
+        repeats = self._generation is not None and not self._generation.depends
         return repeats or can_resume(self.environment_config, self.epoch_id)
 
     def _check_parameters(self) -> None:
@@ -476,6 +476,8 @@ class Training(NewSessionPipeline):
                 feeder = Feeder[Block]()
             skip = self._begin_generation(dataset, config.mode, environment, generation)
             source = self._open_environments(resources, environment, dataset, feeder, buffer, skip)
+            if source.sets.learns:
+                self._note_dependence()
         self.data = TrainingData(
             dataset,
             source,
@@ -669,12 +671,16 @@ class Training(NewSessionPipeline):
         now.store(dataset)
         return NOTHING
 
+    def _note_dependence(self) -> None:
+        """Keep in the dataset that the environments' rows depend on the network that learns."""
+        if self._generation is not None and not self._generation.depends:
+            self._generation = dataclasses.replace(self._generation, depends=True)
+            self._generation.store(self._dataset)
+
     def _predict(self, batch: Batch) -> Batch:
         """Answer `Environment.get_prediction`; before the first batch with the step's shapes."""
         learner, data = self.learner, getattr(self, "data", None)
-        if self._generation is not None and not self._generation.asks:
-            self._generation = dataclasses.replace(self._generation, asks=True)
-            self._generation.store(self._dataset)
+        self._note_dependence()
         if not learner.fields and data is not None:
             known = [name for name, field in data.fields.items() if field.shape is not None]
             if all(name in known for name in learner.batch_fields):

@@ -39,8 +39,8 @@ class Generation:
         seed: Seed of the training.
         batch_size: Number of rows in a batch.
         batch_nb: Number of batches in an epoch.
-        asks: Whether the rows depend on the network that learns, by what it predicted for an
-            environment: then they cannot be generated again.
+        depends: Whether the rows depend on the network that learns, by its predictions for an
+            environment or by losses for a sampler: then they cannot be generated again.
     """
 
     mode: str
@@ -51,7 +51,7 @@ class Generation:
     seed: int
     batch_size: int
     batch_nb: int | None
-    asks: bool = False
+    depends: bool = False
 
     @classmethod
     def begin(
@@ -139,11 +139,12 @@ def find_start(
 
 
 def _check_repeatable(generation: Generation | None, session: Session) -> None:
-    if generation is not None and generation.asks:
+    if generation is not None and generation.depends:
         raise ConfigError(
             "A training cannot be resumed while environments generate its samples if they depend "
-            "on what the network predicted meanwhile, as these do (get_prediction), so that they "
-            f"cannot be generated again. {_advice(session)}"
+            "on the network that learns, as these do: by its predictions (get_prediction) or its "
+            "losses (EnvironmentConfig.sampler). So they cannot be generated again. "
+            f"{_advice(session)}"
         )
 
 
