@@ -28,9 +28,11 @@ from physx_core.errors import (
     MissingFieldError,
     NotFiniteError,
     ProgramError,
+    SampleError,
 )
 from physx_core.pipelines import load_learner
 
+SOURCES = Path(__file__).parents[1] / "programs" / "external"
 SIZE, STEPS = 5, 3
 
 
@@ -276,6 +278,29 @@ def test_include_prints_the_folder_of_the_header(capsys):
     }
     assert main(["include", "--help"]) == 0
     assert main(["include", "all"]) == 1
+
+
+WIRE = [sys.executable, "-S", str(SOURCES / "wire.py")]
+
+
+def test_a_program_in_any_language_can_speak_the_protocol(local):
+    kwargs = {"program": WIRE, "parameters": {"scale": 10}}
+    rows = run(local("external/program", env_kwargs=kwargs), 4)
+    np.testing.assert_array_equal(rows["x"][:, 0], [0, 10, 20, 0])
+    np.testing.assert_array_equal(rows["x"][1], [10, 11, 12])
+
+
+@pytest.mark.parametrize(
+    "seed", [pytest.param(n, marks=pytest.mark.faults if n > 9 else []) for n in range(200)]
+)
+def test_whatever_a_program_says_is_a_sample_or_a_clear_error(local, seed):
+    kwargs = {"program": [*WIRE, str(seed)], "parameters": {"scale": 10}, "timeout": 30}
+    try:
+        rows = run(local("external/program", env_kwargs=kwargs), 3)
+    except (ProgramError, SampleError) as error:
+        assert str(error).partition("Last lines")[0].isprintable()
+        return
+    assert rows["x"].shape == (3, 3) and np.isfinite(rows["x"]).all()
 
 
 OPEN = """
