@@ -24,7 +24,9 @@ from physx_core import (
     Visualizer,
     checkpoint,
 )
+from physx_core.cli import main
 from physx_core.errors import EnvironmentFailedError
+from physx_core.pipelines import read_drawn_rows
 from physx_core.sources import client_source
 from physx_core.toy import Linear
 
@@ -319,10 +321,21 @@ def survives(random, kills, words):
     count = killed("killed", [1.2 * whole * random.random() for _ in range(kills)], *words)
     same(stored("killed"), stored("whole"))
     assert last_checkpoint("killed") == last_checkpoint("whole")
+    if words[2] != "stream":
+        same(*(read_drawn_rows(f"sessions/{name}") for name in ("killed", "whole")))
     return count
 
 
-@pytest.mark.parametrize("words", [("clients", "once"), ("clients", "always"), ("local", "once")])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("clients", "once", "stream"),
+        ("clients", "always", "reservoir"),
+        ("clients", "once", "fifo"),
+        ("local", "once", "window"),
+    ],
+    ids=" ".join,
+)
 def test_a_training_that_is_killed_while_environments_generate_is_resumed_bit_for_bit(
     words, nothing_stays_behind
 ):
@@ -331,6 +344,20 @@ def test_a_training_that_is_killed_while_environments_generate_is_resumed_bit_fo
 
 @pytest.mark.faults
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("words", [("clients", "once"), ("clients", "always")])
+@pytest.mark.parametrize(
+    "words", [("clients", "once", "fifo"), ("clients", "always", "stream")], ids=" ".join
+)
 def test_a_training_survives_being_killed_at_any_moments(words, seed, nothing_stays_behind):
     assert survives(random.Random(seed), 20, words) > 3
+
+
+def test_the_command_resumes_with_the_environments_of_the_session(capfd, nothing_stays_behind):
+    spring = EnvironmentConfig("toy/spring", num_clients=2)
+    options = {"epoch_nb": 2, "batch_nb": 8, "batch_size": 7, "quiet": True}
+    network = NetworkConfig("toy/linear")
+    with pytest.raises(KeyboardInterrupt):
+        Stopped(network, None, spring, session_name="stopped", seed=3, **options).execute()
+    assert main(["train", "sessions/stopped", "--resume"]) == 0
+    assert "2 of 2 epochs" in capfd.readouterr().err
+    Training(network, None, spring, session_name="whole", seed=3, **options).execute()
+    same(stored("stopped"), stored("whole"))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from physx_core import Environment, Field
+from physx_core import Environment, Field, Parameter
 from physx_core.errors import UsageError
 
 
@@ -30,6 +30,7 @@ class Pupil(Environment):
         super().__init__(**kwargs)
         self.delay, self.asks, self.refuse = delay, asks, refuse
         self.fails_at, self.kill_at = fails_at, kill_at
+        self.slope = 1.0
 
     def create(self):
         pass
@@ -56,9 +57,26 @@ class Pupil(Environment):
         if self.factory:
             self.factory.update_points("x", positions=np.append(x, 0.0)[None])
             self.update_visualization()
-        y = x.sum(keepdims=True) + 0.1 * self.rng.normal(size=1) + 0.01 * answer
+        y = self.slope * x.sum(keepdims=True) + 0.1 * self.rng.normal(size=1) + 0.01 * answer
         self.set_training_data(x=x, y=y)
         self.set_additional_data(answer=answer)
 
     def check_sample(self):
         return not self.refuse or self.step_index % self.refuse != 1
+
+
+class Apprentice(Pupil):
+    """Has a parameter, and counts with what it saves how many runs it took part in."""
+
+    def create(self):
+        self.define_parameters([Parameter("slope", 0.5, 1.5)])
+        self.runs = self.load_parameters().get("runs", 0) + 1
+        self.save_parameters(runs=self.runs)
+
+    def reset_parameters(self, slope):
+        self.slope = slope * self.runs
+
+    def step(self):
+        if self.step_index % 4 == 3:
+            self.new_episode()
+        super().step()

@@ -1,7 +1,7 @@
 """A training whose environments generate while it learns, to be killed and resumed.
 
-Arguments: name of the session, whether clients generate, whether the environments are needed in
-every epoch. It resumes the session if there is one.
+Arguments: name of the session, "clients" or "local", whether environments generate in every epoch
+("always") or "once", and the buffer. It resumes the session if there is one.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 from physx_core import DatasetConfig, EnvironmentConfig, NetworkConfig, Training
 from physx_core.toy import LeastSquares, Linear
 
-PUPIL = f"{Path(__file__).parent / 'online_envs.py'}:Pupil"
+APPRENTICE = f"{Path(__file__).parent / 'online_envs.py'}:Apprentice"
 
 
 class Descending(LeastSquares):
@@ -23,9 +23,10 @@ class Descending(LeastSquares):
         self._network.weights = self._network.weights - 0.02 * self._rows.T @ error
 
 
-def training(name, over_tcp, always):
+def training(name, over_tcp, always, online):
     environment = EnvironmentConfig(
-        PUPIL,
+        APPRENTICE,
+        sampler="physx/sobol",
         env_kwargs={"delay": 0.004, "refuse": 5},
         as_tcp_ip_client=over_tcp,
         always_produce=always,
@@ -46,9 +47,12 @@ def training(name, over_tcp, always):
         seed=3,
         quiet=True,
         checkpoint_every=7,
+        online=f"physx/{online}",
+        online_kwargs={} if online == "stream" else {"capacity": 80, "watermark": 40, "views": 2},
         resume=Path("sessions", name).exists(),
     )
 
 
 if __name__ == "__main__":
-    training(sys.argv[1], sys.argv[2] == "clients", sys.argv[3] == "always").execute()
+    name, where, how_often, buffer = sys.argv[1:]
+    training(name, where == "clients", how_often == "always", buffer).execute()

@@ -26,6 +26,7 @@ from physx_core.sources.source import Source
 
 PARAMETERS = "parameters_{}.bin"
 """Name of the file beside a dataset that contains an instance's saved parameters."""
+_FORMER = ".former"
 LARGEST_PARAMETERS = 2**32
 """Bytes of such a file."""
 GENERATION = "generation"
@@ -183,6 +184,27 @@ def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
             with files.storing(f"{path}, copied into the session,"):
                 content = files.read_content(path, LARGEST_PARAMETERS)
                 files.replace(dataset.directory / path.name, content)
+
+
+def keep_parameters(directory: Path) -> None:
+    """Copy the instances' parameters in a dataset's folder, as a training begins."""
+    with files.storing(f"{directory}"):
+        for path in directory.glob(PARAMETERS.format("*") + _FORMER):
+            files.remove(path)
+        for path in directory.glob(PARAMETERS.format("*")):
+            content = files.read_content(path, LARGEST_PARAMETERS)
+            files.replace(path.with_name(path.name + _FORMER), content)
+
+
+def restore_parameters(directory: Path) -> None:
+    """Have the instances' parameters be those of when `keep_parameters` copied them."""
+    with files.storing(f"{directory}"):
+        for path in directory.glob(PARAMETERS.format("*")):
+            former = path.with_name(path.name + _FORMER)
+            if former.exists():
+                files.replace(path, files.read_content(former, LARGEST_PARAMETERS))
+            else:
+                files.remove(path)
 
 
 def is_copy(directory: Path) -> bool:

@@ -668,7 +668,7 @@ class Training(NewSessionPipeline):
         self._generation, self._dataset = former or now, dataset
         if former is not None:
             return former.resume(dataset, config, now)
-        now.store(dataset)
+        now.start(dataset)
         return NOTHING
 
     def _note_dependence(self) -> None:

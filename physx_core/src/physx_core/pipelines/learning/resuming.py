@@ -16,7 +16,13 @@ from physx_core.config import SETS, WRONG, DatasetConfig, EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.dataset.store.manifest import to_plain_info
 from physx_core.errors import ConfigError, DatasetNotFoundError
-from physx_core.pipelines.storage import GENERATION, describe_environment, is_copy
+from physx_core.pipelines.storage import (
+    GENERATION,
+    describe_environment,
+    is_copy,
+    keep_parameters,
+    restore_parameters,
+)
 from physx_core.session import Session
 from physx_core.workers.instance import Skip
 
@@ -62,12 +68,19 @@ class Generation:
         first, wrong, sets, offset = (_count(dataset, name) for name in counted)
         return cls(mode, first, wrong, sets, offset, seed, batch_size, batch_nb)
 
+    def start(self, dataset: Dataset) -> None:
+        """Keep it in the dataset, and copy the parameters that environments have saved there."""
+        keep_parameters(dataset.directory)
+        self.store(dataset)
+
     def store(self, dataset: Dataset) -> None:
         """Keep it in the dataset."""
         dataset.update_info(**{GENERATION: dataclasses.asdict(self)})
 
     def resume(self, dataset: Dataset, environment: EnvironmentConfig, now: Generation) -> Skip:
         """Check that a training continues this one, and return the rows that it has had.
+
+        The parameters that environments have saved are again those of when it began.
 
         Args:
             dataset: Has the rows.
@@ -88,6 +101,7 @@ class Generation:
                     f"{name} was {before[name]!r} and is {value!r}, so other samples would follow. "
                     "Give the same, or start another training."
                 )
+        restore_parameters(dataset.directory)
         rejected: tuple[int, ...] = ()
         if _count(dataset, WRONG) > self.first_wrong:
             numbers = dataset[WRONG]["env_id"][self.first_wrong :]
