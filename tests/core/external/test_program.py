@@ -408,7 +408,7 @@ WAYS = {
 }
 
 
-SLOW = {"hang with a child", "ignore", "half"}
+SLOW = {"hang with a child", "ignore", "half", "never open"}
 
 
 def options_of(faulty, way):
