@@ -16,9 +16,10 @@ from physx_core import (
 from physx_core.checkpoint import BUFFER, read_buffer
 from physx_core.checkpoint import read as read_checkpoint
 from physx_core.cli import main
-from physx_core.errors import ConfigError, SessionError
+from physx_core.errors import CheckpointError, ConfigError, SessionError
 from physx_core.observers import read_scalars
 from physx_core.pipelines import load_learner, read_drawn_rows
+from physx_core.toy import LeastSquares
 
 DRAWN = f"{Path(__file__).parents[1] / 'programs' / 'buffer_envs.py'}:Drawn"
 RESERVOIR = {"capacity": 40, "watermark": 20, "views": 3}
@@ -29,10 +30,30 @@ BUFFERS = {
 }
 
 
-NETWORK = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "y"})
+class Descending(LeastSquares):
+    """Has no state but the weights."""
+
+    def optimize(self, loss):
+        error = self._rows @ self._network.weights - self._targets
+        self._network.weights = self._network.weights - 0.02 * self._rows.T @ error
 
 
-def train(name, online="stream", *, buffer=None, clients=False, delay=0.0, sees=None, **options):
+NETWORK = NetworkConfig(
+    "toy/linear", optimization=Descending, network_kwargs={"net_fields": "x", "opt_fields": "y"}
+)
+
+
+def train(
+    name,
+    online="stream",
+    *,
+    buffer=None,
+    kind=Training,
+    clients=False,
+    delay=0.0,
+    sees=None,
+    **options,
+):
     environment = EnvironmentConfig(
         DRAWN,
         num_clients=2,
@@ -42,7 +63,7 @@ def train(name, online="stream", *, buffer=None, clients=False, delay=0.0, sees=
         always_produce=options.pop("always_produce", False),
     )
 
-    class Seeing(Training):
+    class Seeing(kind):
         def optimize(self):
             super().optimize()
             if sees is not None:
@@ -107,6 +128,61 @@ def test_clients_make_the_training_of_environments_in_this_process(online):
     assert_equal_runs(one, other)
     if online != "stream":
         assert np.array_equal(read_drawn_rows(one), read_drawn_rows(other))
+
+
+def test_a_first_batch_that_waits_for_many_rows_takes_them_in_several_blocks():
+    options = {"capacity": 3000, "watermark": 2600, "views": 2}
+    batches = []
+    one = train("here", "reservoir", online_kwargs=options, batch_nb=10, sees=batches)
+    other = train("clients", "reservoir", online_kwargs=options, batch_nb=10, clients=True)
+    assert_equal_runs(one, other)
+    drawn = read_drawn_rows(one)
+    assert np.array_equal(drawn, read_drawn_rows(other)) and drawn.max() > 2048
+    with Dataset.open(one / "dataset") as dataset:
+        rows = dataset["training"]["x"][:].astype(np.float32)
+        assert len(rows) == 2600
+    assert all(np.array_equal(b["x"], rows[i]) for b, i in zip(batches, drawn, strict=True))
+
+
+class Cut(Training):
+    """Ends with an error in the middle of an epoch."""
+
+    def batch_end(self):
+        super().batch_end()
+        if not self.resume and (self.epoch_id, self.batch_id) == (self.epoch_nb - 1, 13):
+            raise RuntimeError("cut")
+
+
+@pytest.mark.parametrize("always_produce", [False, True])
+@pytest.mark.parametrize("clients", [False, True])
+@pytest.mark.parametrize("online", BUFFERS)
+def test_a_training_that_was_cut_is_resumed_with_the_rows_of_its_buffer(
+    online, clients, always_produce
+):
+    options = {"clients": clients, "always_produce": always_produce}
+    options |= {"epoch_nb": 2 if always_produce else 1}
+    whole = train("whole", online, **options)
+    with pytest.raises(RuntimeError, match="cut"):
+        train("cut", online, kind=Cut, **options)
+    path = Path("sessions/cut")
+    assert len(read_drawn_rows(path)) == 13 + 30 * always_produce
+    train("cut", online, kind=Cut, resume=True, **options)
+    assert_equal_runs(whole, path)
+    assert np.array_equal(read_drawn_rows(whole), read_drawn_rows(path))
+
+
+def test_a_training_is_made_longer_with_the_rows_of_its_buffer():
+    train("run", "fifo", epoch_nb=2, always_produce=True)
+    path = train("run", "fifo", epoch_nb=3, always_produce=True, resume=True)
+    drawn = read_drawn_rows(path)
+    assert np.bincount(drawn.ravel()).tolist() == [2] * 360
+
+
+def test_a_training_cannot_be_resumed_with_another_buffer():
+    with pytest.raises(RuntimeError, match="cut"):
+        train("cut", "reservoir", kind=Cut)
+    with pytest.raises(CheckpointError, match="other options. Resume with the same online"):
+        train("cut", "window", resume=True)
 
 
 def test_later_epochs_read_all_rows_and_the_record_ends_with_the_first():

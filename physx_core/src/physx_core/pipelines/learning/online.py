@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -20,6 +19,7 @@ from physx_core.pipelines.learning.row_store import RowStore
 from physx_core.typing import Batch, Index
 
 _INTERVAL = 1.0
+_LARGEST = 1024
 
 
 class OnlineBatches:
@@ -61,21 +61,34 @@ class OnlineBatches:
         Raises:
             PhysxError: If an environment fails, or rows cannot be stored.
         """
-        buffer, number = self._buffer, self.number
-        count = buffer.needed(number) - self._arrived
-        with self._meter.waiting():
-            block = self.block = self._blocks.next(count)
+        count = self._buffer.needed(self.number) - self._arrived
+        if self._buffer.capacity:
+            batch = self._draw(count, names)
+        else:
+            batch = self._take(count)
+            self.rows = np.arange(self._arrived, self._arrived + count)
         self._meter.count(count, self._blocks.waited)
         self._arrived += count
         self.number += 1
-        if not buffer.capacity:
-            self.rows = np.arange(self._arrived - count, self._arrived)
-            return block.rows
-        draw = buffer.take(number, count)
-        if self._store is None:
-            self._store = self._allocate(block.fields, names)
-        if count:
-            self._store.put(draw.placed, block.rows)
+        return batch
+
+    def _take(self, size: int) -> Batch:
+        """Return the rows of the next block."""
+        with self._meter.waiting():
+            self.block = self._blocks.next(size)
+        return self.block.rows
+
+    def _draw(self, count: int, names: Sequence[str]) -> Batch:
+        """Return a batch that the buffer draws when some rows have arrived."""
+        draw, placed = self._buffer.take(self.number, count), 0
+        for size in self._split(count):
+            rows = self._take(size)
+            if self._store is None:
+                self._store = self._allocate(self.block.fields, names)
+            if size:
+                self._store.put(draw.placed[placed : placed + size], rows)
+            placed += size
+        assert self._store is not None
         self.rows = draw.rows
         if self._drawn is not None:
             self._drawn.append(self._first + draw.rows)
@@ -104,33 +117,55 @@ class OnlineBatches:
             CheckpointError: If it is not a state of this buffer.
         """
         buffer = self._buffer
-        self.number = number
-        self._blocks.skip(self._counts(range(number)))
-        self._arrived = buffer.needed(number - 1)
-        if not buffer.capacity:
-            return
+        arrived = buffer.needed(number - 1)
+        if buffer.capacity:
+            self._restore(number, state())
+            arrived = buffer.arrived
+        self._blocks.skip(self._sizes(range(number), arrived))
+        self.number, self._arrived = number, arrived
+        if buffer.capacity:
+            self._store = self._allocate(dataset.fields(mode), names)
+            slots = np.flatnonzero(buffer.rows >= 0)
+            self._store.read(slots, dataset, mode, self._first + buffer.rows[slots])
+
+    def _restore(self, number: int, state: Index) -> None:
         try:
-            buffer.restore(number, state())
+            self._buffer.restore(number, state)
         except ValueError as error:
             raise CheckpointError(
                 f"The training cannot be resumed: the state of its buffer does not fit "
-                f"{type(buffer).__name__}, as {error}. Resume with the same online, online_kwargs "
-                "and batch_size."
+                f"{type(self._buffer).__name__}, as {error}. Resume with the same online, "
+                "online_kwargs and batch_size."
             ) from error
-        self._arrived = buffer.arrived
-        self._store = self._allocate(dataset.fields(mode), names)
-        slots = np.flatnonzero(buffer.rows >= 0)
-        self._store.read(slots, dataset, mode, self._first + buffer.rows[slots])
 
     def expect(self, batches: int) -> None:
         """Announce that this many batches will be taken."""
-        self._blocks.expect(self._counts(range(self.number, self.number + batches)))
+        self._blocks.expect(self._sizes(range(self.number, self.number + batches)))
 
-    def _counts(self, batches: range) -> Iterator[int]:
-        """Return how many rows arrive for each of some batches, the next one first."""
-        needed = map(self._buffer.needed, batches)
-        pairs = itertools.pairwise(itertools.chain([self._arrived], needed))
-        return (after - before for before, after in pairs)
+    def _sizes(self, batches: range, most: int | None = None) -> Iterator[int]:
+        """Yield the sizes of the blocks for some batches, the next one first.
+
+        Args:
+            batches: Their numbers.
+            most: Number of rows that arrive at most; a run that was shorter needed no more.
+        """
+        before = self._arrived
+        for batch in batches:
+            needed = self._buffer.needed(batch)
+            needed = needed if most is None else min(needed, most)
+            yield from self._split(needed - before)
+            before = needed
+
+    def _split(self, count: int) -> Iterator[int]:
+        """Yield the sizes of the blocks in which rows for a batch of a buffer arrive.
+
+        The first batch may need many rows, which would take much memory in one piece.
+        """
+        largest = max(self._buffer.batch_size, _LARGEST)
+        while self._buffer.capacity and count > largest:
+            yield largest
+            count -= largest
+        yield count
 
     def close(self) -> None:
         """Have no more rows generated, before the environments are closed."""
