@@ -36,7 +36,7 @@ from physx_core.fields import Field
 from physx_core.origin import install_hint
 from physx_core.parsing import parse_toml
 from physx_core.statistics import Normalization
-from physx_core.typing import Index
+from physx_core.typing import Array, Index
 
 FORMAT_VERSION = 2
 """Version of the description; version 1 has no checksums."""
@@ -47,6 +47,9 @@ DESCRIPTION = "checkpoint.toml"
 BUFFER = "buffer.bin"
 """File with the state of the buffer that draws the batches: whole numbers of 8 bytes."""
 _WHOLE = np.dtype("<i8")
+SAMPLER = "sampler.bin"
+"""File with the state of the sampler that learns from the training: numbers of 8 bytes."""
+_REAL = np.dtype("<f8")
 _KEPT = (
     "network",
     "network_kwargs",
@@ -135,6 +138,7 @@ def save(
     normalization: Mapping[str, Normalization],
     progress: Progress,
     buffer: Index | None = None,
+    sampler: Array | None = None,
     *,
     best: bool = False,
 ) -> Path:
@@ -151,6 +155,7 @@ def save(
         normalization: Normalization of the transformation.
         progress: Progress of the training.
         buffer: State of the buffer that draws its batches, if there is one.
+        sampler: State of the sampler that learns from it, if there is one.
         best: Replace ``<network_name>_best``, to predict with or to start from, without the state
             that a resumed training needs.
 
@@ -173,7 +178,7 @@ def save(
         if best:
             _write(partial, description, network)
         else:
-            _write(partial, description, network, optimization, buffer)
+            _write(partial, description, network, optimization, buffer, sampler)
         _publish(partial, path)
     except BaseException as error:
         cause = error if isinstance(error, OSError) else error.__cause__
@@ -217,6 +222,7 @@ def _write(
     network: Network,
     optimization: Optimization | None = None,
     buffer: Index | None = None,
+    sampler: Array | None = None,
 ) -> None:
     """Write the files of a checkpoint to a new folder, and wait until they are on the disk."""
     files.create_folder(partial, sync=False)
@@ -227,6 +233,9 @@ def _write(
         described |= _describe_files(partial, described)
     if buffer is not None:
         _write_new(partial / BUFFER, np.asarray(buffer, _WHOLE).tobytes())
+        described |= _describe_files(partial, described)
+    if sampler is not None:
+        _write_new(partial / SAMPLER, np.asarray(sampler, _REAL).tobytes())
         described |= _describe_files(partial, described)
     _write_description(partial / DESCRIPTION, {**description, "files": described})
     for file in (*described, DESCRIPTION):
@@ -476,15 +485,28 @@ def read_buffer(found: Checkpoint) -> Index:
     Raises:
         CheckpointError: If the checkpoint has none, or was replaced meanwhile.
     """
+    return np.frombuffer(_read_numbers(found, BUFFER), _WHOLE).astype(np.int64)
+
+
+def read_sampler(found: Checkpoint) -> Array:
+    """Return the state of the sampler that learns from a training, from its checkpoint.
+
+    Raises:
+        CheckpointError: If the checkpoint has none, or was replaced meanwhile.
+    """
+    return np.frombuffer(_read_numbers(found, SAMPLER), _REAL).astype(np.float64)
+
+
+def _read_numbers(found: Checkpoint, name: str) -> bytes:
     try:
-        content = files.read_content(found.path / BUFFER, _LARGEST)
+        content = files.read_content(found.path / name, _LARGEST)
     except OSError as error:
         raise CheckpointError(
-            f"{found.path / BUFFER} cannot be read: {error.strerror or error}. The training cannot "
+            f"{found.path / name} cannot be read: {error.strerror or error}. The training cannot "
             "be resumed there. Use another checkpoint."
         ) from error
     check_unchanged(found)
-    return np.frombuffer(content[: len(content) // 8 * 8], _WHOLE).astype(np.int64)
+    return content[: len(content) // 8 * 8]
 
 
 def check_unchanged(found: Checkpoint) -> None:

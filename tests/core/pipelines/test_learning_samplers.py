@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import time
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from physx_core import DataGeneration, Dataset, EnvironmentConfig, NetworkConfig, Training
+from physx_core import (
+    DataGeneration,
+    Dataset,
+    EnvironmentConfig,
+    NetworkConfig,
+    Training,
+    checkpoint,
+)
 from physx_core.components import LearningSampler
 from physx_core.errors import ConfigError, UsageError
 from physx_core.toy import LeastSquares
 
 ENVS = Path(__file__).parents[1] / "programs" / "parameter_envs.py"
+PROGRAM = ENVS.with_name("active_run.py")
 SWING, HARD = f"{ENVS}:Swing", f"{ENVS}:Hard"
 
 
@@ -121,6 +133,86 @@ def test_active_runs_in_clients_and_from_the_command_line(tmp_path):
     assert main(words.split()) == 0
     with Dataset.open(tmp_path / "run" / "dataset") as dataset:
         assert dataset.num_samples("parameters") == 48
+
+
+# Resumed ------------------------------------------------------------------------------------------
+
+
+def killed(folder, name, moments, *words):
+    """Run the program to its end, but kill it after each of some times in s; count the kills."""
+    kills = 0
+    for moment in [*moments, None]:
+        process = subprocess.Popen([sys.executable, str(PROGRAM), name, *words], cwd=folder)
+        try:
+            assert process.wait(moment) == 0
+            break
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            kills += 1
+    return kills
+
+
+def kept(folder, name):
+    """Return all rows and sets, and the files of the last checkpoint."""
+    with Dataset.open(folder / "sessions" / name / "dataset") as dataset:
+        found = {
+            f"{mode}/{field}": dataset[mode][field][:].tobytes()
+            for mode in ("training", "parameters")
+            for field in dataset.fields(mode)
+        }
+    last = checkpoint.find(folder / "sessions" / name, None, -1)
+    with zipfile.ZipFile(last.path / "parameters.npz") as file:
+        found["weights"] = file.read("weights.npy")
+    return found
+
+
+def survives(folder, seed, kills, words):
+    began = time.monotonic()
+    assert not killed(folder, "whole", [], *words)
+    whole, random = time.monotonic() - began, np.random.default_rng(seed)
+    count = killed(folder, "killed", (whole * random.uniform(0.15, 0.6, kills)).tolist(), *words)
+    expected, found = kept(folder, "whole"), kept(folder, "killed")
+    assert expected.keys() == found.keys()
+    assert [name for name in expected if expected[name] != found[name]] == []
+    return count
+
+
+@pytest.mark.parametrize(
+    "words", [("clients", "stream"), ("clients", "reservoir"), ("local", "reservoir")], ids=str
+)
+def test_a_training_whose_sampler_learns_is_killed_and_resumed_bit_for_bit(
+    tmp_path, words, nothing_stays_behind
+):
+    assert survives(tmp_path, 2, 3, words)
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("words", [("clients", "stream"), ("clients", "reservoir")], ids=str)
+def test_such_a_training_survives_being_killed_at_any_moments(
+    tmp_path, words, seed, nothing_stays_behind
+):
+    assert survives(tmp_path, seed, 20, words)
+
+
+def test_after_failed_sets_resuming_is_refused(tmp_path):
+    environment = EnvironmentConfig(
+        SWING, env_kwargs={"fails_above": 25.0}, seed=3, redraw=99, as_tcp_ip_client=False
+    )
+    network = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "noise"})
+    options = {"session_dir": str(tmp_path), "session_name": "run", "quiet": True, "batch_size": 5}
+    options |= {"epoch_nb": 2, "batch_nb": 6, "seed": 5, "checkpoint_every": 2}
+
+    class Stopped(Training):
+        def batch_end(self):
+            if self.batch_id == 4:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Stopped(network, None, environment, **options).execute()
+    with pytest.raises(ConfigError, match="simulations failed.*network_dir"):
+        Training(network, None, environment, resume=True, **options).execute()
 
 
 class Silent(LeastSquares):

@@ -65,6 +65,10 @@ class Swing(Environment):
 class Hard(Environment):
     """A function of two parameters that is flat but for a narrow peak, which is hard to learn."""
 
+    def __init__(self, *, pause=0.0, **kwargs):
+        super().__init__(**kwargs)
+        self.pause = pause
+
     def create(self):
         self.define_parameters([Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)])
 
@@ -77,6 +81,7 @@ class Hard(Environment):
     def step(self):
         if self.step_index:
             self.new_episode()
+        time.sleep(self.pause)
         peak = 10 * np.exp(-np.sum((self.at - 0.8) ** 2) / 0.1**2)
         self.set_training_data(x=self.at, y=[peak])
 

@@ -23,6 +23,7 @@ from physx_core.pipelines.storage import (
     describe_environment,
     open_own,
     record_rejected,
+    store_sets,
 )
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
@@ -94,6 +95,7 @@ class DataGeneration(NewSessionPipeline):
         """
         with record_rejected(self.source, self.dataset):
             self.batch = self.source.batch(self.batch_size)
+            store_sets(self.source, self.dataset)
             if self.batch_id == 0:
                 self.dataset.define_fields(self._mode, self.source.fields)
                 described = describe_environment(self.environment_config, self._seed)

@@ -222,9 +222,9 @@ def record_rejected(
 
     These are the samples that `check_sample` rejects during the body, in the mode "wrong", and the
     sets of parameters that begin in its batch, in the mode "parameters". They are stored after the
-    body's batch. The rejected samples are stored also if too many of them end the run, and sets
-    with which a simulation failed also if that ends it. If the batch fails for another reason, they
-    are not stored either.
+    body's batch, the sets before its rows if the body calls `store_sets`. The rejected samples are
+    stored also if too many of them end the run, and sets with which a simulation failed also if
+    that ends it. If the batch fails for another reason, they are not stored either.
 
     Args:
         source: Generates the batch.
@@ -239,10 +239,10 @@ def record_rejected(
             _store_rejected(source, dataset, earlier)
         source.sets.note_failed()
         with contextlib.suppress(PhysxError):  # the run's own error matters more
-            _store_sets(source, dataset)
+            store_sets(source, dataset)
         raise
     _store_rejected(source, dataset, earlier)
-    _store_sets(source, dataset)
+    store_sets(source, dataset)
 
 
 def _store_rejected(
@@ -260,7 +260,11 @@ def _store_rejected(
             dataset.append(WRONG, part, checked=True)
 
 
-def _store_sets(source: Source, dataset: Dataset | None) -> None:
+def store_sets(source: Source, dataset: Dataset | None) -> None:
+    """Store the sets of parameters that begin in a source's last batch.
+
+    Before its rows, so that rows have their parameters even if the process is killed.
+    """
     sets, failed = source.sets.pop()
     if dataset is None or not (sets or failed):
         return

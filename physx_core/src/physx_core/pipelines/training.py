@@ -27,7 +27,7 @@ from physx_core.config import (
     to_plain,
 )
 from physx_core.dataset import Dataset
-from physx_core.errors import ConfigError, DivergedError
+from physx_core.errors import CheckpointError, ConfigError, DivergedError
 from physx_core.observers import statistics_observers
 from physx_core.pipelines.interrupt import Interrupt, Terminated, deferred_interrupt
 from physx_core.pipelines.learning.blocks import Block
@@ -63,6 +63,7 @@ from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 from physx_core.workers.instance import NOTHING, Skip
+from physx_core.workers.parameter_sets import ParameterSets
 
 _ADVICE = (
     "Lower the learning rate, normalize the data (DatasetConfig.normalize) or limit the gradients; "
@@ -375,11 +376,11 @@ class Training(NewSessionPipeline):
             self.best.state,
             self._record.state,
         )
-        online = self.data.online
-        state = None
-        if online is not None and self.data.produces:
-            state = online.state(self._blocks)
-        return self.learner.save(self.session.network_dir, progress, state, best=best)
+        online, source = self.data.online, self.data.source
+        states: list[Any] = []
+        if online is not None and source is not None and self.data.produces:
+            states = [online.state(self._blocks), source.sets.state(self._blocks)]
+        return self.learner.save(self.session.network_dir, progress, *states, best=best)
 
     def _leave_batch(self, interrupt: Interrupt) -> None:
         """Write a checkpoint if one is due, and end within an epoch after a signal."""
@@ -476,8 +477,6 @@ class Training(NewSessionPipeline):
                 feeder = Feeder[Block]()
             skip = self._begin_generation(dataset, config.mode, environment, generation)
             source = self._open_environments(resources, environment, dataset, feeder, buffer, skip)
-            if source.sets.learns:
-                self._note_dependence()
         self.data = TrainingData(
             dataset,
             source,
@@ -499,6 +498,8 @@ class Training(NewSessionPipeline):
         if last is not None and self._resumed.blocks:
             state = partial(checkpoint.read_buffer, last)
             self.data.resume(self._resumed.blocks, state, self.learner.batch_fields)
+            if source is not None and source.sets.learns:
+                self._resume_sampler(source.sets, last)
         fields = self.data.fields
         shapes = [fields[name].shape for name in self.learner.batch_fields if name in fields]
         if not self.data.produces or None not in shapes:  # else bound with the first batch
@@ -620,6 +621,15 @@ class Training(NewSessionPipeline):
     def _components(self) -> Mapping[str, str]:
         return describe_training(self.learner, self.environment_config, self.data.dataset)
 
+    def _resume_sampler(self, sets: ParameterSets, last: checkpoint.Checkpoint) -> None:
+        try:
+            sets.restore(self._resumed.blocks, checkpoint.read_sampler(last))
+        except ValueError as error:
+            raise CheckpointError(
+                "The training cannot be resumed: the state of the sampler in its checkpoint does "
+                f"not fit, as {error}. Resume with the same sampler and sampler_kwargs."
+            ) from error
+
     def _load_parameters(self, last: checkpoint.Checkpoint | None) -> None:
         config = self.network_config
         found = last
@@ -641,7 +651,7 @@ class Training(NewSessionPipeline):
         buffer: Buffer,
         skip: Skip,
     ) -> Source:
-        seed = self._resumed.seed if config.seed is None else config.seed
+        seed = self._seed_of(config)
         dataset.update_info(**describe_environment(config, seed))
         stored = dataset.num_samples("training") if "training" in dataset.modes else 0
         if self._generation is not None:
@@ -668,8 +678,11 @@ class Training(NewSessionPipeline):
         self._generation, self._dataset = former or now, dataset
         if former is not None:
             return former.resume(dataset, config, now)
-        now.start(dataset)
+        now.start(dataset, **describe_environment(config, self._seed_of(config)))
         return NOTHING
+
+    def _seed_of(self, config: EnvironmentConfig) -> int:
+        return self._resumed.seed if config.seed is None else config.seed
 
     def _note_dependence(self) -> None:
         """Keep in the dataset that the environments' rows depend on the network that learns."""

@@ -41,13 +41,13 @@ class Skip(NamedTuple):
     Attributes:
         rows: Number of rows of all instances together.
         rejected: Number of rejected samples of each instance; empty: none.
-        sets: Number of sets of parameters.
+        sets: Record of the sets of parameters; empty: none.
         begun: Fields ``env_id`` and ``episode`` of the rows; empty: not known.
     """
 
     rows: int = 0
     rejected: tuple[int, ...] = ()
-    sets: int = 0
+    sets: Batch = {}  # noqa: RUF012 - never changed
     begun: Batch = {}  # noqa: RUF012 - never changed
 
     def rows_of(self, number: int, instance_nb: int) -> int:

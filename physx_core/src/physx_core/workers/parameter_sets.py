@@ -71,6 +71,8 @@ class ParameterSets:
         self._config, self._seed = config, list(seed)
         self.instance_nb = config.num_clients
         self._skip = skip
+        self._recorded = {number: row for row, number in enumerate(skip.sets.get("set", ()))}
+        self._surplus = len(self._recorded)  # sets that are recorded already
         self._sampler = _make_sampler(config)
         self._redraws = [0] * self.instance_nb
         self._waiting: list[dict[int, Mapping[str, Any]]] = [{} for _ in self._redraws]
@@ -117,6 +119,8 @@ class ParameterSets:
         self.parameters = first
         if first:
             self._sampler.begin(first, self._seed)
+        if self.learns:
+            self._values = {int(number): self._read(row) for number, row in self._recorded.items()}
 
     @property
     def fields(self) -> list[Field]:
@@ -127,6 +131,34 @@ class ParameterSets:
     def learns(self) -> bool:
         """Whether the sampler learns from losses of a training."""
         return isinstance(self._sampler, LearningSampler) and bool(self.parameters)
+
+    def _read(self, row: int) -> dict[str, Any]:
+        """Return the values of a set that an earlier run recorded."""
+        record = self._skip.sets
+        return checked(self.parameters, {p.name: record[p.name][row] for p in self.parameters})
+
+    def state(self, batches: int) -> Array | None:
+        """Return what `restore` needs to continue after some batches; None: the sampler learns not.
+
+        Args:
+            batches: Number of batches: all that were told, or all but the last one.
+        """
+        if not isinstance(self._sampler, LearningSampler) or not self.parameters:
+            return None
+        with self._changed:
+            return np.concatenate([[self._newest], self._sampler.state(batches)])
+
+    def restore(self, batches: int, state: Array) -> None:
+        """Have the sampler continue after some batches; nothing was chosen yet.
+
+        Raises:
+            ValueError: If it is not a state of this sampler.
+        """
+        assert isinstance(self._sampler, LearningSampler)
+        if not len(state):
+            raise ValueError("it is empty")
+        self._sampler.restore(batches, state[1:])
+        self._told, self._newest = batches, int(state[0])
 
     def follow(self, needed: Callable[[int], int]) -> None:
         """Have the sampler learn from a training.
@@ -210,6 +242,8 @@ class ParameterSets:
         try:
             if not isinstance(sampler, LearningSampler):
                 return checked(self.parameters, sampler.ask(number))
+            if number in self._recorded:
+                return self._read(self._recorded[number])
             batches = self._batches_for(row)
             with self._changed:
                 self._changed.wait_for(lambda: self._is_canceled or self._told >= batches)
@@ -269,9 +303,10 @@ class ParameterSets:
         self._begun, self._failed = [], []
         if not self.parameters:
             return
-        skip, self._skip = self._skip, NOTHING
+        skip = self._skip
         rows = {name: batch[name] for name in ("episode", "env_id")}
         if skip.begun:
+            self._skip = skip._replace(begun={})
             rows = {name: np.concatenate([skip.begun[name], rows[name]]) for name in rows}
         numbers = np.asarray(rows["episode"], np.int64) * self.instance_nb + rows["env_id"] - 1
         found, first = np.unique(numbers, return_index=True)
@@ -282,7 +317,9 @@ class ParameterSets:
             if number in waiting and number not in self._stored:
                 self._stored[number] = self.count
                 self._add(number, waiting[number], failed=False)
-        del self._begun[: skip.sets]
+        recorded = min(self._surplus, len(self._begun))
+        self._surplus -= recorded
+        del self._begun[:recorded]
 
     def note_failed(self) -> None:
         """Find the sets that failed and that no later row follows, at the end of a run."""
@@ -310,11 +347,10 @@ class ParameterSets:
         """Account for a set that gets no more rows."""
         values = waiting.pop(number)
         place = self._stored.pop(number, None)
-        if number not in self.failures:
-            return
+        has_failed = number in self.failures
         if place is None:
-            self._add(number, values, failed=True)
-        else:
+            self._add(number, values, failed=has_failed)
+        elif has_failed:
             self._failed.append(place)
 
     def _add(self, number: int, values: Mapping[str, Any], *, failed: bool) -> None:

@@ -353,6 +353,7 @@ class Learner:
         network_dir: Path,
         progress: checkpoint.Progress,
         buffer: Index | None = None,
+        sampler: Array | None = None,
         *,
         best: bool = False,
     ) -> Path:
@@ -366,6 +367,7 @@ class Learner:
             self.transformation.normalization,
             progress,
             buffer,
+            sampler,
             best=best,
         )
 

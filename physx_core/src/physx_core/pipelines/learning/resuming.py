@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -26,7 +27,15 @@ from physx_core.pipelines.storage import (
 from physx_core.session import Session
 from physx_core.workers.instance import Skip
 
-_SAME = ("environment", "env_kwargs", "num_clients", "simulations_per_step", "seed")
+_SAME = (
+    "environment",
+    "env_kwargs",
+    "num_clients",
+    "simulations_per_step",
+    "sampler",
+    "sampler_kwargs",
+    "seed",
+)
 
 
 @dataclass(frozen=True)
@@ -46,7 +55,7 @@ class Generation:
         batch_size: Number of rows in a batch.
         batch_nb: Number of batches in an epoch.
         depends: Whether the rows depend on the network that learns, by its predictions for an
-            environment or by losses for a sampler: then they cannot be generated again.
+            environment: then they cannot be generated again.
     """
 
     mode: str
@@ -68,14 +77,17 @@ class Generation:
         first, wrong, sets, offset = (_count(dataset, name) for name in counted)
         return cls(mode, first, wrong, sets, offset, seed, batch_size, batch_nb)
 
-    def start(self, dataset: Dataset) -> None:
-        """Keep it in the dataset, and copy the parameters that environments have saved there."""
-        keep_parameters(dataset.directory)
-        self.store(dataset)
+    def start(self, dataset: Dataset, **info: Any) -> None:
+        """Keep it in the dataset, with further information.
 
-    def store(self, dataset: Dataset) -> None:
-        """Keep it in the dataset."""
-        dataset.update_info(**{GENERATION: dataclasses.asdict(self)})
+        Parameters that environments have saved there are copied.
+        """
+        keep_parameters(dataset.directory)
+        self.store(dataset, **info)
+
+    def store(self, dataset: Dataset, **info: Any) -> None:
+        """Keep it in the dataset, with further information."""
+        dataset.update_info(**info, **{GENERATION: dataclasses.asdict(self)})
 
     def resume(self, dataset: Dataset, environment: EnvironmentConfig, now: Generation) -> Skip:
         """Check that a training continues this one, and return the rows that it has had.
@@ -112,7 +124,17 @@ class Generation:
         if rows:
             view = dataset[self.mode]
             begun = {name: view[name][self.first :] for name in ("env_id", "episode")}
-        return Skip(rows, rejected, sets, begun)
+        recorded = {}
+        if sets:
+            view = dataset[SETS]
+            recorded = {name: view[name][self.first_set :] for name in dataset.fields(SETS)}
+            if recorded["failed"].any():
+                raise ConfigError(
+                    "The training cannot be resumed while environments generate its samples, as "
+                    f"{recorded['failed'].sum()} of their simulations failed (redraw). "
+                    f"{_advice(dataset.directory.parent)}"
+                )
+        return Skip(rows, rejected, recorded, begun)
 
 
 def find_start(
@@ -146,7 +168,7 @@ def find_start(
     if generation is None:
         raise ConfigError(
             "A training cannot be resumed while environments generate its samples, as they would "
-            f"start over. {_advice(session)}"
+            f"start over. {_advice(session.path)}"
         )
     _check_repeatable(generation, session)
     return found, environment, generation
@@ -156,17 +178,16 @@ def _check_repeatable(generation: Generation | None, session: Session) -> None:
     if generation is not None and generation.depends:
         raise ConfigError(
             "A training cannot be resumed while environments generate its samples if they depend "
-            "on the network that learns, as these do: by its predictions (get_prediction) or its "
-            "losses (EnvironmentConfig.sampler). So they cannot be generated again. "
-            f"{_advice(session)}"
+            "on the network that learns, as these do, by its predictions (get_prediction). So they "
+            f"cannot be generated again. {_advice(session.path)}"
         )
 
 
-def _advice(session: Session) -> str:
+def _advice(session: Path) -> str:
     return (
         "Leave the environment out to train on the stored samples, or start another training with "
-        f"its network: NetworkConfig.network_dir={str(session.path)!r} (--network.network-dir "
-        f"{session.path})."
+        f"its network: NetworkConfig.network_dir={str(session)!r} (--network.network-dir "
+        f"{session})."
     )
 
 

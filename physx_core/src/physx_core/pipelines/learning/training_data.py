@@ -200,8 +200,7 @@ class TrainingData:
         if self._uses_source and self._shared is not None:
             return self._shared.next(self._names)
         if self._uses_source and self.online is not None:
-            names = [*self._names, *_IDENTITY] if self.wants_row_losses else self._names
-            return self.online.next(names)
+            return self.online.next(self._drawn_fields(self._names))
         if self._uses_source and self.source is not None and self._stored is not None:
             with record_rejected(self.source, self.dataset):
                 return self._replay(self.source, self._stored)
@@ -236,12 +235,17 @@ class TrainingData:
             CheckpointError: If it is not a state of this buffer.
         """
         if self.online is not None:
-            self.online.resume(batches, state, self.dataset, self._mode, names)
+            fields = self._drawn_fields(names)
+            self.online.resume(batches, state, self.dataset, self._mode, fields)
 
     def skip(self, batches: int) -> None:
         """Skip batches that a training read before it was interrupted."""
         for _ in range(batches):
             self.next_batch()
+
+    def _drawn_fields(self, names: Sequence[str]) -> Sequence[str]:
+        """Return the fields of batches that are drawn: a sampler that learns knows rows by two."""
+        return [*names, *_IDENTITY] if self.wants_row_losses else names
 
     @property
     def wants_row_losses(self) -> bool:

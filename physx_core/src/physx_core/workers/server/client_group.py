@@ -248,13 +248,12 @@ class ClientGroup:
         return self._sets.can_redraw(number, error)
 
     def _repeats(self, number: int) -> bool:
-        """Return whether a client has not yet got beyond the rows that an earlier run has had.
-
-        Which of them it fails at is not known, so no other can go on there with other parameters.
-        """
-        peer, rows = self.server.peers.get(number), self._skip.rows
+        """Return whether a client failed at a row that an earlier run has had."""
+        peer = self.server.peers.get(number)
         had = self._skip.rows_of(number, self.config.num_clients)
-        return rows > 0 and (peer is None or peer.received <= had)
+        if peer is None:
+            return had > 0
+        return (peer.received if peer.failure is None else peer.failed_row) < had
 
     def _lose(self, number: int, error: PhysxError, *, left: bool = False) -> None:
         """Have another client take the place of one that is lost.
