@@ -128,6 +128,13 @@ class Parameter:
         return math.prod(self.shape)
 
     @property
+    def columns(self) -> list[str]:
+        """Names of its elements in a table: its own, or with numbers if it has a shape."""
+        if not self.shape:
+            return [self.name]
+        return [f"{self.name}_{element}" for element in range(self.size)]
+
+    @property
     def field(self) -> Field:
         """The field of its values in a dataset."""
         dtype = "int64" if self.distribution == "integer" else "float64"

@@ -40,5 +40,6 @@ def physx_samplers() -> Components:
         "latin_hypercube": "physx_core.samplers.sequences:LatinHypercube",
         "grid": "physx_core.samplers.grid:Grid",
         "active": "physx_core.samplers.active:Active",
+        "generator": "physx_core.samplers.generator:Generator",
         "table": "physx_core.samplers.table:Table",
     }

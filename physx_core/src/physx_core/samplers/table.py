@@ -80,7 +80,7 @@ class Table(Sampler):
         with self._file.open(newline="", encoding="utf-8") as file:
             lines = [line for line in csv.reader(file) if line]
         names, *rows = [[text.strip() for text in line] for line in lines] or [[]]
-        wanted = {parameter.name: _columns_of(parameter) for parameter in self.parameters}
+        wanted = {parameter.name: parameter.columns for parameter in self.parameters}
         self._check_columns([name for group in wanted.values() for name in group], names)
         found = {}
         for parameter in self.parameters:
@@ -97,12 +97,6 @@ class Table(Sampler):
                     f'The table {self._file} has no column "{name}".{nearest(name, given)} It has: '
                     f"{listed(given)}."
                 )
-
-
-def _columns_of(parameter: Parameter) -> list[str]:
-    if not parameter.shape:
-        return [parameter.name]
-    return [f"{parameter.name}_{element}" for element in range(parameter.size)]
 
 
 def _cell(row: Sequence[str], place: int, convert: Any) -> Any:
