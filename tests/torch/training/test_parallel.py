@@ -75,20 +75,33 @@ class Makes(Environment):
         self.set_additional_data(count=self.count)
         self.count += 1
 
-def generating(batch_size, name, epochs=2, over_tcp=True, *, always=False, online=None, **made):
+def generating(batch_size, name, epochs=2, over_tcp=True, *, always=False, online=None,
+               kind=Training, resume=False, **made):
     makes = EnvironmentConfig(Makes, num_clients=2, seed=1, as_tcp_ip_client=over_tcp,
                               always_produce=always, env_kwargs=made)
     buffer = {"online": "physx/reservoir", "online_kwargs": online} if online else {}
-    return Training(network(), DatasetConfig(normalize=True), makes, epoch_nb=epochs,
-                    batch_nb=8, batch_size=batch_size, seed=3, session_name=name, **buffer)
+    return kind(network(), DatasetConfig(normalize=True), makes, epoch_nb=epochs, batch_nb=8,
+                batch_size=batch_size, seed=3, session_name=name, resume=resume, **buffer)
+
+class Fails(Training):
+    def batch_end(self):
+        if (self.epoch_id, self.batch_id) == (1, 3):
+            raise RuntimeError("all fail")
 
 RESERVOIR = {"capacity": 30, "watermark": 12, "views": 2}
 
 def living():
     generating(5, "stream_two").execute()
-    generating(5, "mixed_two", online=RESERVOIR, always=True).execute()
+    generating(5, "mixed_two", over_tcp=False, online=RESERVOIR, always=True).execute()
     generating(5, "asking_two", asks=True, online=RESERVOIR).execute()
-    generating(5, "fails", fails_at=20).execute()
+    failed = {"online": RESERVOIR, "always": True, "over_tcp": False}
+    failing = generating(5, "failed_two", kind=Fails, **failed)
+    try:
+        failing.execute()
+    except RuntimeError:
+        failing.group.tell(None)  # the first one has written the checkpoint
+    generating(5, "failed_two", resume=True, **failed).execute()
+    generating(5, "fails", over_tcp=False, fails_at=20).execute()
 
 halves = EnvironmentConfig(Halves, as_tcp_ip_client=False, load_samples=True)
 
@@ -238,8 +251,10 @@ def test_two_processes_learn_from_environments_of_the_first_as_one_does():
         apart, both = numbers(name), numbers(f"{name}_two")
         assert apart.keys() == both.keys() and ("epoch", "2", "size/training") in apart
         assert all(abs(value - both[key]) < 1e-6 for key, value in apart.items())
-    drawn = [read_drawn_rows(f"sessions/{name}") for name in ("mixed", "mixed_two")]
-    assert np.array_equal(*drawn) and drawn[0].shape == (16, 10)
+    assert agree("mixed", "failed_two")
+    drawn = [read_drawn_rows(f"sessions/{name}") for name in ("mixed", "mixed_two", "failed_two")]
+    assert np.array_equal(drawn[0], drawn[1]) and np.array_equal(drawn[0], drawn[2])
+    assert drawn[0].shape == (16, 10)
     failed = read(Path("sessions/fails/network/network_0")).progress
     assert (failed.epoch, failed.batch) == (0, 4)
 

@@ -454,12 +454,6 @@ class Training(NewSessionPipeline):
             name = self.network_config.network_name or checkpoint.NAME
             last, environment, generation = find_start(session, name, environment)
             config = without_copied_dataset(session, config)
-            if environment is not None and self.group.size > 1:
-                raise ConfigError(
-                    "Several processes cannot resume a training while environments generate its "
-                    "samples. Resume it in one process, up to the end of the epochs in which they "
-                    "do; then continue in several."
-                )
         self._start_from(last, generation)
         buffer = self._create_buffer()
         self._network_class.set_seed(self._resumed.seed)
