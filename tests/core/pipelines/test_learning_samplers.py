@@ -215,6 +215,28 @@ def test_after_failed_sets_resuming_is_refused(tmp_path):
         Training(network, None, environment, resume=True, **options).execute()
 
 
+@pytest.mark.parametrize("delay", [0, 1])
+def test_an_error_ends_a_run_whose_clients_wait_for_losses(tmp_path, delay, nothing_stays_behind):
+    class Failing(Training):
+        def batch_begin(self):
+            super().batch_begin()
+            if self.batch_id == 3:
+                time.sleep(0.5)  # the clients wait for parameters by now
+                raise RuntimeError("on purpose")
+
+    environment = EnvironmentConfig(
+        SWING, num_clients=2, seed=3, sampler="physx/active", sampler_kwargs={"delay": delay}
+    )
+    network = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "noise"})
+    began = time.monotonic()
+    with pytest.raises(RuntimeError, match="on purpose"):
+        Failing(
+            network, None, environment, session_dir=str(tmp_path), epoch_nb=1, batch_nb=9,
+            batch_size=6, quiet=True,
+        ).execute()  # fmt: skip
+    assert time.monotonic() - began < 50
+
+
 class Silent(LeastSquares):
     """Does not tell the losses of rows."""
 

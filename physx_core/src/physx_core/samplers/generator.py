@@ -110,9 +110,9 @@ class Generator(LearningSampler):
             if number in self._ids:
                 result["_id"] = self._ids[number]
             results.append(result)
-        for number in [known for known in self._ids if known <= max(numbers) - self.memory]:
-            del self._ids[number]
         if results:
+            for number in [known for known in self._ids if known <= numbers[-1] - self.memory]:
+                del self._ids[number]
             self._generator.ingest(results)
         self._suggested[batches] = self._suggest()
         for former in [known for known in self._suggested if known < batches - self.delay - 1]:
