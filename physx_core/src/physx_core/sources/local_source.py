@@ -77,7 +77,7 @@ class LocalSource(Source):
             check_stored(stored, size)
         if self._config.record_wrong_samples:
             self.pop_rejected()
-        self._generate_again()
+        self._generate_again(size)
         buffer = self._buffer
         if buffer is not None:
             buffer.clear()
@@ -141,16 +141,18 @@ class LocalSource(Source):
         instance.rejected = former.rejected
         self._open(instance)
 
-    def _generate_again(self) -> None:
-        """Step the instances through the rows that an earlier run has had."""
+    def _generate_again(self, size: int) -> None:
+        """Make the rows that an earlier run has had, and forget them."""
         while self._next < self._skip.rows:
             place = self._next % self.instance_nb
             try:
-                self._instances[place].step()
+                self._make_row(self._instances[place], None, size)
             except PhysxError as error:
                 self._redraw(place, error)
                 continue
-            self._last_steps[place] = self._instances[place].last_step
+            finally:
+                if self._buffer is not None:
+                    self._buffer.clear()
             self._next += 1
             if self._next == self._skip.rows:
                 for instance in self._instances:

@@ -128,11 +128,11 @@ class Generation:
         if sets:
             view = dataset[SETS]
             recorded = {name: view[name][self.first_set :] for name in dataset.fields(SETS)}
-            if recorded["failed"].any():
+            if environment.record_wrong_samples and recorded["failed"].any():
                 raise ConfigError(
                     "The training cannot be resumed while environments generate its samples, as "
-                    f"{recorded['failed'].sum()} of their simulations failed (redraw). "
-                    f"{_advice(dataset.directory.parent)}"
+                    f"{recorded['failed'].sum()} of their simulations failed (redraw) and rejected "
+                    f"samples are recorded. {_advice(dataset.directory.parent)}"
                 )
         return Skip(rows, rejected, recorded, begun)
 

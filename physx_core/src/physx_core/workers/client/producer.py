@@ -110,8 +110,11 @@ class Producer:
         buffer = self._buffer
         if buffer is None:
             buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample))
-        if self.made >= self._skip:
-            buffer.put(sample, instance.instance_id, instance.last_episode, instance.last_step)
+        is_repeated = self.made < self._skip  # and fails again if it is not valid
+        numbers = (instance.instance_id, instance.last_episode, instance.last_step)
+        buffer.put(sample, *numbers, finite=is_repeated)
+        if is_repeated:
+            buffer.clear()
         self._announce(buffer)
         self.made += 1
 

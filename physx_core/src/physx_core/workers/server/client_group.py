@@ -243,17 +243,22 @@ class ClientGroup:
         return passing and self._restarts[number] < self.config.restarts
 
     def _redraws_after(self, number: int, error: PhysxError | None) -> bool:
-        if error is None or self._repeats(number):
+        is_known = getattr(error, "step", -1) >= 0 and not self.config.record_wrong_samples
+        if error is None or (self._repeats(number) and not is_known):
             return False
         return self._sets.can_redraw(number, error)
 
     def _repeats(self, number: int) -> bool:
-        """Return whether a client failed at a row that an earlier run has had."""
+        """Return whether a client failed at a row that an earlier run has had, or may have.
+
+        If it ends without a word, which of them it was making is not known, so no other can go on
+        there with other parameters.
+        """
         peer = self.server.peers.get(number)
         had = self._skip.rows_of(number, self.config.num_clients)
-        if peer is None:
+        if peer is None or not had:
             return had > 0
-        return (peer.received if peer.failure is None else peer.failed_row) < had
+        return peer.received <= had if peer.failure is None else peer.failed_row < had
 
     def _lose(self, number: int, error: PhysxError, *, left: bool = False) -> None:
         """Have another client take the place of one that is lost.

@@ -134,7 +134,8 @@ class Peer(Connection):
         Args:
             step: Number of its first step.
         """
-        self.origin = Origin(self.received, self.rejected.count, self.shown, step, self.episode + 1)
+        row = self.received if self.failure is None else self.failed_row
+        self.origin = Origin(row, self.rejected.count, self.shown, step, self.episode + 1)
         if self.journal is not None:
             self.journal.close()
             self.journal = Journal()
