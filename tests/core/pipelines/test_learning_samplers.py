@@ -196,9 +196,14 @@ def test_such_a_training_survives_being_killed_at_any_moments(
     assert survives(tmp_path, seed, 20, words)
 
 
-def test_after_failed_sets_resuming_is_refused(tmp_path):
+def test_after_failed_sets_resuming_is_refused_if_rejected_samples_are_recorded(tmp_path):
     environment = EnvironmentConfig(
-        SWING, env_kwargs={"fails_above": 25.0}, seed=3, redraw=99, as_tcp_ip_client=False
+        SWING,
+        env_kwargs={"fails_above": 25.0},
+        seed=3,
+        redraw=99,
+        as_tcp_ip_client=False,
+        record_wrong_samples=True,
     )
     network = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "noise"})
     options = {"session_dir": str(tmp_path), "session_name": "run", "quiet": True, "batch_size": 5}
