@@ -272,11 +272,53 @@ def learned() -> list[bool]:
     return met
 
 
+# Which simulations --------------------------------------------------------------------------------
+
+RESONANCE = Problem("online_problems:Resonance", network("output", 2, 64, 64, 2), 1024, 1)
+MANY_VIEWS = 64
+
+
+def tail(sampler: str | None, folder: str, seed: int, data: Mapping[str, np.ndarray]) -> float:
+    """Return the 99th percentile of the error of a training whose sampler chooses simulations."""
+    config = EnvironmentConfig(RESONANCE.environment, num_clients=2, sampler=sampler, seed=seed)
+    kwargs = {
+        "capacity": RESONANCE.rows // 2,
+        "watermark": RESONANCE.rows // 10,
+        "views": MANY_VIEWS,
+    }
+    training = Training(
+        RESONANCE.network, None, config, epoch_nb=1, batch_size=SMALL_BATCH, quiet=True, seed=seed,
+        batch_nb=MANY_VIEWS * RESONANCE.rows // SMALL_BATCH, session_dir=folder,
+        online="physx/reservoir", online_kwargs=kwargs,
+    )  # fmt: skip
+    with training:
+        training.execute()
+        predicted = training.learner.predict_in_training({"input": data["input"]})["output"]
+    errors = np.sqrt(np.mean((predicted - data["output"]) ** 2, axis=1))
+    return float(np.quantile(errors, 0.99))
+
+
+def chosen() -> bool:
+    """Compare simulations that the loss chooses with random ones."""
+    found = []
+    for seed in SEEDS:
+        with tempfile.TemporaryDirectory() as folder:
+            with Dataset.open(stored(RESONANCE, folder, "validation", 10_000, 2000)) as dataset:
+                data = {name: view[:] for name, view in dataset["training"].items()}
+            pair = [tail(sampler, folder, seed, data) for sampler in (None, "physx/active")]
+        found.append((*pair, pair[1] / pair[0]))
+    uniform, active, ratio = np.median(found, axis=0)
+    print(f"Resonance, {RESONANCE.simulations} simulations: 99th percentile of the error, medians")
+    print(f"  uniform {uniform:.3g}, active {active:.3g}; ratios", end=" ")
+    print(*(f"{each:.2f}" for *_, each in found))
+    return claim("active against uniform", float(ratio), at_most=0.7)
+
+
 def main() -> None:
     """Measure and print."""
     torch.set_num_threads(1)
     np.seterr(all="raise")
-    finish([*overlap(), *waits(), memory(), *learned()])
+    finish([*overlap(), *waits(), memory(), *learned(), chosen()])
 
 
 if __name__ == "__main__":

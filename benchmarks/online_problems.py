@@ -98,3 +98,33 @@ class Lorenz(Environment):
     def _speed(self, state: Vector) -> Vector:
         (sigma, rho, beta), (x, y, z) = self._coefficients, state
         return np.array([sigma * (y - x), x * (rho - z) - y, x * y - beta * z])
+
+
+class Resonance(Environment):
+    """The response of a damped oscillator to a periodic force, one sample for each simulation.
+
+    Around the resonance with little damping it is large and changes quickly: a small part of the
+    range of parameters.
+    """
+
+    def create(self) -> None:
+        """Define frequency, in natural frequencies, and damping, of the critical one."""
+        self.define_parameters([Parameter("frequency", 0.2, 3.0), Parameter("damping", 0.03, 0.4)])
+        self._is_new = True
+
+    def init_database(self) -> None:
+        """Define a field to read and one to predict."""
+        self.define_training_fields([Field("input", shape=(2,)), Field("output", shape=(2,))])
+
+    def reset_parameters(self, frequency: float, damping: float) -> None:
+        """Note the parameters."""
+        self._frequency, self._damping = frequency, damping
+
+    def step(self) -> None:
+        """Compute the parts of the response in phase with the force, and a quarter behind."""
+        if not self._is_new:
+            self.new_episode()
+        self._is_new = False
+        response = 1 / (1 - self._frequency**2 + 2j * self._damping * self._frequency)
+        scaled = [(self._frequency - 1.6) / 1.4, (self._damping - 0.2) / 0.2]
+        self.set_training_data(input=scaled, output=[response.real, response.imag])
