@@ -19,7 +19,7 @@ from physx_core.fields import Field
 from physx_core.net.frames import Kind, pack
 from physx_core.net.values import encode
 from physx_core.rows import ROW_FIELDS, concatenate
-from physx_core.sources.source import Source, check_stored
+from physx_core.sources.source import Canceled, Source, check_stored
 from physx_core.typing import Batch
 from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.parameter_sets import ParameterSets
@@ -289,7 +289,7 @@ class ClientSource(Source):
 
     def _check_canceled(self) -> None:
         if self._is_canceled:
-            raise UsageError("This source is being closed.")
+            raise Canceled
 
     def _next_row(self, number: int) -> int:
         """Return the index among all rows of the next one that an instance generates."""

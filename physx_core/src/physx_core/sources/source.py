@@ -13,6 +13,10 @@ from physx_core.typing import Batch
 from physx_core.workers.parameter_sets import ParameterSets
 
 
+class Canceled(BaseException):
+    """A call of `Source.batch` was canceled: the run is over, and nothing of it is kept."""
+
+
 class Source(ABC):
     """Generates batches of samples with the instances of one environment.
 
@@ -78,7 +82,7 @@ class Source(ABC):
         """Pass row i of a prediction to the instance that generated row i of the last batch."""
 
     def cancel(self) -> None:
-        """Have a call of `batch` in another thread end soon, with an error; `close` follows.
+        """Have a call of `batch` in another thread end soon, with `Canceled`; `close` follows.
 
         Environments in this process finish the call.
         """
