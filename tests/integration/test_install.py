@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import venv
+from pathlib import Path
 
 import pytest
 
@@ -54,6 +55,8 @@ def empty(tmp_path, run, wheels, root):
 def test_the_core_alone_generates_and_trains_and_torch_adds_its_network(empty, run, wheels):
     python = empty("physx_core")
     listed = json.loads(run("-m", "pip", "list", "--format", "json", python=python).stdout)
+    folder = run(*PHYSX, "include", python=python).stdout.strip()
+    assert {"physx.h", "physx.f90"} < {path.name for path in Path(folder).iterdir()}
     foreign = {"gymnasium", "torch", "dartpy", "pin", "rerun-sdk"}
     assert not foreign & {package["name"] for package in listed}
     generate = (*PHYSX, "generate", "toy/spring", "--batch-nb", 2, "--batch-size", 10)

@@ -1,5 +1,6 @@
 """A training that was interrupted goes on bit for bit."""
 
+import dataclasses
 import runpy
 import signal
 import subprocess
@@ -149,8 +150,17 @@ def test_what_cannot_be_resumed(training):
     spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, always_produce=True)
     options = {"epoch_nb": 1, "batch_nb": 1, "batch_size": 5, "session_name": "online"}
     Training(NetworkConfig("toy/linear"), None, spring, **options).execute()
-    with pytest.raises(ConfigError, match="cannot be resumed"):
-        Training(NetworkConfig("toy/linear"), None, spring, resume=True, **options).execute()
+    for changed, others, name in (
+        ({"num_clients": 2}, {}, "num_clients was 1 and is 2"),
+        ({"env_kwargs": {"mass": 2.0}}, {}, "env_kwargs was {}"),
+        ({"seed": 3}, {}, "seed was"),
+        ({}, {"batch_size": 6}, "batch_size was 5 and is 6"),
+    ):
+        other = dataclasses.replace(spring, **changed)
+        with pytest.raises(ConfigError, match=f"cannot be resumed .*{name}"):
+            Training(
+                NetworkConfig("toy/linear"), None, other, resume=True, **{**options, **others}
+            ).execute()
     other = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "y"})
     training(1, session_name="run").execute()
     data = DatasetConfig(existing_dir="data")

@@ -2,6 +2,7 @@
 
 from . import plugins as plugins
 from .closeable import Closeable as Closeable
+from .components import Buffer as Buffer
 from .components import ClientHandle as ClientHandle
 from .components import Environment as Environment
 from .components import Factory as Factory
@@ -9,6 +10,8 @@ from .components import Launcher as Launcher
 from .components import Network as Network
 from .components import Observer as Observer
 from .components import Optimization as Optimization
+from .components import Parameter as Parameter
+from .components import Sampler as Sampler
 from .components import Transformation as Transformation
 from .components import Visualizer as Visualizer
 from .config import DatasetConfig as DatasetConfig

@@ -24,6 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
@@ -35,6 +36,7 @@ from physx_core.fields import Field
 from physx_core.origin import install_hint
 from physx_core.parsing import parse_toml
 from physx_core.statistics import Normalization
+from physx_core.typing import Array, Index
 
 FORMAT_VERSION = 2
 """Version of the description; version 1 has no checksums."""
@@ -42,6 +44,12 @@ NAME = "network"
 """Name of the checkpoints unless another one is given."""
 BEST = "best"
 DESCRIPTION = "checkpoint.toml"
+BUFFER = "buffer.bin"
+"""File with the state of the buffer that draws the batches: whole numbers of 8 bytes."""
+_WHOLE = np.dtype("<i8")
+SAMPLER = "sampler.bin"
+"""File with the state of the sampler that learns from the training: numbers of 8 bytes."""
+_REAL = np.dtype("<f8")
 _KEPT = (
     "network",
     "network_kwargs",
@@ -72,6 +80,7 @@ class Progress:
         batch: Number of finished batches of the next epoch.
         batches_read: Number of batches read from the dataset, in all epochs.
         seed: Seed of the training.
+        blocks: Number of batches whose rows environments generated.
         best: State of `BestEpoch`.
         record: State of `TrainingRecord`.
     """
@@ -80,6 +89,7 @@ class Progress:
     batch: int
     batches_read: int
     seed: int
+    blocks: int = 0
     best: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
 
@@ -127,6 +137,8 @@ def save(
     fields: Mapping[str, Field],
     normalization: Mapping[str, Normalization],
     progress: Progress,
+    buffer: Index | None = None,
+    sampler: Array | None = None,
     *,
     best: bool = False,
 ) -> Path:
@@ -142,6 +154,8 @@ def save(
         fields: The dataset's fields.
         normalization: Normalization of the transformation.
         progress: Progress of the training.
+        buffer: State of the buffer that draws its batches, if there is one.
+        sampler: State of the sampler that learns from it, if there is one.
         best: Replace ``<network_name>_best``, to predict with or to start from, without the state
             that a resumed training needs.
 
@@ -161,7 +175,10 @@ def save(
         elif not numbers and not path.is_dir():  # whoever made it may not have waited for the disk
             files.sync_folder(network_dir.parent)
         _clear(network_dir, name)
-        _write(partial, description, network, None if best else optimization)
+        if best:
+            _write(partial, description, network)
+        else:
+            _write(partial, description, network, optimization, buffer, sampler)
         _publish(partial, path)
     except BaseException as error:
         cause = error if isinstance(error, OSError) else error.__cause__
@@ -203,7 +220,9 @@ def _write(
     partial: Path,
     description: Mapping[str, Any],
     network: Network,
-    optimization: Optimization | None,
+    optimization: Optimization | None = None,
+    buffer: Index | None = None,
+    sampler: Array | None = None,
 ) -> None:
     """Write the files of a checkpoint to a new folder, and wait until they are on the disk."""
     files.create_folder(partial, sync=False)
@@ -211,6 +230,12 @@ def _write(
     described = _describe_files(partial)
     if optimization is not None and optimization.state_file:
         optimization.save_state(partial / optimization.state_file)
+        described |= _describe_files(partial, described)
+    if buffer is not None:
+        _write_new(partial / BUFFER, np.asarray(buffer, _WHOLE).tobytes())
+        described |= _describe_files(partial, described)
+    if sampler is not None:
+        _write_new(partial / SAMPLER, np.asarray(sampler, _REAL).tobytes())
         described |= _describe_files(partial, described)
     _write_description(partial / DESCRIPTION, {**description, "files": described})
     for file in (*described, DESCRIPTION):
@@ -331,12 +356,16 @@ def _write_description(path: Path, plain: Mapping[str, Any]) -> None:
     import tomli_w
 
     body = tomli_w.dumps(plain).encode()
+    _write_new(path, body + _END.format(crc32(body)).encode())
+    files.start_sync(path)
+
+
+def _write_new(path: Path, content: bytes) -> None:
     descriptor = files.create_new(path)
     try:
-        files.write_at(descriptor, body + _END.format(crc32(body)).encode(), 0)
+        files.write_at(descriptor, content, 0)
     finally:
         files.close(descriptor)
-    files.start_sync(path)
 
 
 # Finding ----------------------------------------------------------------------------------------
@@ -448,6 +477,36 @@ def read(path: Path, *, content: bool = True) -> Checkpoint:
             problem = error
     text = f"{path} cannot be read: {problem}. {problem.advice}"
     raise CheckpointError(text) from problem
+
+
+def read_buffer(found: Checkpoint) -> Index:
+    """Return the state of the buffer that draws a training's batches, from its checkpoint.
+
+    Raises:
+        CheckpointError: If the checkpoint has none, or was replaced meanwhile.
+    """
+    return np.frombuffer(_read_numbers(found, BUFFER), _WHOLE).astype(np.int64)
+
+
+def read_sampler(found: Checkpoint) -> Array:
+    """Return the state of the sampler that learns from a training, from its checkpoint.
+
+    Raises:
+        CheckpointError: If the checkpoint has none, or was replaced meanwhile.
+    """
+    return np.frombuffer(_read_numbers(found, SAMPLER), _REAL).astype(np.float64)
+
+
+def _read_numbers(found: Checkpoint, name: str) -> bytes:
+    try:
+        content = files.read_content(found.path / name, _LARGEST)
+    except OSError as error:
+        raise CheckpointError(
+            f"{found.path / name} cannot be read: {error.strerror or error}. The training cannot "
+            "be resumed there. Use another checkpoint."
+        ) from error
+    check_unchanged(found)
+    return content[: len(content) // 8 * 8]
 
 
 def check_unchanged(found: Checkpoint) -> None:

@@ -21,6 +21,7 @@ from physx_core.parsing import parse_toml
 
 __all__ = [
     "MODES",
+    "SETS",
     "WRONG",
     "DatasetConfig",
     "EnvironmentConfig",
@@ -138,6 +139,8 @@ MODES = ("training", "validation", "prediction")
 """The modes of a dataset that samples can be generated for."""
 WRONG = "wrong"
 """Mode of the samples that `check_sample` rejected."""
+SETS = "parameters"
+"""Mode of the parameters that were chosen, one row for each set."""
 
 
 @configuration
@@ -178,6 +181,14 @@ class EnvironmentConfig:
     """Visualizer, for example "rerun"; None: the environment has no factory."""
     visualizer_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the visualizer."""
+    sampler: str | type[Any] | None = None
+    """Sampler of the environment's parameters, for example "physx/sobol"; None: they are drawn from
+    their distributions."""
+    sampler_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the sampler."""
+    redraw: int = at_least(0, 0)
+    """Number of times that each instance continues with its next parameters after some with which
+    the simulation failed; those are recorded."""
     seed: int | None = None
     """Seed of all instances' random streams; None: a random one, recorded in the session."""
     timeout: float = at_least(0.1, 60.0)

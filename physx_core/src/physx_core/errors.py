@@ -256,6 +256,23 @@ class ClientError(PhysxError):
         super().__init__(f"Client {instance_id} {message}{tail}")
 
 
+class ProgramError(PhysxError):
+    """A program that makes the samples of an environment failed, hung or broke the protocol.
+
+    Attributes:
+        program: The program and its arguments, as in a shell.
+        exit_status: Exit status of the process, negative for a signal, None while it runs.
+        stderr: Last lines of its standard error.
+    """
+
+    def __init__(
+        self, program: str, message: str, *, exit_status: int | None = None, stderr: str = ""
+    ) -> None:
+        self.program, self.exit_status, self.stderr = program, exit_status, stderr
+        tail = f"\nLast lines of its standard error:\n{stderr}" if stderr else ""
+        super().__init__(f"The program {program} {message}{tail}")
+
+
 class ConnectionRefusedByPeerError(PhysxError):
     """The other side of a connection failed to authenticate, or violated the protocol."""
 

@@ -174,6 +174,10 @@ class RejectedSamples:
             copies = {name: np.array(value) for name, value in sample.items()}
             self._waiting.append((copies, episode, step))
 
+    def forget(self, count: int) -> None:
+        """Forget the first samples."""
+        del self._waiting[:count]
+
     def infer_shapes(self, fields: Sequence[Field]) -> list[Field]:
         """Return fields with open shapes taken from the first sample that has all the fields."""
         for sample, _, _ in self._waiting:

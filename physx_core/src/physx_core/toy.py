@@ -213,6 +213,11 @@ class LeastSquares(Optimization):
         self._targets = target.reshape(len(target), -1)
         return float(np.mean((prediction[self._network.pred_fields[0]] - target) ** 2))
 
+    def compute_row_losses(self, prediction: Tensors, targets: Tensors, data: Tensors) -> Any:
+        """Return the mean square of each row's difference."""
+        error = prediction[self._network.pred_fields[0]] - targets[self._network.opt_fields[0]]
+        return np.mean((error**2).reshape(len(error), -1), axis=1)
+
     def optimize(self, loss: Any) -> None:
         """Add the batch to the normal equations and solve them."""
         normal, right = self._rows.T @ self._rows, self._rows.T @ self._targets

@@ -7,17 +7,23 @@ averaged before clipping and stepping, so that all processes have the same param
 from __future__ import annotations
 
 import atexit
+import datetime
 import json
 import os
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import distributed
 
 from physx_core.components import Group
 from physx_core.errors import ConfigError
+from physx_core.typing import Batch
 from physx_torch.devices import find_device
+
+_TIMEOUT = datetime.timedelta(days=1)
+"""Longest time for which the others wait for one; its environments may take long for a batch."""
 
 
 def join_group(device: str) -> Group:
@@ -60,6 +66,32 @@ class TorchGroup(Group):
         distributed.broadcast(tensor, 0)
         return tensor
 
+    def deal(self, batch: Batch) -> tuple[Batch, float]:
+        """Return this process's share of the leading process's batch, and its weight."""
+        kinds = {name: (array.dtype.str, array.shape[1:]) for name, array in batch.items()}
+        shares = [self.share_for(rank, batch) for rank in range(self.size if self.leads else 0)]
+        rows = [len(next(iter(share.values()))) for share, _ in shares]
+        told = self.tell([kinds, rows, [weight for _, weight in shares]])
+        kinds, count, weight = told[0], told[1][self.rank], told[2][self.rank]
+        if self.leads:
+            for rank in range(1, self.size):
+                distributed.send(self._packed(shares[rank][0]), rank)
+            return shares[0]
+        types = {name: np.dtype((kind, tuple(shape))) for name, (kind, shape) in kinds.items()}
+        nbytes = count * sum(dtype.itemsize for dtype in types.values())
+        received = torch.empty(nbytes, dtype=torch.uint8, device=self._device)
+        distributed.recv(received, 0)
+        content, place, share = received.cpu().numpy(), 0, {}
+        for name, dtype in types.items():
+            part = content[place : place + count * dtype.itemsize]
+            share[name] = np.frombuffer(part.tobytes(), dtype.base).reshape(count, *dtype.shape)
+            place += part.nbytes
+        return share, weight
+
+    def _packed(self, share: Batch) -> torch.Tensor:
+        content = b"".join(np.ascontiguousarray(array).tobytes() for array in share.values())
+        return torch.frombuffer(bytearray(content), dtype=torch.uint8).to(self._device)
+
     def total(self, values: Sequence[float]) -> list[float]:
         """Return the sums of the numbers over all processes."""
         sums = torch.tensor(values, dtype=torch.float64, device=self._device)
@@ -73,7 +105,7 @@ def _connect(device: torch.device) -> None:
     if own:
         torch.cuda.set_device(device)
     try:
-        distributed.init_process_group("cpu:gloo,cuda:nccl" if own else "gloo")
+        distributed.init_process_group("cpu:gloo,cuda:nccl" if own else "gloo", timeout=_TIMEOUT)
     except (RuntimeError, ValueError) as error:
         raise ConfigError(
             f"The processes that train together cannot connect: {error}. "

@@ -54,12 +54,15 @@ if __name__ == "__main__":
     data = DatasetConfig(existing_dir="sessions/run")
     spring = EnvironmentConfig("toy/spring", num_clients=2, seed=1)
     alone = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, always_produce=True)
+    busy = EnvironmentConfig("toy/spring", num_clients=2, always_produce=True)
     network = NetworkConfig("toy/linear")
 """
 PIPELINES = {
     "generation": 'DataGeneration(spring, session_name="new", batch_nb=10**7, batch_size=6)',
     "training": 'Training(network, data, session_name="new", epoch_nb=10**7, batch_size=10)',
     "online training": 'Training(network, None, alone, session_name="new", epoch_nb=10**7,'
+    " batch_nb=10, batch_size=10)",
+    "training with clients": 'Training(network, None, busy, session_name="new", epoch_nb=10**7,'
     " batch_nb=10, batch_size=10)",
     "prediction": 'Prediction(NetworkConfig(), spring, session_name="trained", record=True)',
     "replay": 'Replay(data, spring, session_name="new", step_nb=-1)',
@@ -102,7 +105,8 @@ AGAIN = "next: physx train --config sessions/new --network.network-dir sessions/
 LEFT = {
     "generation": ["next: physx info sessions/new"],
     "training": [CHECKPOINT, "next: physx train sessions/new --resume"],
-    "online training": [CHECKPOINT, AGAIN],
+    "online training": [CHECKPOINT, "next: physx train sessions/new --resume"],
+    "training with clients": [CHECKPOINT, "next: physx train sessions/new --resume"],
     "prediction": ["next: physx info sessions/trained"],
     "replay": ["session: sessions/new is removed, as the run kept nothing in it"],
 }
@@ -119,7 +123,7 @@ def test_sigterm_ends_every_pipeline_in_order_with_status_143(kind, nothing_stay
         assert "interrupted after" in Path(f"sessions/{session}/info.txt").read_text()
     if "training" in kind:
         assert checkpoints("new") == ["network_0"] and progress("new") != (0, 0)
-    if kind in ("generation", "online training", "prediction"):
+    if kind in ("generation", "online training", "training with clients", "prediction"):
         with Dataset.open(f"sessions/{session}") as dataset:
             mode = "prediction" if kind == "prediction" else "training"
             assert dataset.num_samples(mode) > 0 and dataset.verify() == []
@@ -135,6 +139,23 @@ def test_a_second_signal_ends_a_training_at_once():
     code, _ = signaled(text, [signal.SIGTERM, signal.SIGTERM])
     assert code == 143 and time.monotonic() - began < 25
     assert not Path("sessions/new/network").exists()
+
+
+@pytest.mark.parametrize("busy", ["optimize", "batch_produce"])
+def test_a_second_signal_ends_a_training_whose_clients_run_ahead(busy, nothing_stays_behind):
+    """It is learning, or waits for a client that takes its time."""
+    slow = Path(__file__).parents[1] / "programs" / "online_envs.py"
+    make = (
+        f'Training(NetworkConfig("toy/linear", network_kwargs={{"net_fields": "x", "opt_fields":'
+        f' "y"}}), None, EnvironmentConfig("{slow}:Pupil", env_kwargs={{"asks": True, "delay": '
+        f"{1e4 * (busy == 'batch_produce')}}}), epoch_nb=1, batch_nb=1000, batch_size=5)"
+    )
+    text = saying(make, "train_begin")
+    if busy == "optimize":
+        text = saying(make, "optimize").replace("close()", "close(); import time; time.sleep(60)")
+    began = time.monotonic()
+    code, _ = signaled(text, [signal.SIGTERM, signal.SIGTERM])
+    assert code == 143 and time.monotonic() - began < 50
 
 
 def test_the_command_ends_with_143_too():
@@ -179,19 +200,31 @@ def test_an_environment_that_fails_leaves_a_checkpoint_and_the_error_names_it():
         Training(NETWORK, None, config, batch_nb=3, **OPTIONS).execute()
     place = Path("sessions/training/network/network_0")
     assert str(place) in caught.value.__notes__[-1]
-    assert "NetworkConfig.network_dir" in caught.value.__notes__[-1]
+    assert "from which resume=True" in caught.value.__notes__[-1]
     assert progress() == (1, 1)
     Training(NETWORK, batch_nb=3, resume=True, **OPTIONS).execute()
     assert progress(number=1) == (3, 0)
 
 
+class Asking(Failing):
+    """Moves as the network that learns predicts."""
+
+    def step(self):
+        super().step()
+        self.state = (
+            self.state + self.get_prediction(state=self.state, force=np.zeros(1))["next_state"]
+        )
+
+
 def test_a_training_that_cannot_be_resumed_says_how_to_go_on(capfd):
-    config = EnvironmentConfig(Failing, as_tcp_ip_client=False, seed=1)
+    config = EnvironmentConfig(Asking, as_tcp_ip_client=False, seed=1)
     with pytest.raises(EnvironmentFailedError) as caught:
         Training(NETWORK, None, config, batch_nb=9, **OPTIONS).execute()
     assert "NetworkConfig.network_dir" in caught.value.__notes__[-1]
     last = capfd.readouterr().err.splitlines()[-1]
     assert last == AGAIN.replace("new", "training")
+    with pytest.raises(ConfigError, match=r"depend on the network that learns.*network_dir"):
+        Training(NETWORK, None, config, batch_nb=9, resume=True, **OPTIONS).execute()
     words = last.removeprefix("next: physx ").split()
     assert main([*words, "--environment.environment", "toy/spring", "--batch-nb", "1"]) == 0
     assert progress("training_1") == (3, 0)

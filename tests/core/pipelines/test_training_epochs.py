@@ -285,13 +285,11 @@ def test_what_cannot_be_trained_by_several_processes(data, monkeypatch):
 
     options = {"epoch_nb": 1, "batch_nb": 1, "batch_size": 2}
     for data, choice, advice in (
-        (None, {}, "generate the samples in one process, with epoch_nb=1"),
-        (None, {"always_produce": True}, "Leave out always_produce"),
         (DATA, {"load_samples": True}, "send the stored samples through them in one process"),
         (DATA, {"load_samples": True, "only_first_epoch": False}, "or train in one process"),
     ):
         spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, **choice)
-        with pytest.raises(ConfigError, match=f"train on stored samples only.*{advice}"):
+        with pytest.raises(ConfigError, match=f"cannot replay samples for several.*{advice}"):
             Training(NetworkConfig(Joins), data, spring, **options).execute()
     with pytest.raises(ConfigError, match="LeastSquares cannot work in several processes"):
         Training(NetworkConfig(Joins), DATA, **options).execute()

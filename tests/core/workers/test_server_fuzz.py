@@ -19,6 +19,7 @@ import pytest
 
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.net import Kind, pack
+from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.server.client_group import ClientGroup
 
 ROGUE = Path(__file__).parents[1] / "programs" / "rogue_client.py"
@@ -138,7 +139,7 @@ class Attacked:
     def __init__(self, port, honest, rogues):
         config = EnvironmentConfig(f"{ENVS}:Plain", num_clients=honest + rogues, port=port)
         self.services = Tolerant()
-        self.server = ClientGroup(config, self.services, [1]).server
+        self.server = ClientGroup(config, self.services, [1], ParameterSets(config, [1])).server
         self.honest = range(1, honest + 1)
         self.rogues = range(honest + 1, honest + rogues + 1)
         self.rows = dict.fromkeys([*self.honest, *self.rogues], 0)

@@ -85,6 +85,40 @@ def test_one_step_of_gradient_descent_by_hand():
     torch.testing.assert_close(network.layers[0].weight.detach(), expected)
 
 
+class Doubled(TorchOptimization):
+    """Has a loss of its own."""
+
+    def compute_loss(self, prediction, targets, data):
+        return 2 * super().compute_loss(prediction, targets, data)
+
+
+@pytest.mark.parametrize(
+    ("kind", "loss"),
+    [
+        (TorchOptimization, "MSELoss"),
+        (TorchOptimization, "SmoothL1Loss"),
+        (TorchOptimization, lambda a, b: ((a - b) ** 4).mean()),
+        (Doubled, "L1Loss"),
+    ],
+)
+def test_the_losses_of_rows_are_those_of_batches_of_one_row(kind, loss):
+    network, _ = made()
+    optimization = kind()
+    optimization.set_loss(loss)
+    optimization.set_optimizer("SGD", network, lr=0.1)
+    tensors = network.numpy_to_tensor(regression(7))
+    prediction = network.predict(tensors)
+    losses = optimization.compute_row_losses(prediction, tensors, tensors)
+    assert losses.shape == (7,)
+    assert not losses.requires_grad
+    for row in range(7):
+        one = {name: value[row : row + 1] for name, value in tensors.items()}
+        alone = optimization.compute_loss(network.predict(one), one, one)
+        assert losses[row].item() == pytest.approx(alone.item(), rel=1e-5)
+    whole = optimization.compute_loss(prediction, tensors, tensors)
+    assert losses.mean().item() == pytest.approx(whole.item(), rel=1e-5)
+
+
 def test_only_the_network_needs_gradients():
     network, optimization = made()
     data = network.numpy_to_tensor(regression(4))

@@ -17,11 +17,12 @@ from safetensors.torch import load_file
 
 from physx_core import Dataset
 from physx_core.checkpoint import read
+from physx_core.pipelines import read_drawn_rows
 
 pytest.importorskip("torch.distributed")
 
 SCRIPT = '''
-import os, signal, sys, torch
+import os, signal, sys, numpy as np, torch
 from physx_core import (
     DatasetConfig, Environment, EnvironmentConfig, Field, NetworkConfig, Training)
 from physx_core.errors import ConfigError
@@ -50,14 +51,68 @@ class Halves(Environment):
     def step(self):
         self.set_training_data(x=self.sample["x"], y=self.sample["y"] / 2)
 
+class Makes(Environment):
+    """Makes samples, and fails or asks for predictions if it is told to."""
+
+    def __init__(self, *, fails_at=None, asks=False, **kwargs):
+        super().__init__(**kwargs)
+        self.count, self.fails_at, self.asks = 0, fails_at, asks
+
+    def create(self):
+        pass
+
+    def init_database(self):
+        self.define_training_fields([Field("x", (3,)), Field("y", (2,))])
+        self.define_additional_fields([Field("count", (), "int64")])
+
+    def step(self):
+        if self.count == self.fails_at:
+            raise RuntimeError("enough")
+        x = self.rng.normal(size=3)
+        if self.asks and self.count:
+            x[0] += self.get_prediction(x=x)["y"][0]
+        self.set_training_data(x=x, y=np.sin(x[:2]))
+        self.set_additional_data(count=self.count)
+        self.count += 1
+
+def generating(batch_size, name, epochs=2, over_tcp=True, *, always=False, online=None,
+               kind=Training, resume=False, **made):
+    makes = EnvironmentConfig(Makes, num_clients=2, seed=1, as_tcp_ip_client=over_tcp,
+                              always_produce=always, env_kwargs=made)
+    buffer = {"online": "physx/reservoir", "online_kwargs": online} if online else {}
+    return kind(network(), DatasetConfig(normalize=True), makes, epoch_nb=epochs, batch_nb=8,
+                batch_size=batch_size, seed=3, session_name=name, resume=resume, **buffer)
+
+class Fails(Training):
+    def batch_end(self):
+        if (self.epoch_id, self.batch_id) == (1, 3):
+            raise RuntimeError("all fail")
+
+RESERVOIR = {"capacity": 30, "watermark": 12, "views": 2}
+
+def living():
+    generating(5, "stream_two").execute()
+    generating(5, "mixed_two", over_tcp=False, online=RESERVOIR, always=True).execute()
+    generating(5, "asking_two", asks=True, online=RESERVOIR).execute()
+    failed = {"online": RESERVOIR, "always": True, "over_tcp": False}
+    failing = generating(5, "failed_two", kind=Fails, **failed)
+    try:
+        failing.execute()
+    except RuntimeError:
+        failing.group.tell(None)  # the first one has written the checkpoint
+    generating(5, "failed_two", resume=True, **failed).execute()
+    generating(5, "fails", over_tcp=False, fails_at=20).execute()
+
 halves = EnvironmentConfig(Halves, as_tcp_ip_client=False, load_samples=True)
 
-def training(batch_size, name, epochs=4, seed=3, environment=None, kind=Training, **more):
-    network = NetworkConfig(
+def network():
+    return NetworkConfig(
         Net, optimization=Extra, loss="MSELoss", optimizer="Adam", lr=1e-2, data_type="float64",
         device="cpu", scheduler="ReduceLROnPlateau", scheduler_kwargs={"patience": 0},
         optimization_kwargs={"gradient_clip": 0.5, "accumulate": 2})
-    return kind(network, DatasetConfig(existing_dir="data", normalize=True), environment,
+
+def training(batch_size, name, epochs=4, seed=3, environment=None, kind=Training, **more):
+    return kind(network(), DatasetConfig(existing_dir="data", normalize=True), environment,
                 epoch_nb=epochs, batch_size=batch_size, seed=seed, session_name=name, **more)
 
 class Cut(Training):
@@ -83,7 +138,7 @@ def together():
         training(5, "sent", environment=halves).execute()
         raise SystemExit("environments took part")
     except ConfigError as error:
-        assert "Several processes train on stored samples only" in str(error)
+        assert "cannot replay samples for several processes" in str(error)
     training(5, "sent", 3, environment=halves, resume=True).execute()
     with training(5, "free", 2, seed=None) as made:
         made.execute()
@@ -140,15 +195,16 @@ def parameters(session, number=0):
     return load_file(f"sessions/{session}/network/network_{number}/parameters.safetensors")
 
 
-def agree(session, other, number=0):
+def agree(session, other, number=0, second=1):
     """Whether one process and two came to the same network."""
-    one, two = parameters(session, number), parameters(other, 1)
+    one, two = parameters(session, number), parameters(other, second)
     return all(torch.allclose(value, two[name], rtol=0, atol=1e-6) for name, value in one.items())
 
 
 def numbers(session):
     with Path(f"sessions/{session}/stats/scalars.csv").open() as stream:
-        return {tuple(row[:3]): float(row[3]) for row in list(csv.reader(stream))[1:]}
+        rows = [row for row in list(csv.reader(stream))[1:] if not row[2].startswith("online/")]
+        return {tuple(row[:3]): float(row[3]) for row in rows}
 
 
 def test_two_processes_train_as_one_with_the_doubled_batch():
@@ -176,6 +232,31 @@ def test_two_processes_train_as_one_with_the_doubled_batch():
     assert (cut.epoch, cut.batch) == (1, 3)  # both ended after the same batch
     resumed = parameters("cut", 1)
     assert all(torch.equal(value, resumed[name]) for name, value in parameters("two", 1).items())
+
+
+def test_two_processes_learn_from_environments_of_the_first_as_one_does():
+    script = alone()
+    generating, reservoir = script["generating"], script["RESERVOIR"]
+    generating(10, "stream", over_tcp=False).execute()
+    generating(10, "mixed", over_tcp=False, online=reservoir, always=True).execute()
+    generating(10, "asking", over_tcp=False, asks=True, online=reservoir).execute()
+    status, text = ended(start("living()"))
+    assert status != 0 and "enough" in text, text
+    for name in ("stream", "mixed"):
+        with Dataset.open(f"sessions/{name}") as one, Dataset.open(f"sessions/{name}_two") as two:
+            for field in ("x", "y", "count"):
+                assert np.array_equal(one["training"][field][:], two["training"][field][:])
+    for name in ("stream", "mixed", "asking"):
+        assert agree(name, f"{name}_two", second=0), name
+        apart, both = numbers(name), numbers(f"{name}_two")
+        assert apart.keys() == both.keys() and ("epoch", "2", "size/training") in apart
+        assert all(abs(value - both[key]) < 1e-6 for key, value in apart.items())
+    assert agree("mixed", "failed_two")
+    drawn = [read_drawn_rows(f"sessions/{name}") for name in ("mixed", "mixed_two", "failed_two")]
+    assert np.array_equal(drawn[0], drawn[1]) and np.array_equal(drawn[0], drawn[2])
+    assert drawn[0].shape == (16, 10)
+    failed = read(Path("sessions/fails/network/network_0")).progress
+    assert (failed.epoch, failed.batch) == (0, 4)
 
 
 def test_ctrl_c_at_the_launcher_keeps_a_checkpoint_that_can_be_resumed():

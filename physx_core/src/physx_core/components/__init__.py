@@ -1,7 +1,7 @@
 """Base classes of the components that plugins implement and pipelines use.
 
-A plugin derives its environments, networks, optimizations, transformations, visualizers and
-launchers from these.
+A plugin derives its environments, networks, optimizations, transformations, visualizers,
+launchers, buffers and samplers from these.
 """
 
 from __future__ import annotations

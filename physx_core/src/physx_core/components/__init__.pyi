@@ -1,5 +1,7 @@
 """Base classes of the components that plugins implement and pipelines use."""
 
+from .buffer import Buffer as Buffer
+from .buffer import Draw as Draw
 from .environment import Environment as Environment
 from .environment import Services as Services
 from .environment import options_of as options_of
@@ -8,6 +10,9 @@ from .launcher import ClientHandle as ClientHandle
 from .launcher import Launcher as Launcher
 from .network import Network as Network
 from .optimization import Optimization as Optimization
+from .parameter import Parameter as Parameter
+from .sampler import LearningSampler as LearningSampler
+from .sampler import Sampler as Sampler
 from .scene import Event as Event
 from .scene import Factory as Factory
 from .transformation import Transformation as Transformation

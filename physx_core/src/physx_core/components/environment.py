@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, ClassVar, Protocol, TypeAlias
 
 import numpy as np
 
+from physx_core.components.parameter import Parameter, as_parameters, draw, random_of
 from physx_core.components.scene import Event, Factory, NullFactory
 from physx_core.errors import (
     ConfigError,
@@ -86,24 +87,33 @@ class Services(Protocol):
         ...
 
 
+Choose: TypeAlias = Callable[[int], Mapping[str, Any]]
+"""Returns the values of the parameters for an episode, by name."""
+
+
 class Environment:
     """A simulation that generates one sample in each step.
 
     Subclasses implement `create`, `init_database` and `step`. The methods are called in this
-    order: `create`, `init`, `init_database`, `init_visualization` (only with a visualizer), then
-    `step` repeatedly, and `close` at the end, also after a failure.
+    order: `create`, `init`, `init_database`, `init_visualization` (only with a visualizer),
+    `reset_parameters` (only if parameters are defined), then `step` repeatedly, and `close` at the
+    end, also after a failure.
 
     Attributes:
         instance_id: Number of this instance among all instances of the run, from 1.
         instance_nb: Number of instances in the run.
-        rng: Random number generator of this instance, with its own stream.
+        rng: Random number generator of this instance, with its own stream; if parameters are
+            defined, with one for each episode.
         factory: Draws the environment. Without a visualizer it accepts everything and does nothing,
             and is false: ``if self.factory:`` saves what only the drawing needs.
         compute_training_data: False in sub-steps whose data are not used.
         step_index: Number of finished steps.
         episode_index: Index of the current trajectory, from 0.
         sample_episode: Index of the trajectory of the last training data.
+        runs_programs: Whether arguments name programs to run, so that no file may give them.
     """
+
+    runs_programs: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -129,6 +139,7 @@ class Environment:
         self.instance_id = instance_id
         self.instance_nb = instance_nb
         stream = np.random.SeedSequence(seed, spawn_key=(instance_id - 1,))
+        self._seed_entropy: Any = stream.entropy
         self.rng = np.random.default_rng(stream)
         self.factory: Factory = NullFactory()
         self.compute_training_data = True
@@ -142,6 +153,9 @@ class Environment:
         self._training: dict[str, Any] | None = None
         self._additional: dict[str, Any] | None = None
         self._services: Services | None = None
+        self._defined_parameters: list[Parameter] = []
+        self._choose_parameters: Choose | None = None
+        self._has_begun_episodes = False
 
     # What a subclass implements -------------------------------------------------------------
 
@@ -158,6 +172,18 @@ class Environment:
 
     def init_visualization(self) -> None:
         """Add objects to `factory`."""
+
+    def reset_parameters(self, **values: Any) -> None:
+        """Prepare the next episode with these values of the defined parameters.
+
+        Called before the first step and by `new_episode`, if `define_parameters` was called. Just
+        before it `rng` starts again, from a seed of this episode; so if this method sets the whole
+        state, the episode depends on nothing that was before it.
+
+        Args:
+            values: A number for each parameter of shape ``()``, else an array.
+        """
+        raise self._lacks("reset_parameters")
 
     def step(self) -> Any:
         """Simulate one step and set its data with `set_training_data`; may be a coroutine."""
@@ -206,6 +232,25 @@ class Environment:
         """
         self._define(as_fields(fields, "additional"))
 
+    def define_parameters(self, parameters: Parameter | Iterable[Parameter]) -> None:
+        """Define properties of the simulation that are chosen for each episode.
+
+        Call it in `create` or `init`. The run's sampler (`EnvironmentConfig.sampler`) chooses their
+        values, which `reset_parameters` gets; without one they are drawn from their distributions.
+
+        Raises:
+            ConfigError: If a parameter is malformed or defined twice.
+            UsageError: If the first episode has begun.
+        """
+        if self._has_begun_episodes:
+            raise UsageError(
+                "define_parameters() was called after the first step: call it in create()."
+            )
+        for parameter in as_parameters(parameters):
+            if any(known.name == parameter.name for known in self._defined_parameters):
+                raise ConfigError(f'The parameter "{parameter.name}" is defined twice.')
+            self._defined_parameters.append(parameter)
+
     def set_training_data(self, **fields: Any) -> None:
         """Set this step's training data: every training field, as arrays or numbers."""
         self._training = fields
@@ -216,9 +261,12 @@ class Environment:
 
         Call it when the state jumps, for example after drawing a new motion; the first trajectory
         starts automatically. Rows keep its index in the field ``episode``, from which
-        `Dataset.episodes` recovers the trajectories.
+        `Dataset.episodes` recovers the trajectories. If there are parameters, the next values are
+        chosen and `reset_parameters` is called.
         """
         self.episode_index += 1
+        if self._has_begun_episodes and self._defined_parameters:
+            self._reset_with_parameters()
 
     def set_additional_data(self, **fields: Any) -> None:
         """Set this step's additional data: every additional field, as arrays or numbers."""
@@ -270,6 +318,28 @@ class Environment:
         """Send the drawing events that `factory` collected since the last call to the viewers."""
         if self.factory:
             self._run().show(self.instance_id, self.step_index, self.factory.take_events())
+
+    def begin_episodes(self, episode: int | None = None) -> None:
+        """Begin the first episode; physx calls it before the first step.
+
+        Args:
+            episode: Index of the episode; None: that of the environment.
+        """
+        self._has_begun_episodes = True
+        if self._defined_parameters:
+            self.episode_index = self.episode_index if episode is None else episode
+            self._reset_with_parameters()
+
+    def _reset_with_parameters(self) -> None:
+        """Have the parameters of the current episode chosen, and prepare it with them."""
+        number = self.episode_index * self.instance_nb + self.instance_id - 1
+        if self._choose_parameters is not None:
+            values = self._choose_parameters(self.episode_index)
+        else:
+            values = draw(self._defined_parameters, self._seed_entropy, number)
+        fresh = random_of(self._seed_entropy, number, 0).bit_generator.state
+        self.rng.bit_generator.state = fresh  # in place, as others may hold the generator
+        self.reset_parameters(**values)
 
     def _lacks(self, method: str) -> UsageError:
         own = [name for name in dir(type(self)) if not hasattr(Environment, name)]

@@ -51,7 +51,19 @@ class Group:
         Args:
             batch: The whole batch, the same in all processes.
         """
+        return self.share_for(self.rank, batch)
+
+    def share_for(self, rank: int, batch: Batch) -> tuple[Batch, float]:
+        """Return the rows of the process of some rank, and their weight: see `share_of`."""
         rows = len(next(iter(batch.values())))
-        first, last = rows * self.rank // self.size, rows * (self.rank + 1) // self.size
+        first, last = rows * rank // self.size, rows * (rank + 1) // self.size
         own = slice(first, last) if last > first else slice(0, 1)
         return {name: values[own] for name, values in batch.items()}, (last - first) / rows
+
+    def deal(self, batch: Batch) -> tuple[Batch, float]:
+        """Return this process's share of a batch that only the leading one has: see `share_of`.
+
+        Args:
+            batch: The whole batch; ignored in the other processes.
+        """
+        return self.share_of(batch)

@@ -86,6 +86,19 @@ class Optimization(ABC):
             data: The whole batch, for losses that need more.
         """
 
+    def compute_row_losses(self, prediction: Tensors, targets: Tensors, data: Tensors) -> Any:
+        """Return the loss of each row of a batch, shape (rows,), for samplers that learn from them.
+
+        Called after `compute_loss`, with the same arguments, before `optimize`; nothing may change.
+
+        Raises:
+            ConfigError: If the optimization does not know them.
+        """
+        raise ConfigError(
+            f"{type(self).__name__} does not compute the losses of single rows, from which the "
+            "sampler learns: implement compute_row_losses(), or choose another sampler."
+        )
+
     def transform_loss(self, loss: Any, data: Tensors) -> dict[str, Any]:
         """Return the statistics of this step; entries beside ``loss`` are recorded too.
 

@@ -74,6 +74,10 @@ class Kind(enum.IntEnum):
     """Server: values of no fixed layout that belong to the next message [as there]."""
     SEEN = 25
     """Server: the result of a request, for observing clients [number of results so far]."""
+    PARAMETERS = 26
+    """Client, before READY: the parameters that its environment defines, if any."""
+    CHOOSE = 27
+    """Client: request for the parameters of an episode [number of the request]."""
 
 
 _KINDS = {int(kind): kind for kind in Kind}

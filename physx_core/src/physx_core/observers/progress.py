@@ -44,9 +44,17 @@ class ProgressBar(Observer):
             self._bar.update(count)
 
     def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
-        """Show the statistics of an epoch behind the bar, except those over several epochs."""
-        if self._bar is not None and timeline == "epoch":
+        """Show the statistics of an epoch behind the bar, except those over several epochs.
+
+        While environments generate, what there is about that is shown in their place.
+        """
+        if self._bar is None:
+            return
+        if timeline == "epoch":
             shown = {k: v for k, v in values.items() if not k.endswith(("_mean", "_variance"))}
+        else:
+            shown = {k[7:]: v for k, v in values.items() if k.startswith("online/")}
+        if shown:
             self._bar.set_postfix_str(", ".join(f"{k} {v:.3g}" for k, v in shown.items()), False)
 
     def note(self, text: str) -> None:

@@ -15,9 +15,16 @@ from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, deriv
 from physx_core.pipelines.run_description import (
     describe_dataset,
     describe_environment_config,
+    describe_failed_sets,
     describe_samples,
 )
-from physx_core.pipelines.storage import describe_environment, open_own, record_rejected
+from physx_core.pipelines.storage import (
+    GENERATION,
+    describe_environment,
+    open_own,
+    record_rejected,
+    store_sets,
+)
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 
@@ -88,11 +95,11 @@ class DataGeneration(NewSessionPipeline):
         """
         with record_rejected(self.source, self.dataset):
             self.batch = self.source.batch(self.batch_size)
+            store_sets(self.source, self.dataset)
             if self.batch_id == 0:
                 self.dataset.define_fields(self._mode, self.source.fields)
-                self.dataset.update_info(
-                    **describe_environment(self.environment_config, self._seed)
-                )
+                described = describe_environment(self.environment_config, self._seed)
+                self.dataset.update_info(**described, **{GENERATION: None})
             self.dataset.append(self._mode, self.batch, checked=True)
 
     def batch_count(self) -> None:
@@ -148,6 +155,7 @@ class DataGeneration(NewSessionPipeline):
         rate = count * self.batch_size / duration
         yield f"{count} of {self.batch_nb} batches in {duration:.2f} s, {rate:.0f} samples/s"
         yield describe_samples(self.dataset.directory)
+        yield from describe_failed_sets(self.source)
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         path = shlex.quote(str(self.session.path))

@@ -20,11 +20,12 @@ from physx_core.config import EnvironmentConfig, to_plain
 from physx_core.errors import UsageError
 from physx_core.observers import Observers, ProgressBar, ScalarsFile
 from physx_core.pipelines.interrupt import Terminated, raised_at_sigterm
-from physx_core.pipelines.services import Predict, RunServices
+from physx_core.pipelines.services import Predict, RunServices, Show
 from physx_core.pipelines.storage import remove_unused
 from physx_core.plugins import resolve
 from physx_core.session import Session
 from physx_core.sources.source import Source
+from physx_core.workers.instance import NOTHING, Skip
 
 _STREAMS = {"training": 0, "validation": 1, "prediction": 2}
 
@@ -228,10 +229,13 @@ class Pipeline(ABC):
         seed: Sequence[int],
         *,
         predict: Predict | None = None,
+        show: Show | None = None,
+        run_ahead: int | None = None,
         total: int | None = None,
         in_process: bool = False,
         replayed: Path | None = None,
         accept_all: bool = False,
+        skip: Skip = NOTHING,
     ) -> Source:
         """Open the environments, in this process or in clients.
 
@@ -240,25 +244,35 @@ class Pipeline(ABC):
             config: The environment, and how its instances run.
             seed: Seed of the instances.
             predict: The network's prediction for a batch; None: there is no network.
+            show: Receives drawing events; None: the observers.
+            run_ahead: Number of rows that clients may generate before they are requested; None: as
+                many as `ClientSource` permits. See there for when it must be 0.
             total: Number of rows that will be requested; None: unknown.
             in_process: Whether they must run in this process.
             replayed: Folder of the dataset whose samples they replay; the parameters saved there
                 can be loaded. None: they generate new samples.
             accept_all: Whether samples that `check_sample` rejects count like the others.
+            skip: The rows that an earlier run has had: they are generated again, but not returned.
         """
-        services = RunServices(self.session.dataset_dir, self.observers, predict, replayed)
+        services = RunServices(
+            self.session.dataset_dir, show or self.observers.events, predict, replayed
+        )
         source: Source
         if in_process or not config.as_tcp_ip_client:
             from physx_core.sources.local_source import LocalSource
 
-            source = LocalSource(config, services, seed, accept_all=accept_all)
+            source = LocalSource(config, services, seed, accept_all=accept_all, skip=skip)
         else:
             from physx_core.sources.client_source import ClientSource
 
-            # Predictions change while a network learns; a row to replay is sent when it is due.
-            ahead = None if predict is None and replayed is None else 0
             source = ClientSource(
-                config, services, seed, run_ahead=ahead, total=total, accept_all=accept_all
+                config,
+                services,
+                seed,
+                run_ahead=run_ahead,
+                total=total,
+                accept_all=accept_all,
+                skip=skip,
             )
         return resources.enter_context(source)
 

@@ -183,6 +183,7 @@ class Prediction(Pipeline):
             environment,
             derive_seed(seed, "prediction", 0),
             predict=self.learner.answer,
+            run_ahead=0,
             in_process=environment.num_clients == 1,
             replayed=replayed,
         )

@@ -17,11 +17,11 @@ from physx_core.config import (
     to_plain,
 )
 from physx_core.dataset import Dataset
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, UntrustedReferenceError
 from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
 from physx_core.pipelines.stored_rows import StoredRows
-from physx_core.plugins.references import check_recorded, is_recorded_as
+from physx_core.plugins.references import check_recorded, find, is_recorded_as
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 
@@ -133,6 +133,7 @@ class Replay(NewSessionPipeline):
             resources,
             environment,
             derive_seed(seed, "prediction", 0),
+            run_ahead=0,
             in_process=environment.num_clients == 1,
             replayed=dataset.directory,
             accept_all=True,
@@ -156,7 +157,8 @@ def recorded_environment(
 
     Raises:
         ConfigError: If the dataset does not name its environment.
-        UntrustedReferenceError: If it names code that is no component of an installed plugin.
+        UntrustedReferenceError: If it names code that is no component of an installed plugin, or a
+            program.
     """
     info: Mapping[str, Any] = dataset.info
     recorded = info.get("environment")
@@ -175,6 +177,13 @@ def recorded_environment(
         "arguments",
         trust=trust,
     )
+    component = find("environment", recorded if given is None else given)
+    if not trust and getattr(component, "runs_programs", False):
+        raise UntrustedReferenceError(
+            f"The dataset in {dataset.directory} has the arguments of {recorded}, which runs the "
+            "programs that they name. Give the arguments yourself, or trust the dataset: --trust "
+            "(in Python trust=True)."
+        )
     count = info.get("num_clients", 1)
     if not trust and isinstance(count, int) and count > _MOST_CLIENTS:
         raise ConfigError(

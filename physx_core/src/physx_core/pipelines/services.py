@@ -10,7 +10,6 @@ import numpy as np
 
 from physx_core import files
 from physx_core.components.scene import Event
-from physx_core.components.visualizer import Observer
 from physx_core.errors import ConnectionRefusedByPeerError, DatasetError, UsageError
 from physx_core.net.values import decode, encode
 from physx_core.pipelines.storage import LARGEST_PARAMETERS, PARAMETERS
@@ -18,6 +17,8 @@ from physx_core.typing import Batch, Sample
 
 Predict: TypeAlias = Callable[[Batch], Batch]
 """The network's prediction for a batch, both in physical units."""
+Show: TypeAlias = Callable[[int, int, list[Event]], None]
+"""Receives an instance, its step, and what it draws then."""
 
 
 class RunServices:
@@ -26,7 +27,7 @@ class RunServices:
     def __init__(
         self,
         dataset_dir: Path,
-        observer: Observer,
+        show: Show,
         predict: Predict | None,
         source_dir: Path | None = None,
     ) -> None:
@@ -34,13 +35,13 @@ class RunServices:
 
         Args:
             dataset_dir: Folder for the instances' parameters.
-            observer: Receives drawing events.
+            show: Receives drawing events.
             predict: The network's prediction; None: the pipeline has no network.
             source_dir: Folder of a dataset that is only read, to look for parameters that are not
                 in `dataset_dir`.
         """
         self._dir, self._source_dir = dataset_dir, source_dir
-        self._observer = observer
+        self._show = show
         self._predict = predict
 
     def predict(self, fields: Sample) -> Sample:
@@ -76,7 +77,7 @@ class RunServices:
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:
         """Pass drawing events to the observers."""
-        self._observer.events(instance_id, step, events)
+        self._show(instance_id, step, events)
 
 
 def _read_parameters(path: Path) -> dict[str, Any]:

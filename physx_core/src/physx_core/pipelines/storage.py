@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from physx_core import files
-from physx_core.config import WRONG, DatasetConfig, EnvironmentConfig, to_plain
+from physx_core.config import SETS, WRONG, DatasetConfig, EnvironmentConfig, to_plain
 from physx_core.dataset import Dataset
 from physx_core.dataset.store.locks import LOCK
 from physx_core.dataset.store.manifest_file import FILE
@@ -26,8 +26,11 @@ from physx_core.sources.source import Source
 
 PARAMETERS = "parameters_{}.bin"
 """Name of the file beside a dataset that contains an instance's saved parameters."""
+_FORMER = ".former"
 LARGEST_PARAMETERS = 2**32
 """Bytes of such a file."""
+GENERATION = "generation"
+"""Entry of a dataset's info that describes the last training whose environments generated rows."""
 
 
 def open_own(session: Session, config: DatasetConfig) -> Dataset:
@@ -143,23 +146,16 @@ def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) 
 
 
 def reject_environments(environment: EnvironmentConfig) -> None:
-    """Reject environments in a training of several processes."""
-    replays = environment.load_samples
-    if environment.always_produce or (replays and not environment.only_first_epoch):
-        advice = (
-            "take part in every epoch. Leave out always_produce and only_first_epoch=False, or "
-            "train in one process."
-        )
-    else:
-        what = "send the stored samples through them" if replays else "generate the samples"
-        advice = (
-            f"take part in the first epoch. First {what} in one process, with epoch_nb=1; then "
-            "continue in several with resume=True (physx train --resume)."
-        )
-    raise ConfigError(
-        "Several processes train on stored samples only, each on its share, but environments "
-        f"would {advice}"
+    """Reject environments that replay samples in a training of several processes."""
+    if not environment.load_samples:
+        return
+    advice = (
+        "First send the stored samples through them in one process, with epoch_nb=1; then continue "
+        "in several with resume=True (physx train --resume)."
     )
+    if not environment.only_first_epoch:
+        advice = "Leave out only_first_epoch=False, or train in one process."
+    raise ConfigError(f"Environments cannot replay samples for several processes. {advice}")
 
 
 def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
@@ -182,11 +178,33 @@ def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
         )
     dataset.merge(config.existing_dir)
     with Dataset.open(config.existing_dir) as existing:
-        dataset.update_info(**existing.info, copied_from=str(existing.directory))
+        info = {**existing.info, GENERATION: None, "copied_from": str(existing.directory)}
+        dataset.update_info(**info)
         for path in existing.directory.glob(PARAMETERS.format("*")):
             with files.storing(f"{path}, copied into the session,"):
                 content = files.read_content(path, LARGEST_PARAMETERS)
                 files.replace(dataset.directory / path.name, content)
+
+
+def keep_parameters(directory: Path) -> None:
+    """Copy the instances' parameters in a dataset's folder, as a training begins."""
+    with files.storing(f"{directory}"):
+        for path in directory.glob(PARAMETERS.format("*") + _FORMER):
+            files.remove(path)
+        for path in directory.glob(PARAMETERS.format("*")):
+            content = files.read_content(path, LARGEST_PARAMETERS)
+            files.replace(path.with_name(path.name + _FORMER), content)
+
+
+def restore_parameters(directory: Path) -> None:
+    """Have the instances' parameters be those of when `keep_parameters` copied them."""
+    with files.storing(f"{directory}"):
+        for path in directory.glob(PARAMETERS.format("*")):
+            former = path.with_name(path.name + _FORMER)
+            if former.exists():
+                files.replace(path, files.read_content(former, LARGEST_PARAMETERS))
+            else:
+                files.remove(path)
 
 
 def is_copy(directory: Path) -> bool:
@@ -197,29 +215,66 @@ def is_copy(directory: Path) -> bool:
 
 
 @contextlib.contextmanager
-def record_rejected(source: Source, dataset: Dataset | None) -> Iterator[None]:
-    """Store the samples that `check_sample` rejects during the body, in the mode "wrong".
+def record_rejected(
+    source: Source, dataset: Dataset | None, earlier: Mapping[int, int] | None = None
+) -> Iterator[None]:
+    """Store what a source makes beside the rows of a batch.
 
-    They are stored after the body's batch, also if too many of them end the run. If the batch
-    fails for another reason, they are not stored either.
+    These are the samples that `check_sample` rejects during the body, in the mode "wrong", and the
+    sets of parameters that begin in its batch, in the mode "parameters". They are stored after the
+    body's batch, the sets before its rows if the body calls `store_sets`. The rejected samples are
+    stored also if too many of them end the run, and sets with which a simulation failed also if
+    that ends it. If the batch fails for another reason, they are not stored either.
 
     Args:
         source: Generates the batch.
         dataset: Stores the samples; None: they are discarded.
+        earlier: Instance to the step of its last row before the batch, if a run was killed before
+            it stored what was rejected until then: that is stored first. None: nothing is left.
     """
     try:
         yield
-    except WrongSamplesError:
-        _store_rejected(source, dataset)
+    except PhysxError as error:
+        if isinstance(error, WrongSamplesError):
+            _store_rejected(source, dataset, earlier)
+        source.sets.note_failed()
+        with contextlib.suppress(PhysxError):  # the run's own error matters more
+            store_sets(source, dataset)
         raise
-    _store_rejected(source, dataset)
+    _store_rejected(source, dataset, earlier)
+    store_sets(source, dataset)
 
 
-def _store_rejected(source: Source, dataset: Dataset | None) -> None:
+def _store_rejected(
+    source: Source, dataset: Dataset | None, earlier: Mapping[int, int] | None
+) -> None:
     rows = source.pop_rejected()
-    if rows and dataset is not None:
-        dataset.define_fields(WRONG, source.fields)
-        dataset.append(WRONG, rows, checked=True)
+    if not rows or dataset is None:
+        return
+    dataset.define_fields(WRONG, source.fields)
+    last = [(earlier or {}).get(number, -1) for number in rows["env_id"].tolist()]
+    is_left = rows["step"] < last
+    for chosen in (is_left, ~is_left):
+        if chosen.any():
+            part = {name: values[chosen] for name, values in rows.items()}
+            dataset.append(WRONG, part, checked=True)
+
+
+def store_sets(source: Source, dataset: Dataset | None) -> None:
+    """Store the sets of parameters that begin in a source's last batch.
+
+    Before its rows, so that rows have their parameters even if the process is killed.
+    """
+    sets, failed = source.sets.pop()
+    if dataset is None or not (sets or failed):
+        return
+    dataset.define_fields(SETS, source.sets.fields)
+    if sets:
+        dataset.append(SETS, sets)
+    if failed:
+        first = dataset.num_samples(SETS) - source.sets.count
+        index = [first + place for place in failed]
+        dataset.update(SETS, index, {"failed": [True] * len(index)})
 
 
 def describe_environment(config: EnvironmentConfig, seed: int) -> dict[str, Any]:
@@ -233,6 +288,7 @@ def describe_environment(config: EnvironmentConfig, seed: int) -> dict[str, Any]
         "env_kwargs": plain["env_kwargs"],
         "num_clients": config.num_clients,
         "simulations_per_step": config.simulations_per_step,
+        **{name: plain[name] for name in ("sampler", "sampler_kwargs") if plain.get(name)},
         "seed": seed,
         "versions": installed_versions(),
     }

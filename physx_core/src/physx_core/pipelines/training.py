@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import shlex
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 from physx_core import checkpoint
 from physx_core.checkpoint import Progress
+from physx_core.components.buffer import Buffer
 from physx_core.components.group import Group
 from physx_core.components.network import Network
 from physx_core.config import (
@@ -24,20 +27,30 @@ from physx_core.config import (
     to_plain,
 )
 from physx_core.dataset import Dataset
-from physx_core.errors import DivergedError
+from physx_core.errors import CheckpointError, ConfigError, DivergedError
 from physx_core.observers import statistics_observers
 from physx_core.pipelines.interrupt import Interrupt, Terminated, deferred_interrupt
+from physx_core.pipelines.learning.blocks import Block
+from physx_core.pipelines.learning.components import create
+from physx_core.pipelines.learning.drawn_rows import DrawnRows
+from physx_core.pipelines.learning.feeder import Feeder
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.resuming import (
+    Generation,
     can_resume,
-    read_last_checkpoint,
+    find_start,
     without_copied_dataset,
 )
 from physx_core.pipelines.learning.training_data import TrainingData
 from physx_core.pipelines.learning.training_record import BestEpoch, TrainingRecord
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
-from physx_core.pipelines.run_description import describe_samples, describe_training
+from physx_core.pipelines.run_description import (
+    describe_failed_sets,
+    describe_samples,
+    describe_training,
+)
 from physx_core.pipelines.storage import (
+    GENERATION,
     check_sources,
     copy_existing,
     describe_environment,
@@ -49,6 +62,8 @@ from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
+from physx_core.workers.instance import NOTHING, Skip
+from physx_core.workers.parameter_sets import ParameterSets
 
 _ADVICE = (
     "Lower the learning rate, normalize the data (DatasetConfig.normalize) or limit the gradients; "
@@ -68,22 +83,24 @@ class Training(NewSessionPipeline):
     - an existing dataset (``dataset_config.existing_dir``), which is only read, or the session's
       own one;
     - environments, which generate samples in the first epoch, stored and reused in later ones, or
-      in every epoch with ``always_produce``;
+      in every epoch with ``always_produce``; ``online`` says how they make up batches meanwhile;
     - an existing dataset by way of environments, with ``load_samples``: the session gets its own
       copy of the dataset; in the first epoch, or in every one with ``only_first_epoch=False``, each
       stored sample goes through an environment, whose result is trained on and replaces the sample
       in the copy: see `TrainingData`. Without ``existing_dir`` the session's own samples are used.
 
-    Several processes started by ``torchrun`` train one network together on stored samples: each
-    takes its share of every batch, which is ``batch_size`` times the number of processes, and the
-    first one writes the session. If environments generate or replay the samples of the first epoch,
-    train that epoch in one process, then continue in several with ``resume``.
+    Several processes started by ``torchrun`` train one network together: each takes its share of
+    every batch, which is ``batch_size`` times the number of processes. The first one writes the
+    session; it has the environments, and passes on each one's share of what they generate. If they
+    replay the samples of the first epoch, train that epoch in one process, then continue in several
+    with ``resume``.
 
     Attributes:
         group: The processes that train together.
         learner: The network, its transformation and its optimization.
         data: Source of the batches.
-        batch: The current batch, in physical units.
+        batch: The current batch, in physical units; in one of several processes only its share
+            while environments generate.
         epoch_id: Number of finished epochs.
         batch_id: Number of finished batches of the current epoch.
         losses: The result of `Optimization.transform_loss` for the current batch, as numbers.
@@ -105,6 +122,14 @@ class Training(NewSessionPipeline):
     """Batches in an epoch; None: as many as needed to use each stored sample once."""
     seed: int | None = at_least(0, None)
     """Seed of the network's initial parameters and of the order of samples; None: a random one."""
+    online: str | type[Any] = "physx/stream"
+    """Buffer that decides which rows a batch holds while environments generate them:
+    "physx/stream", each row once, in order; "physx/reservoir", "physx/window" or "physx/fifo",
+    batches drawn at random from the rows kept in memory; or that of a plugin."""
+    online_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the buffer: ``capacity``, number of rows kept in memory;
+    ``watermark``, number of rows before the first batch; ``views``, how many times a row is used on
+    average. All rows are stored, whatever is kept in memory."""
     validation_every: int = at_least(0, 1)
     """Number of epochs between validations, if the dataset has a validation mode or
     `validation_split` holds samples back; 0: never."""
@@ -122,8 +147,12 @@ class Training(NewSessionPipeline):
     """Keyword arguments of each observer, by its name; in a command ``rerun={mode="save"}``."""
     histograms_every: int = at_least(0, 0)
     """Number of epochs between histograms of weights and gradients; 0: none."""
+    checkpoint_every: int = at_least(0, 0)
+    """Number of batches between checkpoints within epochs, counted over all epochs; 0: none."""
     resume: bool = field(default=False, metadata={"recorded": False})
-    """Resume from the session's last checkpoint, up to `epoch_nb` epochs in total."""
+    """Resume from the session's last checkpoint, up to `epoch_nb` epochs in total. While
+    environments generate the samples, they generate those that are stored again, unless they depend
+    on predictions; without a checkpoint the training begins again with the stored samples."""
 
     kind: ClassVar[str] = "training"
     group: Group = field(init=False, repr=False, default_factory=Group)
@@ -141,6 +170,8 @@ class Training(NewSessionPipeline):
     _epoch_batches: int | None = field(init=False, repr=False, default=None)
     _is_savable: bool = field(init=False, repr=False, default=False)
     _met_nan: bool = field(init=False, repr=False, default=False)
+    _blocks: int = field(init=False, repr=False, default=0)
+    _generation: Generation | None = field(init=False, repr=False, default=None)
 
     def execute(self) -> None:
         """Train. However the training ends, the network trained so far is a checkpoint to resume.
@@ -171,8 +202,7 @@ class Training(NewSessionPipeline):
                             raise self._lacks_super("optimize")
                         self._count("batch_id", "batch_count")
                         self.batch_end()
-                        if self.group.any(bool(interrupt)) and self.batch_condition():
-                            self._end_early(interrupt)
+                        self._leave_batch(interrupt)
                     self._count("epoch_id", "epoch_count")
                     self.epoch_end()
                     if self.group.any(bool(interrupt)):
@@ -195,7 +225,8 @@ class Training(NewSessionPipeline):
         """Called before each epoch; decides how many batches it has."""
         begins = self.epoch_id == self._resumed.epoch
         self.batch_id = self._resumed.batch if begins else 0
-        self._epoch_batches = self.data.begin_epoch(self.epoch_id, self.learner.batch_fields)
+        names = self.learner.batch_fields
+        self._epoch_batches = self.data.begin_epoch(self.epoch_id, names, self.batch_id)
         if self.data.has_changed:
             self.learner.normalize(self.data.normalization())
         if begins:
@@ -224,9 +255,12 @@ class Training(NewSessionPipeline):
             DivergedError: If the loss or a gradient is not finite, with ``on_nan="stop"``.
         """
         try:
-            self.losses = self.learner.optimize(self.batch)
+            by_row = self.data.wants_row_losses
+            self.losses = self.learner.optimize(self.batch, self.data.weight, by_row=by_row)
         except DivergedError as error:
             raise self._diverged(f"{error}", self.batch_id + 1) from None
+        if by_row:
+            self.data.tell(self.batch, self.learner.row_losses)
         if self.on_nan == "continue" and not math.isfinite(self.losses["loss"]):
             self._continue_after_nan()
         if self._leads and not self._is_savable:
@@ -237,12 +271,19 @@ class Training(NewSessionPipeline):
         """Count the batch and record its losses."""
         self.batch_id += 1
         values = self._record.add(self.losses)
-        number = self.epoch_id * (self._epoch_batches or 0) + self.batch_id
-        self.observers.scalars(values, number, "batch")
+        if self.data.produces and self.data.online is not None:
+            self._blocks = self.data.online.number
+            values |= self.data.online.recent_statistics()
+        self.observers.scalars(values, self._number, "batch")
         self.observers.advance(1)
         if self._leads and time.monotonic() > self._checked + _SESSION_INTERVAL:
             checkpoint.check_session(self.session.network_dir)
             self._checked = time.monotonic()
+
+    @property
+    def _number(self) -> int:
+        """Number of finished batches of all epochs."""
+        return self.epoch_id * (self._epoch_batches or 0) + self.batch_id
 
     def batch_end(self) -> None:
         """Called after each batch."""
@@ -331,10 +372,22 @@ class Training(NewSessionPipeline):
             self.batch_id,
             self.data.batches_read,
             self._resumed.seed,
+            self._blocks,
             self.best.state,
             self._record.state,
         )
-        return self.learner.save(self.session.network_dir, progress, best=best)
+        online, source = self.data.online, self.data.source
+        states: list[Any] = []
+        if online is not None and source is not None and self.data.produces:
+            states = [online.state(self._blocks), source.sets.state(self._blocks)]
+        return self.learner.save(self.session.network_dir, progress, *states, best=best)
+
+    def _leave_batch(self, interrupt: Interrupt) -> None:
+        """Write a checkpoint if one is due, and end within an epoch after a signal."""
+        if self.checkpoint_every and self._number % self.checkpoint_every == 0:
+            self.save_checkpoint()
+        if self.group.any(bool(interrupt)) and self.batch_condition():
+            self._end_early(interrupt)
 
     def _end_early(self, interrupt: Interrupt) -> None:
         self.save_checkpoint()
@@ -357,9 +410,15 @@ class Training(NewSessionPipeline):
             error.add_note(f"The network could not be saved: {failure} Last checkpoint: {last}.")
         else:
             how = "from which resume=True (physx train --resume) continues"
-            if not can_resume(self.environment_config, self.epoch_id):
+            if not self._is_resumable:
                 how = "with which another training starts: NetworkConfig.network_dir"
             error.add_note(f"The network trained so far is {self.checkpoint_path}, {how}.")
+
+    @property
+    def _is_resumable(self) -> bool:
+        """Whether the training can be resumed from the last checkpoint."""
+        repeats = self._generation is not None and not self._generation.depends
+        return repeats or can_resume(self.environment_config, self.epoch_id)
 
     def _check_parameters(self) -> None:
         name = self.learner.network.find_not_finite() if self.on_nan == "stop" else ""
@@ -389,28 +448,29 @@ class Training(NewSessionPipeline):
         check_sources(config, environment)
         self._network_class: Any = Network
         self._prepare_network_class()
-        last = session = None
+        last = session = generation = None
         if self.resume:
             session = Session.existing(self.session_dir, self.session_name)
             name = self.network_config.network_name or checkpoint.NAME
-            last = read_last_checkpoint(session, name, environment)
-            config, environment = without_copied_dataset(session, config), None
-        self._start_from(last)
+            last, environment, generation = find_start(session, name, environment)
+            config = without_copied_dataset(session, config)
+        self._start_from(last, generation)
+        buffer = self._create_buffer()
         self._network_class.set_seed(self._resumed.seed)
         self.learner = Learner(self.network_config, trains=True, stops_at_nan=self.on_nan == "stop")
         if config.existing_dir is not None:  # a missing dataset leaves no session behind
             Dataset.open(config.existing_dir).close()
         self.session = session or self._open_session()
-        make = open_existing if environment is None else open_own
-        dataset = resources.enter_context(make(self.session, config))
-        if environment is not None:
-            copy_existing(dataset, config)
+        dataset = resources.enter_context(self._open_dataset(config, environment))
         self._record_config(self._resumed.seed)
         further = statistics_observers(self.statistics, self.statistics_kwargs, environment)
         self._observe(resources, environment, further if self._leads else ())
-        source = None
-        if environment is not None:
-            source = self._open_environments(resources, environment, dataset)
+        source = feeder = None
+        if environment is not None and self._leads:
+            if environment.as_tcp_ip_client and not environment.load_samples:
+                feeder = Feeder[Block]()
+            skip = self._begin_generation(dataset, config.mode, environment, generation)
+            source = self._open_environments(resources, environment, dataset, feeder, buffer, skip)
         self.data = TrainingData(
             dataset,
             source,
@@ -420,11 +480,27 @@ class Training(NewSessionPipeline):
             seed=self._resumed.seed,
             environment=environment,
             data_type=self.network_config.data_type,
+            buffer=buffer,
+            drawn=self._open_drawn_rows(resources, buffer) if source is not None else None,
+            group=self.group,
+            first=0 if self._generation is None else self._generation.first,
+            feeder=feeder,
+            ahead=type(self).batch_condition is Training.batch_condition
+            and type(self).batch_produce is Training.batch_produce,
         )
+        resources.callback(self.data.close)
+        if last is not None and self._resumed.blocks:
+            state = partial(checkpoint.read_buffer, last)
+            self.data.resume(self._resumed.blocks, state, self.learner.batch_fields)
+            if source is not None and source.sets.learns:
+                self._resume_sampler(source.sets, last)
         fields = self.data.fields
         shapes = [fields[name].shape for name in self.learner.batch_fields if name in fields]
         if not self.data.produces or None not in shapes:  # else bound with the first batch
-            self.learner.bind(fields, self.data.normalization())
+            known = self.data.normalization()
+            if last is not None and dataset.info.get(GENERATION) and config.existing_dir is None:
+                known = last.normalization  # to the last bit
+            self.learner.bind(fields, known)
         self._load_parameters(last)
         self.learner.join(self.group)
         self.learner.network.set_train()
@@ -442,14 +518,50 @@ class Training(NewSessionPipeline):
         if self.group.size > 1 and self.environment_config is not None and not self.resume:
             reject_environments(self.environment_config)
 
-    def _start_from(self, last: checkpoint.Checkpoint | None) -> None:
+    def _start_from(
+        self, last: checkpoint.Checkpoint | None, generation: Generation | None
+    ) -> None:
         """Start at the first epoch, or where a checkpoint was written."""
-        seed = self.group.tell(choose_seed(self.seed))
+        seed = self.group.tell(choose_seed(self.seed) if generation is None else generation.seed)
         self._resumed = last.progress if last else Progress(0, 0, 0, seed)
         self._saved = (self._resumed.epoch, self._resumed.batch)
+        self._blocks = self._resumed.blocks
         self.checkpoint_path = last.path if last else None
         self._record = TrainingRecord(self._resumed.record)
         self.best = BestEpoch(self._resumed.best, self.min_improvement)
+
+    def _open_dataset(
+        self, config: DatasetConfig, environment: EnvironmentConfig | None
+    ) -> Dataset:
+        """Open the dataset; only the leading process writes to the one that rows are added to."""
+        if environment is None:
+            return open_existing(self.session, config)
+        if self._leads:
+            dataset = open_own(self.session, config)
+            copy_existing(dataset, config)
+        self.group.tell(None)
+        return dataset if self._leads else open_existing(self.session, config)
+
+    def _create_buffer(self) -> Buffer:
+        environment = self.environment_config
+        buffer: Buffer = create("buffer", self.online, self.online_kwargs, Buffer)
+        produces = environment is not None and not environment.load_samples
+        if not produces and buffer.capacity and not self.resume:
+            raise ConfigError(
+                f"Training.online is {self.online!r}, which mixes rows while environments generate "
+                "them, but none do here: name an environment that does, or leave online out."
+            )
+        always = environment is not None and environment.always_produce
+        batch_nb = (self.batch_nb or 0) * (self.epoch_nb if always else 1)
+        buffer.begin(self.batch_size * self.group.size, batch_nb, self._resumed.seed)
+        return buffer
+
+    def _open_drawn_rows(self, resources: contextlib.ExitStack, buffer: Buffer) -> DrawnRows | None:
+        if not buffer.capacity:
+            return None
+        return resources.enter_context(
+            contextlib.closing(DrawnRows(self.session, buffer.batch_size, self._resumed.blocks))
+        )
 
     def _open_session(self) -> Session:
         made = None
@@ -461,6 +573,8 @@ class Training(NewSessionPipeline):
     def _plan(self) -> Iterable[str]:
         if self.data.dataset.modes:
             yield describe_samples(self.data.dataset.directory)
+        if self.data.online is not None:
+            yield from self.data.online.announce()
         if self.group.size > 1:
             total, each, count = self.batch_size * self.group.size, self.batch_size, self.group.size
             yield f"batches of {total} samples, {each} in each of {count} processes"
@@ -477,6 +591,9 @@ class Training(NewSessionPipeline):
             yield f"smallest loss {self.best.loss:.6g}, after epoch {self.best.epoch}"
         if self.environment_config is not None:
             yield describe_samples(self.data.dataset.directory)
+            yield from describe_failed_sets(self.data.source)
+        if self.data.online is not None:
+            yield from self.data.online.describe()
         if self.checkpoint_path is not None:
             yield f"checkpoint: {self.checkpoint_path}"
 
@@ -490,13 +607,22 @@ class Training(NewSessionPipeline):
             words = [f"--network.{k} {shlex.quote(v)}" for k, v in named.items() if ":" in v]
             yield " ".join(["physx predict", path, "ENVIRONMENT --step-nb N", *words])
             yield f"physx stats {path}"
-        elif can_resume(self.environment_config, self.epoch_id):
+        elif self._is_resumable:
             yield f"physx train {path} --resume"
         else:
             yield f"physx train --config {path} --network.network-dir {path}"
 
     def _components(self) -> Mapping[str, str]:
         return describe_training(self.learner, self.environment_config, self.data.dataset)
+
+    def _resume_sampler(self, sets: ParameterSets, last: checkpoint.Checkpoint) -> None:
+        try:
+            sets.restore(self._resumed.blocks, checkpoint.read_sampler(last))
+        except ValueError as error:
+            raise CheckpointError(
+                "The training cannot be resumed: the state of the sampler in its checkpoint does "
+                f"not fit, as {error}. Resume with the same sampler and sampler_kwargs."
+            ) from error
 
     def _load_parameters(self, last: checkpoint.Checkpoint | None) -> None:
         config = self.network_config
@@ -511,21 +637,57 @@ class Training(NewSessionPipeline):
             self.session.note(found.notice)
 
     def _open_environments(
-        self, resources: contextlib.ExitStack, config: EnvironmentConfig, dataset: Dataset
+        self,
+        resources: contextlib.ExitStack,
+        config: EnvironmentConfig,
+        dataset: Dataset,
+        feeder: Feeder[Block] | None,
+        buffer: Buffer,
+        skip: Skip,
     ) -> Source:
-        seed = self._resumed.seed if config.seed is None else config.seed
+        seed = self._seed_of(config)
         dataset.update_info(**describe_environment(config, seed))
         stored = dataset.num_samples("training") if "training" in dataset.modes else 0
+        if self._generation is not None:
+            stored = self._generation.offset
         return self._open_source(
             resources,
             config,
             derive_seed(seed, "training", stored),
-            predict=self._predict,
+            predict=self._predict if feeder is None else feeder.calling(self._predict),
+            show=None if feeder is None else feeder.telling(self.observers.events),
+            run_ahead=0 if config.load_samples else None,
+            total=None if config.load_samples or not self.batch_nb else buffer.total,
+            skip=skip,
         )
+
+    def _begin_generation(
+        self, dataset: Dataset, mode: str, config: EnvironmentConfig, former: Generation | None
+    ) -> Skip:
+        """Keep what the environments' rows depend on; return those that an earlier run has had."""
+        if config.load_samples:
+            return NOTHING
+        seed, size = self._resumed.seed, self.batch_size * self.group.size
+        now = Generation.begin(dataset, mode, seed, size, self.batch_nb)
+        self._generation, self._dataset = former or now, dataset
+        if former is not None:
+            return former.resume(dataset, config, now)
+        now.start(dataset, **describe_environment(config, self._seed_of(config)))
+        return NOTHING
+
+    def _seed_of(self, config: EnvironmentConfig) -> int:
+        return self._resumed.seed if config.seed is None else config.seed
+
+    def _note_dependence(self) -> None:
+        """Keep in the dataset that the environments' rows depend on the network that learns."""
+        if self._generation is not None and not self._generation.depends:
+            self._generation = dataclasses.replace(self._generation, depends=True)
+            self._generation.store(self._dataset)
 
     def _predict(self, batch: Batch) -> Batch:
         """Answer `Environment.get_prediction`; before the first batch with the step's shapes."""
         learner, data = self.learner, getattr(self, "data", None)
+        self._note_dependence()
         if not learner.fields and data is not None:
             known = [name for name, field in data.fields.items() if field.shape is not None]
             if all(name in known for name in learner.batch_fields):

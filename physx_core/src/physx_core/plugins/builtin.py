@@ -15,6 +15,31 @@ def physx_launchers() -> Components:
 
 
 @hookimpl
+def physx_buffers() -> Components:
+    """Return the buffers of trainings while environments generate."""
+    return {
+        "stream": "physx_core.buffers.stream:Stream",
+        "reservoir": "physx_core.buffers.reservoir:Reservoir",
+        "window": "physx_core.buffers.window:Window",
+        "fifo": "physx_core.buffers.fifo:Fifo",
+    }
+
+
+@hookimpl
 def physx_transformations() -> Components:
     """Return the transformation of networks that name none."""
     return {"identity": "physx_core.components.transformation:Transformation"}
+
+
+@hookimpl
+def physx_samplers() -> Components:
+    """Return the samplers, which are imported when a run uses them."""
+    return {
+        "uniform": "physx_core.samplers.uniform:Uniform",
+        "sobol": "physx_core.samplers.sequences:Sobol",
+        "latin_hypercube": "physx_core.samplers.sequences:LatinHypercube",
+        "grid": "physx_core.samplers.grid:Grid",
+        "active": "physx_core.samplers.active:Active",
+        "generator": "physx_core.samplers.generator:Generator",
+        "table": "physx_core.samplers.table:Table",
+    }

@@ -1,4 +1,4 @@
-"""The seven hooks that a plugin may implement.
+"""The nine hooks that a plugin may implement.
 
 Each returns a dictionary from a component's name to the component: a class, a function that takes
 the component's keyword arguments and returns it, or a reference ``"package.module:Name"`` that is
@@ -34,6 +34,8 @@ KINDS = {
     "visualizer": "physx_visualizers",
     "backend": "physx_backends",
     "launcher": "physx_launchers",
+    "buffer": "physx_buffers",
+    "sampler": "physx_samplers",
 }
 """Kind of component to the hook that returns it."""
 
@@ -81,3 +83,13 @@ def physx_backends() -> Components:  # type: ignore[empty-body]
 @hookspec
 def physx_launchers() -> Components:  # type: ignore[empty-body]
     """Return subclasses of `physx_core.Launcher` by name."""
+
+
+@hookspec
+def physx_buffers() -> Components:  # type: ignore[empty-body]
+    """Return subclasses of `physx_core.Buffer` by name."""
+
+
+@hookspec
+def physx_samplers() -> Components:  # type: ignore[empty-body]
+    """Return subclasses of `physx_core.Sampler` by name."""

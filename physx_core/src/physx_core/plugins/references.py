@@ -30,10 +30,12 @@ from physx_core.plugins.registry import available, load
 
 if TYPE_CHECKING:
     from physx_core.components import (
+        Buffer,
         Environment,
         Launcher,
         Network,
         Optimization,
+        Sampler,
         Transformation,
         Visualizer,
     )
@@ -56,6 +58,10 @@ def resolve(kind: Literal["visualizer"], reference: Any) -> Callable[..., Visual
 @overload
 def resolve(kind: Literal["launcher"], reference: Any) -> Callable[..., Launcher]: ...
 @overload
+def resolve(kind: Literal["buffer"], reference: Any) -> Callable[..., Buffer]: ...
+@overload
+def resolve(kind: Literal["sampler"], reference: Any) -> Callable[..., Sampler]: ...
+@overload
 def resolve(kind: Literal["backend"], reference: Any) -> Backend: ...
 @overload
 def resolve(kind: str, reference: Any) -> Any: ...
@@ -66,7 +72,7 @@ def resolve(kind: str, reference: Any) -> Any:
 
     Args:
         kind: ``environment``, ``network``, ``optimization``, ``transformation``, ``visualizer``,
-            ``backend`` or ``launcher``.
+            ``backend``, ``launcher``, ``buffer`` or ``sampler``.
         reference: ``"plugin/name"``; ``"plugin"`` where it has just one of the kind;
             ``"package.module:Class"``; ``"script.py:Class"``; or the class itself.
 

@@ -19,8 +19,10 @@ from physx_core.fields import Field
 from physx_core.net.frames import Kind, pack
 from physx_core.net.values import encode
 from physx_core.rows import ROW_FIELDS, concatenate
-from physx_core.sources.source import Source, check_stored
+from physx_core.sources.source import Canceled, Source, check_stored
 from physx_core.typing import Batch
+from physx_core.workers.instance import NOTHING, Skip
+from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.row_codec import row_bytes
 from physx_core.workers.server.client_group import ClientGroup
 
@@ -32,10 +34,12 @@ class ClientSource(Source):
     """Collects rows from clients, and places each by its instance and step.
 
     Rows are the same as those of `LocalSource`, bit for bit. Requests of the environments are
-    served while waiting for a batch. If the services have a method
-    ``predict_batch(batch) -> batch``, predictions wait until every working instance has requested
-    one, and are computed as one batch in the order of the instances: with ``run_ahead=0`` the same
-    batches in every run. A network may round these differently from single samples.
+    served while waiting for a batch; one for a prediction is held until the batch is requested to
+    which the row belongs that its environment is making. If the services have a method
+    ``predict_batch(batch) -> batch``, predictions wait until every instance that owes a row of the
+    batch has requested one, and are computed together in the order of the instances: the same
+    groups in every run, however far the clients run ahead. A network may round these differently
+    from single samples.
     """
 
     def __init__(
@@ -47,6 +51,7 @@ class ClientSource(Source):
         run_ahead: int | None = None,
         total: int | None = None,
         accept_all: bool = False,
+        skip: Skip = NOTHING,
     ) -> None:
         """Prepare the clients.
 
@@ -55,22 +60,26 @@ class ClientSource(Source):
             services: Serves the environments' requests.
             seed: Seed of all instances.
             run_ahead: Number of rows that each client may generate before they are requested;
-                None: as many as fit in 4 MB. It must be 0 if rows depend on a network that is
-                trained, or on predictions that are applied.
-            total: Number of rows that will be requested in all, beyond which no client generates
-                any; None: unknown.
+                None: as many as fit in 4 MB. It must be 0 if predictions are applied, or stored
+                rows are replayed.
+            total: Number of rows that will be requested in all, with those to skip, beyond which
+                no client generates any; None: unknown.
             accept_all: Whether samples that `check_sample` rejects count like the others.
+            skip: The rows that an earlier run has had: they are generated again, but not returned.
         """
         self.instance_nb = config.num_clients
-        self._group = ClientGroup(config, services, seed, accept_all=accept_all)
+        self.sets = ParameterSets(config, seed, skip)
+        self._group = ClientGroup(
+            config, services, seed, self.sets, accept_all=accept_all, skip=skip
+        )
         self._rejections = 0
         if config.record_wrong_samples:
             self._rejections = config.max_wrong_samples_per_step + 1
         self._failed_row: int | None = None
         self._run_ahead, self._total = run_ahead, total
-        self._asked = 0
-        self._taken = [0] * self.instance_nb
-        self._first = 0
+        self._asked = self._first = skip.rows
+        self._taken = [skip.rows_of(n + 1, self.instance_nb) for n in range(self.instance_nb)]
+        self._agreeing = {1}
         self._opened: list[Field] = []
         self._table: list[Field] = []
         self._out: Batch = {}
@@ -92,6 +101,8 @@ class ClientSource(Source):
             first = self._group.peer(1).fields
             for number in range(2, self.instance_nb + 1):
                 self._agree(number, first, self._group.peer(number).fields)
+            peers = map(self._group.peer, range(1, self.instance_nb + 1))
+            self.sets.begin([peer.parameters for peer in peers])
         except BaseException:
             self._failed = True
             raise
@@ -130,7 +141,9 @@ class ClientSource(Source):
         except BaseException:
             self._failed = True
             raise
-        return {name: array[:size] for name, array in self._out.items()}
+        rows = {name: array[:size] for name, array in self._out.items()}
+        self.sets.note(rows)
+        return rows
 
     def apply(self, prediction: Batch, *, at_once: bool = True) -> None:
         """Pass predictions to the instances: see `Source.apply`.
@@ -222,7 +235,7 @@ class ClientSource(Source):
             ahead = min(max(1, _AHEAD_BYTES // size), _AHEAD_ROWS) if self._table else 0
         for number in range(1, self.instance_nb + 1):
             peer = self._group.peer(number)
-            needed = self._wanted(number, self._asked)
+            needed = peer.wanted = self._wanted(number, self._asked)
             allowed = needed + ahead
             if self._total is not None:
                 allowed = max(needed, min(allowed, self._wanted(number, self._total)))
@@ -233,6 +246,7 @@ class ClientSource(Source):
 
     def _without_table(self) -> list[int]:
         """Return the first instance until its fields are known; it generates the first row."""
+        self._check_canceled()
         peer = self._group.peer(1)
         if peer.row_fields:
             self._table = peer.row_fields
@@ -243,6 +257,7 @@ class ClientSource(Source):
 
     def _without_rows(self) -> list[int]:
         """Move received rows into the batch; return the instances whose rows are missing."""
+        self._check_canceled()
         owing, failed = [], {}
         for number in range(1, self.instance_nb + 1):
             peer, taken = self._group.peer(number), self._taken[number - 1]
@@ -250,8 +265,9 @@ class ClientSource(Source):
             if not missing:
                 continue
             if peer.rows.count:
-                if not taken:
+                if number not in self._agreeing:
                     self._agree(number, self._table, peer.row_fields)
+                    self._agreeing.add(number)
                 start = taken * self.instance_nb + number - 1 - self._first
                 moved = peer.rows.take(missing, self._out, start, self.instance_nb)
                 self._taken[number - 1] += moved
@@ -265,9 +281,15 @@ class ClientSource(Source):
             earlier = [number for number in owing if self._next_row(number) < row]
             if not (earlier and self._rejections and isinstance(failed[row], WrongSamplesError)):
                 self._failed_row = row
+                number = row % self.instance_nb + 1
+                self.sets.fail(number, self._group.peer(number).episode, failed[row])
                 raise failed[row]
             return earlier  # rows rejected before it are needed too
         return owing
+
+    def _check_canceled(self) -> None:
+        if self._is_canceled:
+            raise Canceled
 
     def _next_row(self, number: int) -> int:
         """Return the index among all rows of the next one that an instance generates."""

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 from physx_core.components.environment import Services
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import UsageError
+from physx_core.errors import PhysxError, UsageError
 from physx_core.fields import Field
 from physx_core.rows import ROW_FIELDS, RowBuffer, concatenate, copy_row, infer_shapes
 from physx_core.sources.source import Source, check_stored
-from physx_core.typing import Batch
-from physx_core.workers.instance import Instance, instance_arguments
+from physx_core.typing import Batch, Sample
+from physx_core.workers.instance import NOTHING, Instance, Skip, instance_arguments
+from physx_core.workers.parameter_sets import ParameterSets, next_step
+
+_LOG = logging.getLogger("physx")
 
 
 class LocalSource(Source):
@@ -25,6 +31,7 @@ class LocalSource(Source):
         seed: Sequence[int],
         *,
         accept_all: bool = False,
+        skip: Skip = NOTHING,
     ) -> None:
         """Prepare the instances.
 
@@ -33,17 +40,22 @@ class LocalSource(Source):
             services: Serves the environments' requests.
             seed: Seed of all instances.
             accept_all: Whether samples that `check_sample` rejects count like the others.
+            skip: The rows that an earlier run has had: they are generated again, but not returned.
         """
         self.instance_nb = config.num_clients
         self._services = services
         self._config = config
-        self._instances = [
-            Instance(**instance_arguments(config, number, seed, accept_all))
+        self._arguments = [
+            instance_arguments(config, number, seed, accept_all)
             for number in range(1, self.instance_nb + 1)
         ]
+        self.sets = ParameterSets(config, seed, skip)
+        self._instances = [Instance(**arguments) for arguments in self._arguments]
         self._buffer: RowBuffer | None = None
         self._next = 0
+        self._skip = skip
         self._last = range(0)
+        self._last_steps = [-1] * self.instance_nb
 
     @property
     def fields(self) -> list[Field]:
@@ -56,7 +68,8 @@ class LocalSource(Source):
     def open(self) -> None:
         """Create the instances' environments: see `Source.open`."""
         for instance in self._instances:
-            instance.open(self._services, draw=self._config.visualizer is not None)
+            self._open(instance)
+        self.sets.begin([instance.parameters for instance in self._instances])
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:
         """Return the next rows: see `Source.batch`."""
@@ -64,23 +77,87 @@ class LocalSource(Source):
             check_stored(stored, size)
         if self._config.record_wrong_samples:
             self.pop_rejected()
+        self._generate_again(size)
         buffer = self._buffer
         if buffer is not None:
             buffer.clear()
             if buffer.capacity < size:
                 buffer = self._buffer = RowBuffer(buffer.fields[: -len(ROW_FIELDS)], size)
-        instances, count = self._instances, self.instance_nb
+        count = self.instance_nb
         self._last = range(self._next, self._next + size)
         for row in range(size):
-            instance = instances[self._next % count]
-            sample = instance.step(None if stored is None else copy_row(stored, row))
-            if buffer is None:
-                buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
-            buffer.put(sample, instance.instance_id, instance.last_episode, instance.last_step)
+            place = self._next % count
+            while True:
+                given = None if stored is None else copy_row(stored, row)
+                try:
+                    self._make_row(self._instances[place], given, size)
+                    break
+                except PhysxError as error:
+                    self._redraw(place, error)
             self._next += 1
+        buffer = self._buffer
         if buffer is None:
             raise UsageError(f"A batch must have at least one row, not {size}.")
-        return buffer.take()
+        rows = buffer.take()
+        self.sets.note(rows)
+        return rows
+
+    def _open(self, instance: Instance) -> None:
+        draw = self._config.visualizer is not None
+        instance.open(self._services, draw, partial(self._choose, instance.instance_id))
+
+    def _choose(self, instance_id: int, episode: int) -> dict[str, Any]:
+        return self.sets.choose(instance_id, episode, self._next)
+
+    def _make_row(self, instance: Instance, stored: Sample | None, size: int) -> None:
+        sample = instance.step(stored)
+        if self._buffer is None:
+            self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
+        self._buffer.put(
+            sample,
+            instance.instance_id,
+            instance.last_episode,
+            instance.last_step,
+            finite=self._config.redraw > 0,
+        )
+        self._last_steps[instance.instance_id - 1] = instance.last_step
+
+    def _redraw(self, place: int, error: PhysxError) -> None:
+        """Continue with an instance's next parameters, or raise the error of its simulation."""
+        former = self._instances[place]
+        episode = -1 if former.environment is None else former.environment.episode_index
+        if not self.sets.can_redraw(place + 1, error):
+            self.sets.fail(place + 1, episode, error)
+            raise error
+        text = str(error).partition("\n")[0].rstrip(".")
+        _LOG.warning("%s. %s", text, self.sets.redraw(place + 1, episode, error))
+        with contextlib.suppress(PhysxError):
+            former.close()
+        instance = self._instances[place] = Instance(
+            **self._arguments[place],
+            first_step=next_step(self._last_steps[place], error),
+            first_episode=episode + 1,
+        )
+        instance.rejected = former.rejected
+        self._open(instance)
+
+    def _generate_again(self, size: int) -> None:
+        """Make the rows that an earlier run has had, and forget them."""
+        while self._next < self._skip.rows:
+            place = self._next % self.instance_nb
+            try:
+                self._make_row(self._instances[place], None, size)
+            except PhysxError as error:
+                self._redraw(place, error)
+                continue
+            finally:
+                if self._buffer is not None:
+                    self._buffer.clear()
+            self._next += 1
+            if self._next == self._skip.rows:
+                for instance in self._instances:
+                    if instance.rejected is not None:
+                        instance.rejected.forget(self._skip.rejected_of(instance.instance_id))
 
     def pop_rejected(self) -> Batch:
         """Return the rejected samples: see `Source.pop_rejected`."""

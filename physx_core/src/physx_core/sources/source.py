@@ -10,6 +10,11 @@ from typing import Self
 from physx_core.errors import PhysxError, UsageError
 from physx_core.fields import Field
 from physx_core.typing import Batch
+from physx_core.workers.parameter_sets import ParameterSets
+
+
+class Canceled(BaseException):
+    """A call of `Source.batch` was canceled: the run is over, and nothing of it is kept."""
 
 
 class Source(ABC):
@@ -21,9 +26,13 @@ class Source(ABC):
 
     Attributes:
         instance_nb: Number of instances.
+        sets: The sets of parameters that the instances are given; those whose first rows are in the
+            last batch can be taken from it.
     """
 
     instance_nb: int
+    sets: ParameterSets
+    _is_canceled = False
 
     @property
     @abstractmethod
@@ -71,6 +80,14 @@ class Source(ABC):
     @abstractmethod
     def apply(self, prediction: Batch) -> None:
         """Pass row i of a prediction to the instance that generated row i of the last batch."""
+
+    def cancel(self) -> None:
+        """Have a call of `batch` in another thread end soon, with `Canceled`; `close` follows.
+
+        Environments in this process finish the call.
+        """
+        self._is_canceled = True
+        self.sets.cancel()
 
     @abstractmethod
     def close(self) -> None:

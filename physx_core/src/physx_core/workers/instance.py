@@ -7,15 +7,17 @@ import inspect
 import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from physx_core.components.environment import (
+    Choose,
     Environment,
     PredictedFields,
     Services,
     explain_missing_attribute,
     options_of,
 )
+from physx_core.components.parameter import Parameter
 from physx_core.components.scene import Factory
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
@@ -28,7 +30,37 @@ from physx_core.errors import (
 from physx_core.fields import Field
 from physx_core.plugins import resolve
 from physx_core.rows import RejectedSamples
-from physx_core.typing import Sample
+from physx_core.typing import Batch, Sample
+
+_STEPPING = ("reset_parameters", "step", "check_sample", "apply_prediction", "close")
+
+
+class Skip(NamedTuple):
+    """What an earlier run has had of the same instances, with the same seed.
+
+    Attributes:
+        rows: Number of rows of all instances together.
+        rejected: Number of rejected samples of each instance; empty: none.
+        sets: Record of the sets of parameters; empty: none.
+        begun: Fields ``env_id`` and ``episode`` of the rows; empty: not known.
+    """
+
+    rows: int = 0
+    rejected: tuple[int, ...] = ()
+    sets: Batch = {}  # noqa: RUF012 - never changed
+    begun: Batch = {}  # noqa: RUF012 - never changed
+
+    def rows_of(self, number: int, instance_nb: int) -> int:
+        """Return how many of the rows an instance generated, counted from 1."""
+        return (self.rows - number + instance_nb) // instance_nb
+
+    def rejected_of(self, number: int) -> int:
+        """Return how many samples of an instance were rejected."""
+        return self.rejected[number - 1] if self.rejected else 0
+
+
+NOTHING = Skip()
+"""What a new run has had."""
 
 
 def instance_arguments(
@@ -71,6 +103,8 @@ class Instance:
         max_wrong_samples: int = 10,
         record_wrong: bool = False,
         accept_all: bool = False,
+        first_step: int = 0,
+        first_episode: int | None = None,
     ) -> None:
         """Store the arguments of the environment.
 
@@ -84,6 +118,8 @@ class Instance:
             max_wrong_samples: How many consecutive samples `check_sample` may reject.
             record_wrong: Whether to keep the samples that it rejects in `rejected`.
             accept_all: Whether to ignore the verdict of `check_sample`, as in a replay.
+            first_step: Number of its first step; others were made before.
+            first_episode: Number of its first trajectory; None: the environment's own.
         """
         self.instance_id = instance_id
         self.environment: Environment | None = None
@@ -100,6 +136,7 @@ class Instance:
         self._sub_steps = simulations_per_step - 1
         self._max_wrong_samples = max_wrong_samples
         self._accepts_all = accept_all
+        self._first_step, self._first_episode = first_step, first_episode
         self._runner: Any = None
 
     @property
@@ -107,12 +144,20 @@ class Instance:
         """The environment's fields; shapes that it leaves open are None. Empty if it is closed."""
         return self.environment.fields if self.environment is not None else []
 
-    def open(self, services: Services, draw: bool) -> None:
+    @property
+    def parameters(self) -> list[Parameter]:
+        """The parameters that the environment defines. Empty if it is closed."""
+        environment = self.environment
+        return [] if environment is None else list(environment._defined_parameters)
+
+    def open(self, services: Services, draw: bool, choose: Choose | None = None) -> None:
         """Create the environment: `create`, `init`, `init_database`, `init_visualization`.
 
         Args:
             services: What the environment may request from the run.
             draw: Whether there is a visualizer.
+            choose: Chooses the parameters of an episode; None: they are drawn from their
+                distributions.
 
         Raises:
             EnvironmentFailedError: If the environment cannot be imported or a method of it raises.
@@ -120,7 +165,8 @@ class Instance:
             PhysxError: If the environment raises such an error; it is passed on.
         """
         environment = self.environment = self._create()
-        environment._services = services
+        environment._services, environment._choose_parameters = services, choose
+        environment.step_index = self._first_step
         _warn_of_misspelt_methods(type(environment))
         self._call("create", environment.create)
         self._call("init", environment.init)
@@ -170,6 +216,8 @@ class Instance:
         """
         environment = self._alive()
         environment.sample = stored
+        if not environment._has_begun_episodes:
+            self._call("reset_parameters", environment.begin_episodes, self._first_episode)
         wrong = 0
         while True:
             sample, accepted = self._simulate(environment)
@@ -258,7 +306,7 @@ class Instance:
     def _failure(self, method: str, error: Exception) -> Exception:
         """Return the error to raise: one of physx with a note of its place, else one around it."""
         step = self.environment.step_index if self.environment is not None else -1
-        if method not in ("step", "check_sample", "apply_prediction", "close"):
+        if method not in _STEPPING:
             step = -1
         if isinstance(error, PhysxError):
             if method != "import":
@@ -279,7 +327,8 @@ class Instance:
 def _warn_of_misspelt_methods(cls: type[Environment]) -> None:
     """Warn of methods that nobody calls, but whose names are nearly those of optional ones."""
     own = [name for name in dir(cls) if not name.startswith("_") and not hasattr(Environment, name)]
-    for method in ("init_visualization", "check_sample", "apply_prediction"):
+    optional = ("init_visualization", "check_sample", "apply_prediction", "reset_parameters")
+    for method in optional:
         if getattr(cls, method) is getattr(Environment, method):
             for name in difflib.get_close_matches(method, own, n=1, cutoff=0.85):
                 warnings.warn(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -42,6 +43,20 @@ def _clear_gradients(optimizer: torch.optim.Optimizer) -> None:
     for group in optimizer.param_groups:
         for parameter in group["params"]:
             parameter.grad = None
+
+
+def _without_reduction(loss: Loss) -> Loss | None:
+    """Return a loss that gives each element's own; None if that is not known of it."""
+    if not isinstance(loss, torch.nn.Module) or getattr(loss, "reduction", "") != "mean":
+        return None
+    if (
+        type(loss).__module__ != "torch.nn.modules.loss"
+        or getattr(loss, "weight", None) is not None
+    ):
+        return None
+    single: Any = copy.copy(loss)
+    single.reduction = "none"
+    return single
 
 
 class TorchOptimization(Optimization):
@@ -228,6 +243,29 @@ class TorchOptimization(Optimization):
                 raise FieldsMismatchError("Prediction and target differ", {pred_name: text})
             losses.append(self.loss(pred, target))
         return losses[0] if len(losses) == 1 else torch.stack(losses).mean()
+
+    @torch.no_grad()
+    def compute_row_losses(
+        self, prediction: Tensors, targets: Tensors, data: Tensors
+    ) -> torch.Tensor:
+        """Return the loss of each row.
+
+        Losses of PyTorch with a ``reduction`` are computed for all rows at once, others row by row.
+        """
+        if self.loss is None or self._network is None:
+            raise UsageError("compute_row_losses() needs set_loss() and set_optimizer() before it.")
+        by_row = _without_reduction(self.loss)
+        if by_row is None or type(self).compute_loss is not TorchOptimization.compute_loss:
+            rows = range(len(next(iter(prediction.values()))))
+            parts = (
+                [{name: value[row : row + 1] for name, value in one.items()} for row in rows]
+                for one in (prediction, targets, data)
+            )
+            return torch.stack([self.compute_loss(*row) for row in zip(*parts, strict=True)])
+        names = zip(self._network.pred_fields, self._network.opt_fields, strict=True)
+        losses = [by_row(prediction[pred_name], targets[name]) for pred_name, name in names]
+        flat = [loss.reshape(len(loss), -1).mean(1) for loss in losses]
+        return torch.stack(flat).mean(0)
 
     def transform_loss(self, loss: torch.Tensor, data: Tensors) -> dict[str, Any]:
         """Return ``{"loss": <number>}``."""

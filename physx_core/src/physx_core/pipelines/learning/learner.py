@@ -33,7 +33,7 @@ from physx_core.plugins import import_component
 from physx_core.plugins.networks import resolve_network
 from physx_core.plugins.references import check_recorded, is_of_plugin, is_recorded_as
 from physx_core.statistics import Normalization
-from physx_core.typing import Array, Batch, Tensors
+from physx_core.typing import Array, Batch, Index, Tensors
 
 
 class _Step(NamedTuple):
@@ -42,6 +42,7 @@ class _Step(NamedTuple):
     data: Tensors
     prediction: Tensors
     loss: Any
+    compared: tuple[Tensors, Tensors]
 
 
 class Learner:
@@ -54,6 +55,8 @@ class Learner:
         optimization: Improves the network; None if nothing is trained.
         fields: The fields that the network was bound to, by name.
         group: The processes that train the network together.
+        row_losses: Loss of each row of the last batch, shape (rows,), if `optimize` was asked for
+            them.
     """
 
     def __init__(
@@ -91,6 +94,7 @@ class Learner:
         self.optimization: Optimization | None = None
         self.fields: dict[str, Field] = {}
         self.group = Group()
+        self.row_losses: Array = np.zeros(0)
         self._is_between_steps = False
         if trains:
             self.optimization = self._create_optimization(config)
@@ -150,17 +154,25 @@ class Learner:
         targets = {name: data[name] for name in network.opt_fields}
         predicted = network.predict(transformation.transform_before_prediction(inputs))
         prediction, targets = transformation.transform_before_loss(predicted, targets)
-        return _Step(data, predicted, optimization.compute_loss(prediction, targets, data))
+        loss = optimization.compute_loss(prediction, targets, data)
+        return _Step(data, predicted, loss, (prediction, targets))
 
     def _trainer(self) -> Optimization:
         if self.optimization is None:
             raise UsageError("This network was created for prediction and cannot be trained.")
         return self.optimization
 
-    def optimize(self, batch: Batch) -> dict[str, float]:
+    def optimize(
+        self, batch: Batch, weight: float | None = None, *, by_row: bool = False
+    ) -> dict[str, float]:
         """Train on a batch and return the statistics of the step, ``loss`` first.
 
         In a group of processes each trains on its share; the statistics are those of the batch.
+
+        Args:
+            batch: The batch, the same in all processes, or this process's share of it.
+            weight: Weight of that share in the mean over the whole batch; None: it is the batch.
+            by_row: Whether to compute `row_losses`, too.
 
         Raises:
             DivergedError: If the loss or a gradient is not finite, unless
@@ -171,11 +183,15 @@ class Learner:
             self._is_between_steps = False
             self.network.set_train()
         optimization, group = self._trainer(), self.group
-        share, weight = (batch, 1.0) if group.size == 1 else group.share_of(batch)
+        share = batch
+        if weight is None:
+            share, weight = (batch, 1.0) if group.size == 1 else group.share_of(batch)
         step = self._compute_loss(optimization, share)
         loss, stops = step.loss, optimization.stops_at_nan
         if stops and isinstance(loss, (float, np.floating)) and not math.isfinite(loss):
             raise DivergedError(self._explain(f"the loss is {loss}", step))
+        if by_row:
+            self.row_losses = self._compute_row_losses(optimization, step)
         try:  # the mean of the weighted losses of a group is that of the batch
             optimization.optimize(loss if group.size == 1 else loss * (weight * group.size))
         except DivergedError as error:
@@ -186,6 +202,17 @@ class Learner:
             losses = dict(zip(losses, totals, strict=True))
         if stops and not math.isfinite(losses["loss"]):
             raise DivergedError(self._explain(f"the loss is {losses['loss']}", step))
+        return losses
+
+    def _compute_row_losses(self, optimization: Optimization, step: _Step) -> Array:
+        found = optimization.compute_row_losses(*step.compared, step.data)
+        losses: Array = self.network.tensor_to_numpy({"loss": found})["loss"].astype(np.float64)
+        rows = len(next(iter(step.data.values())))
+        if losses.shape != (rows,):
+            raise UsageError(
+                f"{type(optimization).__name__}.compute_row_losses() returned shape "
+                f"{losses.shape} for {rows} rows."
+            )
         return losses
 
     def _explain(self, found: str, step: _Step) -> str:
@@ -321,7 +348,15 @@ class Learner:
         prediction = self.network.predict(self.transformation.transform_before_prediction(inputs))
         return self.transformation.transform_before_apply(prediction)
 
-    def save(self, network_dir: Path, progress: checkpoint.Progress, *, best: bool = False) -> Path:
+    def save(
+        self,
+        network_dir: Path,
+        progress: checkpoint.Progress,
+        buffer: Index | None = None,
+        sampler: Array | None = None,
+        *,
+        best: bool = False,
+    ) -> Path:
         """Write the next checkpoint, or the best one, and return its folder."""
         return checkpoint.save(
             network_dir,
@@ -331,6 +366,8 @@ class Learner:
             self.fields,
             self.transformation.normalization,
             progress,
+            buffer,
+            sampler,
             best=best,
         )
 

@@ -1,36 +1,206 @@
-"""Finds the checkpoint and the dataset that a training resumes from."""
+"""Finds the checkpoint, the dataset and the environments that a training resumes from."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
 
 from physx_core import checkpoint
 from physx_core.checkpoint import Checkpoint
-from physx_core.config import DatasetConfig, EnvironmentConfig
-from physx_core.errors import ConfigError
-from physx_core.pipelines.storage import is_copy
+from physx_core.config import SETS, WRONG, DatasetConfig, EnvironmentConfig
+from physx_core.dataset import Dataset
+from physx_core.dataset.store.manifest import to_plain_info
+from physx_core.errors import ConfigError, DatasetNotFoundError
+from physx_core.pipelines.storage import (
+    GENERATION,
+    describe_environment,
+    is_copy,
+    keep_parameters,
+    restore_parameters,
+)
 from physx_core.session import Session
+from physx_core.workers.instance import Skip
+
+_SAME = (
+    "environment",
+    "env_kwargs",
+    "num_clients",
+    "simulations_per_step",
+    "sampler",
+    "sampler_kwargs",
+    "seed",
+)
 
 
-def read_last_checkpoint(
+@dataclass(frozen=True)
+class Generation:
+    """What the rows that a training's environments generate depend on, beside the environment.
+
+    It is kept in the dataset, so that a run that was killed can go on: its environments generate
+    the same rows again.
+
+    Attributes:
+        mode: Mode in which the rows are stored.
+        first: Number of rows that the mode had before.
+        first_wrong: Number of rejected samples that there were before.
+        first_set: Number of sets of parameters that there were before.
+        offset: Number of rows of the mode "training" before, which the seed is derived from.
+        seed: Seed of the training.
+        batch_size: Number of rows in a batch.
+        batch_nb: Number of batches in an epoch.
+        depends: Whether the rows depend on the network that learns, by its predictions for an
+            environment: then they cannot be generated again.
+    """
+
+    mode: str
+    first: int
+    first_wrong: int
+    first_set: int
+    offset: int
+    seed: int
+    batch_size: int
+    batch_nb: int | None
+    depends: bool = False
+
+    @classmethod
+    def begin(
+        cls, dataset: Dataset, mode: str, seed: int, batch_size: int, batch_nb: int | None
+    ) -> Self:
+        """Return the description of a training that begins now."""
+        counted = (mode, WRONG, SETS, "training")
+        first, wrong, sets, offset = (_count(dataset, name) for name in counted)
+        return cls(mode, first, wrong, sets, offset, seed, batch_size, batch_nb)
+
+    def start(self, dataset: Dataset, **info: Any) -> None:
+        """Keep it in the dataset, with further information.
+
+        Parameters that environments have saved there are copied.
+        """
+        keep_parameters(dataset.directory)
+        self.store(dataset, **info)
+
+    def store(self, dataset: Dataset, **info: Any) -> None:
+        """Keep it in the dataset, with further information."""
+        dataset.update_info(**info, **{GENERATION: dataclasses.asdict(self)})
+
+    def resume(self, dataset: Dataset, environment: EnvironmentConfig, now: Generation) -> Skip:
+        """Check that a training continues this one, and return the rows that it has had.
+
+        The parameters that environments have saved are again those of when it began.
+
+        Args:
+            dataset: Has the rows.
+            environment: The environment.
+            now: The description of the training if it began now.
+        """
+        given = to_plain_info(describe_environment(environment, environment.seed or 0))
+        if environment.seed is None:
+            given["seed"] = dataset.info.get("seed")
+        before = {"batch_size": self.batch_size, "batch_nb": self.batch_nb, "mode": self.mode}
+        after = {"batch_size": now.batch_size, "batch_nb": now.batch_nb, "mode": now.mode}
+        before |= {name: dataset.info.get(name) for name in _SAME}
+        after |= {name: given.get(name) for name in _SAME}
+        for name, value in after.items():
+            if value != before[name]:
+                raise ConfigError(
+                    f"The training cannot be resumed while environments generate its samples: "
+                    f"{name} was {before[name]!r} and is {value!r}, so other samples would follow. "
+                    "Give the same, or start another training."
+                )
+        restore_parameters(dataset.directory)
+        rejected: tuple[int, ...] = ()
+        if _count(dataset, WRONG) > self.first_wrong:
+            numbers = dataset[WRONG]["env_id"][self.first_wrong :]
+            found = np.bincount(numbers, minlength=environment.num_clients + 1)
+            rejected = tuple(int(count) for count in found[1:])
+        rows, sets = _count(dataset, self.mode) - self.first, _count(dataset, SETS) - self.first_set
+        begun = {}
+        if rows:
+            view = dataset[self.mode]
+            begun = {name: view[name][self.first :] for name in ("env_id", "episode")}
+        recorded = {}
+        if sets:
+            view = dataset[SETS]
+            recorded = {name: view[name][self.first_set :] for name in dataset.fields(SETS)}
+            if environment.record_wrong_samples and recorded["failed"].any():
+                raise ConfigError(
+                    "The training cannot be resumed while environments generate its samples, as "
+                    f"{recorded['failed'].sum()} of their simulations failed (redraw) and rejected "
+                    f"samples are recorded. {_advice(dataset.directory.parent)}"
+                )
+        return Skip(rows, rejected, recorded, begun)
+
+
+def find_start(
     session: Session, name: str, environment: EnvironmentConfig | None
-) -> Checkpoint:
-    """Return the checkpoint that a training resumes from.
+) -> tuple[Checkpoint | None, EnvironmentConfig | None, Generation | None]:
+    """Return what a training resumes from.
 
     Args:
         session: The training's session.
         name: Name of the network.
-        environment: The environment of the samples; all needed samples must be stored already.
+        environment: The environment of the samples.
+
+    Returns:
+        The checkpoint, None if the training begins again; the environment, if samples are still to
+        be generated; and the description of those that are there, None if there are none.
     """
+    info: Mapping[str, Any] = {}
+    is_empty = True
+    if environment is not None and not environment.load_samples:
+        with contextlib.suppress(DatasetNotFoundError), Dataset.open(session.dataset_dir) as data:
+            info, is_empty = data.info, not any(data.num_samples(mode) for mode in data.modes)
+        generation = _parse(info.get(GENERATION))
+        is_new = not checkpoint.list_numbers(session.network_dir, name)
+        if is_new and (generation is not None or is_empty):
+            _check_repeatable(generation, session)
+            return None, environment, generation
     found = checkpoint.find(session.network_dir, name, -1)
-    if not can_resume(environment, found.progress.epoch):
+    if can_resume(environment, found.progress.epoch):
+        return found, None, None
+    generation = _parse(info.get(GENERATION))
+    if generation is None:
         raise ConfigError(
             "A training cannot be resumed while environments generate its samples, as they would "
-            f"start over. Leave the environment out to train on the stored samples, or start "
-            f"another training with its network: NetworkConfig.network_dir={str(session.path)!r} "
-            f"(--network.network-dir {session.path})."
+            f"start over. {_advice(session.path)}"
         )
-    return found
+    _check_repeatable(generation, session)
+    return found, environment, generation
+
+
+def _check_repeatable(generation: Generation | None, session: Session) -> None:
+    if generation is not None and generation.depends:
+        raise ConfigError(
+            "A training cannot be resumed while environments generate its samples if they depend "
+            "on the network that learns, as these do, by its predictions (get_prediction). So they "
+            f"cannot be generated again. {_advice(session.path)}"
+        )
+
+
+def _advice(session: Path) -> str:
+    return (
+        "Leave the environment out to train on the stored samples, or start another training with "
+        f"its network: NetworkConfig.network_dir={str(session)!r} (--network.network-dir "
+        f"{session})."
+    )
+
+
+def _parse(plain: Any) -> Generation | None:
+    """Return the description in a dataset's info; None if there is none that is valid."""
+    try:
+        return Generation(**plain)
+    except TypeError:
+        return None
+
+
+def _count(dataset: Dataset, mode: str) -> int:
+    return dataset.num_samples(mode) if mode in dataset.modes else 0
 
 
 def can_resume(environment: EnvironmentConfig | None, epochs: int) -> bool:

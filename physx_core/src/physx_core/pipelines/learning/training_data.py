@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 
 import numpy as np
 
+from physx_core.components.buffer import Buffer
+from physx_core.components.group import Group
 from physx_core.config import DatasetConfig, EnvironmentConfig
 from physx_core.dataset import Dataset, Subset
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import RESERVED, Field
+from physx_core.pipelines.learning.blocks import Block, Blocks
+from physx_core.pipelines.learning.drawn_rows import DrawnRows
+from physx_core.pipelines.learning.feeder import Feeder
+from physx_core.pipelines.learning.online import OnlineBatches
+from physx_core.pipelines.learning.sharing import SharedBatches
 from physx_core.pipelines.storage import other_samples, record_rejected
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.sources.source import Source
 from physx_core.statistics import Normalization
-from physx_core.typing import Batch
+from physx_core.typing import Array, Batch, Index
+
+_IDENTITY = ("env_id", "episode")
 
 
 class TrainingData:
@@ -39,6 +48,7 @@ class TrainingData:
         dataset: Dataset to read batches from, and to store generated ones in.
         source: The environments; None if only the dataset is read.
         batches_read: Number of batches read from the dataset.
+        online: The batches of rows that environments generate; None if they generate none.
         parts: The samples to train on and those held back, ``training`` and ``validation``; empty
             if none are held back.
     """
@@ -54,6 +64,12 @@ class TrainingData:
         seed: int,
         environment: EnvironmentConfig | None,
         data_type: str,
+        buffer: Buffer,
+        drawn: DrawnRows | None = None,
+        group: Group,
+        first: int = 0,
+        feeder: Feeder[Block] | None = None,
+        ahead: bool = True,
     ) -> None:
         """Check that the samples are available, and hold some back if configured.
 
@@ -66,9 +82,18 @@ class TrainingData:
             seed: Seed of the order of samples.
             environment: Configuration of the source; None without one.
             data_type: Floating type of the batches that are read.
+            buffer: Decides what batches hold while environments generate; it has begun.
+            drawn: Where to write which rows the buffer drew.
+            group: The processes that train together; only the leading one has the environments.
+            first: Number of samples that the mode had before the first generated batch.
+            feeder: Has a thread that has the environments generate batches ahead of the training;
+                None: they are generated when they are taken.
+            ahead: Whether all batches of an epoch will be taken, so that they may be generated
+                ahead.
         """
         replay = environment is not None and environment.load_samples
-        if source is not None and batch_nb is None and not replay:
+        generates = environment is not None and not replay
+        if generates and batch_nb is None:
             raise ConfigError(
                 "Training.batch_nb is missing: it is the number of batches to generate in an epoch."
             )
@@ -77,28 +102,47 @@ class TrainingData:
         self._config = config
         self._batch_size, self._batch_nb = batch_size, batch_nb
         self._seed = seed
+        self._ahead = ahead
         self._always = environment is not None and (
             not environment.only_first_epoch if replay else environment.always_produce
         )
         self._data_type = data_type
         self._mode = config.mode
         self._reader: Iterator[Batch] | None = None
-        self._uses_source = source is not None
+        self._has_source = self._uses_source = source is not None or generates
         self._changed = False
-        if source is None and not self._count(self._mode):
+        if not self._has_source and not self._count(self._mode):
             raise DatasetError(
                 f'The dataset in {dataset.directory} has no samples of mode "{self._mode}" to '
                 f"train on. It has: {listed(dataset.modes)}."
                 f"{other_samples(dataset.directory, self._mode)}"
             )
         self.parts = self._split(replay)
-        self._stored = self._stored_rows(source) if replay and source is not None else None
+        self._stored: StoredRows | None = None
+        self.online: OnlineBatches | None = None
+        self._shared: SharedBatches | None = None
+        self._names: Sequence[str] = ()
+        if source is not None and replay:
+            self._stored = self._stored_rows(source)
+        elif source is not None:
+            blocks = Blocks(
+                source, dataset, self._mode, normalize=config.normalize, first=first, feeder=feeder
+            )
+            self.online = OnlineBatches(blocks, buffer, data_type, drawn, first)
+            source.sets.follow(buffer.needed)
+            if source.sets.learns and group.size > 1:
+                raise ConfigError(
+                    "A sampler that learns from losses works in one process: leave torchrun out, "
+                    'or choose another sampler, for example "physx/sobol".'
+                )
+        if generates and group.size > 1:
+            self._shared = SharedBatches(group, self.online, source.fields if source else ())
 
     def _split(self, replay: bool) -> dict[str, Subset]:
         share = self._config.validation_split
         if not share:
             return {}
-        if self.source is not None and not replay:
+        if self._has_source and not replay:
             raise ConfigError(
                 "DatasetConfig.validation_split holds back stored samples, but environments "
                 'generate these. Generate the samples first, or others in the mode "validation".'
@@ -120,15 +164,21 @@ class TrainingData:
         compare_fields(f'The environment cannot replay mode "{self._mode}", which', known, given)
         return rows
 
-    def begin_epoch(self, epoch_id: int, names: Sequence[str]) -> int:
+    def begin_epoch(self, epoch_id: int, names: Sequence[str], done: int = 0) -> int:
         """Prepare an epoch and return its number of batches.
 
         Args:
             epoch_id: Index of the epoch, from 0.
             names: Fields of the batches that are read from the dataset.
+            done: Number of its batches that were learned from already.
         """
-        self._uses_source = self.source is not None and (epoch_id == 0 or self._always)
+        self._names = names
+        self._uses_source = self._has_source and (epoch_id == 0 or self._always)
+        if self._uses_source and self.online is not None and self._ahead:
+            self.online.expect(max(0, (self._batch_nb or 0) - done))
         if not self._uses_source and self._reader is None:
+            if self._shared is not None:
+                self._shared.finish(self.dataset)
             part = self.parts.get("training")
             batches = part.batches if part else partial(self.dataset.batches, self._mode)
             self._reader = batches(
@@ -143,15 +193,17 @@ class TrainingData:
         return self._batch_nb or -(-self._samples // self._batch_size)
 
     def next_batch(self) -> Batch:
-        """Return the next batch in physical units; generated ones are stored already."""
-        if self._uses_source and self.source is not None:
+        """Return the next batch in physical units; generated ones are stored already.
+
+        In a group of processes each gets its share of a generated batch, whose `weight` is known.
+        """
+        if self._uses_source and self._shared is not None:
+            return self._shared.next(self._names)
+        if self._uses_source and self.online is not None:
+            return self.online.next(self._drawn_fields(self._names))
+        if self._uses_source and self.source is not None and self._stored is not None:
             with record_rejected(self.source, self.dataset):
-                if self._stored is not None:
-                    return self._replay(self.source, self._stored)
-                batch = self.source.batch(self._batch_size)
-                self.dataset.define_fields(self._mode, self.source.fields)
-                self.dataset.append(self._mode, batch, checked=True)
-                return batch
+                return self._replay(self.source, self._stored)
         if self._reader is None:
             raise UsageError("next_batch() needs begin_epoch() before it.")
         self.batches_read += 1
@@ -166,10 +218,56 @@ class TrainingData:
         self._changed = True
         return batch
 
+    def close(self) -> None:
+        """End what generates batches ahead, before the source is closed."""
+        if self.online is not None:
+            self.online.close()
+
+    def resume(self, batches: int, state: Callable[[], Index], names: Sequence[str]) -> None:
+        """Continue after batches that were drawn while environments generated.
+
+        Args:
+            batches: Their number.
+            state: Returns the state of the buffer then; called if it keeps rows.
+            names: Fields of the batches.
+
+        Raises:
+            CheckpointError: If it is not a state of this buffer.
+        """
+        if self.online is not None:
+            fields = self._drawn_fields(names)
+            self.online.resume(batches, state, self.dataset, self._mode, fields)
+
     def skip(self, batches: int) -> None:
         """Skip batches that a training read before it was interrupted."""
         for _ in range(batches):
             self.next_batch()
+
+    def _drawn_fields(self, names: Sequence[str]) -> Sequence[str]:
+        """Return the fields of batches that are drawn: a sampler that learns knows rows by two."""
+        return [*names, *_IDENTITY] if self.wants_row_losses else names
+
+    @property
+    def wants_row_losses(self) -> bool:
+        """Whether a sampler learns from the losses of the rows of the current epoch."""
+        return self.produces and self.source is not None and self.source.sets.learns
+
+    def tell(self, batch: Batch, losses: Array) -> None:
+        """Have the sampler learn from the last batch.
+
+        Args:
+            batch: The batch.
+            losses: Loss of each row, shape (rows,).
+        """
+        assert self.source is not None
+        episodes = np.asarray(batch["episode"], np.int64)
+        numbers = episodes * self.source.instance_nb + batch["env_id"] - 1
+        self.source.sets.tell(numbers, losses)
+
+    @property
+    def weight(self) -> float | None:
+        """Weight of the last batch if it is this process's share of one; None: it is a whole."""
+        return self._shared.weight if self._shared is not None and self._uses_source else None
 
     @property
     def produces(self) -> bool:
@@ -195,6 +293,10 @@ class TrainingData:
     @property
     def fields(self) -> Mapping[str, Field]:
         """The stored fields by name; those of the environments until something is stored."""
+        if self._shared is not None:
+            return self._shared.block.fields
+        if self.online is not None and self.online.block.fields:
+            return self.online.block.fields
         if self.source is not None and not self._count(self._mode):
             return {field.name: field for field in self.source.fields}
         return self.dataset.fields(self._mode)
@@ -202,6 +304,10 @@ class TrainingData:
     def normalization(self) -> dict[str, Normalization]:
         """Return the normalization by field; empty if nothing is to be normalized."""
         self._changed = False
+        if self.produces and self._shared is not None:
+            return self._shared.block.normalization
+        if self.produces and self.online is not None and self.online.block.fields:
+            return self.online.block.normalization
         if not self._config.normalize or not self._count(self._mode):
             return {}
         if self.parts:

@@ -26,21 +26,31 @@ class Producer:
     """
 
     def __init__(
-        self, link: WorkerLink, instance: Instance, skip: int = 0, rejected: int = 0
+        self,
+        link: WorkerLink,
+        instance: Instance,
+        *,
+        rows: int = 0,
+        rejected: int = 0,
+        made: int = 0,
+        slow_until: int = 0,
     ) -> None:
         """Store what generates and sends the rows.
 
         Args:
             link: The connection to the server.
             instance: Generates the rows; open.
-            skip: How many rows the server has from an earlier client. They are generated again, but
+            rows: How many rows the server has from earlier clients. They are generated again, but
                 not sent.
-            rejected: How many rejected rows it has from an earlier client.
+            rejected: How many rejected rows it has that are generated again.
+            made: How many of the rows are not generated again.
+            slow_until: Number of the trajectory before which each row is sent at once.
         """
-        self.made = 0
+        self.made = made
         self.failure: PhysxError | None = None
         self._link, self._instance = link, instance
-        self._skip, self._skip_rejected = skip, rejected
+        self._skip, self._skip_rejected = rows, rejected
+        self._slow_until = slow_until
         self._buffer: RowBuffer | None = None
         self._announced = False
         self._stored: deque[Sample] = deque()
@@ -100,8 +110,11 @@ class Producer:
         buffer = self._buffer
         if buffer is None:
             buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample))
-        if self.made >= self._skip:
-            buffer.put(sample, instance.instance_id, instance.last_episode, instance.last_step)
+        is_repeated = self.made < self._skip  # and fails again if it is not valid
+        numbers = (instance.instance_id, instance.last_episode, instance.last_step)
+        buffer.put(sample, *numbers, finite=is_repeated)
+        if is_repeated:
+            buffer.clear()
         self._announce(buffer)
         self.made += 1
 
@@ -140,6 +153,7 @@ class Producer:
         return (
             self.made >= self._credit
             or (buffer is not None and buffer.full)
+            or self._instance.last_episode < self._slow_until
             or time.monotonic() - self._sent_at >= _BLOCK_TIME
         )
 

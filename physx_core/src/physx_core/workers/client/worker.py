@@ -59,12 +59,13 @@ def _serve(link: WorkerLink, setup: dict[str, Any], say: Callable[[str], None]) 
     os.environ[CLIENT_VARIABLE] = "1"
     draw, skip = setup.pop("draw"), setup.pop("skip")
     _take_place(setup.pop("path"), setup.pop("directory"))
+    again = skip["rows"] - skip["made"]
     say(
         f"runs {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"
-        + (f"; {skip['rows']} rows are stored and are made again" if skip["rows"] else "")
+        + (f"; {again} rows are stored and are made again" if again else "")
     )
     link.spins = has_core_for_each(setup["instance_nb"])
-    client = _Client(link, Instance(**setup), skip)
+    client = _Client(link, Instance(**setup), skip.pop("shown"), skip)
     try:
         client.live(draw)
     finally:
@@ -95,17 +96,22 @@ class _Client:
         is_forsaken: Whether the server is gone without ending the run.
     """
 
-    def __init__(self, link: WorkerLink, instance: Instance, skip: dict[str, int]) -> None:
+    def __init__(
+        self, link: WorkerLink, instance: Instance, shown: int, skip: dict[str, int]
+    ) -> None:
         self.failure: PhysxError | None = None
         self.is_forsaken = False
         self._link, self._instance = link, instance
-        self._producer = Producer(link, instance, skip["rows"], skip["rejected"])
-        self._services = RemoteServices(link, self._producer, skip["shown"])
+        self._producer = Producer(link, instance, **skip)
+        self._services = RemoteServices(link, self._producer, shown)
 
     def live(self, draw: bool) -> None:
         """Open the environment and make rows until the run ends or the environment fails."""
         try:
-            self._instance.open(self._services, draw)
+            self._instance.open(self._services, draw, self._services.choose)
+            parameters = [parameter.to_dict() for parameter in self._instance.parameters]
+            if parameters:
+                self._link.send(pack(Kind.PARAMETERS, encode(parameters)))
             fields = [field.to_dict() for field in self._instance.fields]
             self._link.send(pack(Kind.READY, encode(fields)))
             self._producer.run()
@@ -155,6 +161,13 @@ class RemoteServices:
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
         """Return the values that the instance kept: see `Services.load_parameters`."""
         values: dict[str, Any] = self._ask(Kind.LOAD, None, "load_parameters()")
+        return values
+
+    def choose(self, episode: int) -> dict[str, Any]:
+        """Return the parameters of an episode."""
+        self._producer.flush()
+        request = {"episode": episode, "row": self._producer.made}
+        values: dict[str, Any] = self._link.ask(Kind.CHOOSE, request, "the parameters")
         return values
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:

@@ -14,14 +14,21 @@ from typing import Any
 from physx_core.components.environment import Services
 from physx_core.components.launcher import ClientHandle, Launcher
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import ClientError, ConfigError, EnvironmentFailedError, PhysxError
+from physx_core.errors import (
+    ClientError,
+    ConfigError,
+    EnvironmentFailedError,
+    PhysxError,
+    ProgramError,
+)
 from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.net.tokens import choose_token
 from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate
-from physx_core.workers.instance import instance_arguments
+from physx_core.workers.instance import NOTHING, Skip, instance_arguments
 from physx_core.workers.launchers import stop
+from physx_core.workers.parameter_sets import ParameterSets, next_step
 from physx_core.workers.server.client_errors import exit_error, timeout_error
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.server import Server
@@ -30,7 +37,7 @@ _TICK = 0.1
 _GRACE = 1.0
 _EXIT_TIME = 5.0
 _SAY_EVERY = 5.0
-_PASSING = (EnvironmentFailedError, ClientError)  # what may not come again
+_PASSING = (EnvironmentFailedError, ProgramError, ClientError)  # what may not come again
 _LOG = logging.getLogger("physx")
 
 
@@ -47,8 +54,10 @@ class ClientGroup:
         config: EnvironmentConfig,
         services: Services,
         seed: Sequence[int],
+        sets: ParameterSets,
         *,
         accept_all: bool = False,
+        skip: Skip = NOTHING,
     ) -> None:
         """Keep the arguments; `open` starts the clients.
 
@@ -56,11 +65,13 @@ class ClientGroup:
             config: The environment, the number of clients, and their launcher.
             services: The services of the run, for the environments.
             seed: Seed of all instances.
+            sets: Chooses the instances' parameters.
             accept_all: Whether samples that `check_sample` rejects count like the others.
+            skip: What an earlier run has had: clients generate it again, but do not send it.
         """
         self.config = config
-        self._seed = list(seed)
-        self._accepts_all = accept_all
+        self._seed, self._sets = list(seed), sets
+        self._accepts_all, self._skip = accept_all, skip
         self._launcher = _make_launcher(config)
         self._handles: dict[int, ClientHandle] = {}
         self._launched: dict[int, float] = {}
@@ -75,7 +86,9 @@ class ClientGroup:
             services,
             self._encode_setup,
             choose_token(config, self._launcher.by_hand),
+            sets,
             self._replaces,
+            skip,
         )
 
     def open(self) -> None:
@@ -221,10 +234,31 @@ class ClientGroup:
 
     def _replaces(self, number: int, error: PhysxError | None) -> bool:
         """Return whether another client replaces one that failed, or left without an error."""
-        if error is None and self._launcher.by_hand:
+        if error is None and (self._launcher.by_hand or self.config.redraw):
             return True
+        return self._restarts_after(number, error) or self._redraws_after(number, error)
+
+    def _restarts_after(self, number: int, error: PhysxError | None) -> bool:
         passing = error is None or isinstance(error, _PASSING)
         return passing and self._restarts[number] < self.config.restarts
+
+    def _redraws_after(self, number: int, error: PhysxError | None) -> bool:
+        is_known = getattr(error, "step", -1) >= 0 and not self.config.record_wrong_samples
+        if error is None or (self._repeats(number) and not is_known):
+            return False
+        return self._sets.can_redraw(number, error)
+
+    def _repeats(self, number: int) -> bool:
+        """Return whether a client failed at a row that an earlier run has had, or may have.
+
+        If it ends without a word, which of them it was making is not known, so no other can go on
+        there with other parameters.
+        """
+        peer = self.server.peers.get(number)
+        had = self._skip.rows_of(number, self.config.num_clients)
+        if peer is None or not had:
+            return had > 0
+        return peer.received <= had if peer.failure is None else peer.failed_row < had
 
     def _lose(self, number: int, error: PhysxError, *, left: bool = False) -> None:
         """Have another client take the place of one that is lost.
@@ -236,19 +270,40 @@ class ClientGroup:
         """
         absent = self._launcher.by_hand and self._find_peer(number) is None
         if absent or not self._replaces(number, None if left else error):
+            self._sets.fail(number, self._episode(number), error)
             raise error
-        if not left:
-            self._restarts[number] += 1
         text, _, details = str(error).partition("\n")
-        follows = self._describe_next(number, left)
+        if left or self._restarts_after(number, error):
+            self._restarts[number] += not left
+            follows = self._describe_next(number, left)
+        else:
+            follows = self._redraw(self.server.peers[number], error)
         _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
         self.server.vacate(number)
         handle = self._handles.pop(number, None)
-        closes = isinstance(error, EnvironmentFailedError)  # and needs a moment for it
+        closes = not isinstance(error, ClientError)  # and needs a moment for it
         stop([] if handle is None else [handle], _GRACE if closes else 0.0)
         self._exits.pop(number, None)
         if not self._closing:
             self._launch([number])
+
+    def _episode(self, number: int) -> int:
+        peer = self.server.peers.get(number)
+        return -1 if peer is None else peer.episode
+
+    def _redraw(self, peer: Peer, error: PhysxError) -> str:
+        """Have the next client of an instance begin with its next parameters; say so.
+
+        A client that ended without a word may have made rows that it did not send. So the same
+        parameters are simulated once more, and each row is sent at once: where it ends then depends
+        on the parameters alone.
+        """
+        if isinstance(error, ClientError) and peer.slow_until <= peer.episode:
+            peer.slow_until = peer.episode + 1
+            return "The same parameters are simulated once more, to see where they fail."
+        text = self._sets.redraw(peer.instance_id, peer.episode, error)
+        peer.move_origin(next_step(peer.last_step, error))
+        return text
 
     def _describe_next(self, number: int, left: bool) -> str:
         if self._closing:
@@ -292,8 +347,16 @@ class ClientGroup:
 
     def _encode_setup(self, peer: Peer) -> bytes:
         """Return the first message to a client: its instance, and what the server has of it."""
-        skip = {"rows": peer.received, "rejected": peer.rejected.count, "shown": peer.shown}
-        return self._encode(peer.instance_id, skip=skip)
+        origin = peer.origin
+        skip = {
+            "rows": peer.received,
+            "rejected": peer.rejected.count - origin.rejected,
+            "shown": peer.shown - origin.shown,
+            "made": origin.rows,
+            "slow_until": peer.slow_until,
+        }
+        first = {"first_step": origin.step, "first_episode": origin.episode}
+        return self._encode(peer.instance_id, skip=skip, **first)
 
     def _encode(self, instance_id: int, **progress: Any) -> bytes:
         config = self.config

@@ -5,16 +5,36 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
+from typing import NamedTuple
 
+from physx_core.components.parameter import Parameter
 from physx_core.errors import PhysxError
 from physx_core.fields import Field
 from physx_core.net.connection import Connection
-from physx_core.net.frames import FrameReader
+from physx_core.net.frames import FrameReader, Kind, pack
 from physx_core.net.handshake import HANDSHAKE_LIMIT
 from physx_core.workers.row_codec import RejectedRows, RowQueue
 from physx_core.workers.server.journal import Journal
 
 _PIECE = 1 << 16
+
+
+class Origin(NamedTuple):
+    """Where the clients of an instance begin: how much others had sent before.
+
+    Attributes:
+        rows: Number of rows.
+        rejected: Number of rejected rows.
+        shown: Number of messages with drawing events.
+        step: Number of the first step.
+        episode: Number of the first episode; None: that of the environment.
+    """
+
+    rows: int = 0
+    rejected: int = 0
+    shown: int = 0
+    step: int = 0
+    episode: int | None = None
 
 
 class Peer(Connection):
@@ -28,6 +48,7 @@ class Peer(Connection):
         rows: Rows that arrived.
         received: How many rows arrived in all.
         granted: How many rows it may make in all.
+        wanted: How many of them the run waits for, or has had; the others it makes ahead.
         rejected: Rows that arrived and that its environment rejected.
         rejected_limit: How many of those it may send in all.
         failure: The error that it sent.
@@ -41,6 +62,10 @@ class Peer(Connection):
         requests: How many requests it sent.
         shown: How many messages with drawing events arrived in all.
         journal: Messages for a client that takes its place; None if none can.
+        parameters: The parameters that its environment defines.
+        episode: Last episode that it was given parameters for; -1: none.
+        origin: Where a client that takes its place begins.
+        slow_until: Episode before which that client sends each row at once.
     """
 
     reader: FrameReader
@@ -57,7 +82,7 @@ class Peer(Connection):
         self.fields: list[Field] = []
         self.row_fields: list[Field] = []
         self.rows = RowQueue()
-        self.received = self.granted = 0
+        self.received = self.granted = self.wanted = 0
         self.rejected = RejectedRows()
         self.rejected_limit = 0
         self.failure: PhysxError | None = None
@@ -67,13 +92,25 @@ class Peer(Connection):
         self.has_vanished = self.finished = self.vacant = self.has_told_fields = False
         self.requests = self.shown = 0
         self.journal: Journal | None = None
+        self.parameters: list[Parameter] = []
+        self.episode = -1
+        self.origin = Origin()
+        self.slow_until = 0
         self._arrived = 0  # of a long frame, when the peer was last heard of
         self._next_order: int | None = None  # of the journal's, for this client; None: it had all
 
     @property
-    def is_at_work(self) -> bool:
-        """Whether its environment is starting or making rows, or would be if it were not lost."""
-        return not self.finished and (not self.fields or self.received < self.granted)
+    def is_awaited(self) -> bool:
+        """Whether its environment is starting or making rows that the run waits for.
+
+        Or would be if it were not lost.
+        """
+        return not self.finished and (not self.fields or self.received < self.wanted)
+
+    @property
+    def is_ahead(self) -> bool:
+        """Whether its environment is making a row that the run does not wait for yet."""
+        return bool(self.fields) and self.wanted <= self.received < self.granted
 
     @property
     def is_lost(self) -> bool:
@@ -83,10 +120,26 @@ class Peer(Connection):
     def succeed(self, former: Peer) -> None:
         """Take the place of another client of the instance, with everything it sent."""
         self.rows, self.received, self.granted = former.rows, former.received, former.granted
+        self.wanted = former.wanted
         self.rejected, self.rejected_limit = former.rejected, former.rejected_limit
         self.row_fields, self.last_step = former.row_fields, former.last_step
         self.shown, self.journal = former.shown, former.journal
+        self.episode, self.origin = former.episode, former.origin
+        self.slow_until = former.slow_until
         self._next_order = None if self.journal is None else 0
+
+    def move_origin(self, step: int) -> None:
+        """Have a client that takes its place begin with the next episode, at the next row.
+
+        Args:
+            step: Number of its first step.
+        """
+        row = self.received if self.failure is None else self.failed_row
+        self.origin = Origin(row, self.rejected.count, self.shown, step, self.episode + 1)
+        if self.journal is not None:
+            self.journal.close()
+            self.journal = Journal()
+            self.journal.record(pack(Kind.CREDIT, number=self.granted))
 
     def hear(self, *, whole: bool) -> None:
         """Note a sign of life: a whole frame, or a good piece of a long one.

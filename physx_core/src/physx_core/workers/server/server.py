@@ -21,6 +21,8 @@ from physx_core.net.liveness import is_loss
 from physx_core.net.remote_errors import decode_error, encode_error
 from physx_core.net.spin_wait import has_core_for_each
 from physx_core.net.strangers import Handshakes
+from physx_core.workers.instance import NOTHING, Skip
+from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.peer import Peer
@@ -30,6 +32,7 @@ from physx_core.workers.server.validation import (
     check_row_fields,
     check_rows,
     parse_fields,
+    parse_parameters,
 )
 
 _HANDSHAKE_TIME = 5.0
@@ -37,6 +40,7 @@ _SPIN_TIME = 5e-5  # for the next requests of clients that were just answered
 _MAX_STRANGERS = 128
 _TURNS = 64
 _LONG = 1 << 16
+_REQUESTS = (Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW, Kind.CHOOSE)
 
 
 class Server:
@@ -55,7 +59,9 @@ class Server:
         services: Services,
         setup: Callable[[Peer], bytes],
         token: str,
+        sets: ParameterSets,
         replaces: Callable[[int, PhysxError | None], bool] = lambda number, error: False,
+        skip: Skip = NOTHING,
     ) -> None:
         """Keep the arguments; `open` starts to listen.
 
@@ -66,21 +72,24 @@ class Server:
             services: The services of the run, for the environments.
             setup: Returns the payload that tells an instance's client what to run.
             token: Secret of the run.
+            sets: Chooses the instances' parameters.
             replaces: Whether another client takes the place of one that failed with an error, or
                 left without one.
+            skip: What an earlier run has had of the instances.
         """
         self.peers: dict[int, Peer] = {}
         self.token = token
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
         self._spin_time = _SPIN_TIME if has_core_for_each(instance_nb) else 0.0
-        self._requests = ServiceRequests(services)
-        self._setup, self._replaces = setup, replaces
+        self._requests = ServiceRequests(services, sets)
+        self._setup, self._replaces, self._skip = setup, replaces, skip
         self._ending = self._has_news = False
         self._listener = Listener[Peer](self._meet, self._give_up)
         self._strangers = Handshakes[Peer](
             token, _HANDSHAKE_TIME, _MAX_STRANGERS, self._drop, self._listener.timers
         )
         self._dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
+            Kind.PARAMETERS: _take_parameters,
             Kind.READY: _take_ready,
             Kind.FIELDS: _take_fields,
             Kind.ROWS: _take_rows,
@@ -88,7 +97,7 @@ class Server:
             Kind.ERROR: _take_error,
             Kind.BYE: self._take_bye,
             Kind.AGAIN: _take_again,
-            **dict.fromkeys((Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW), self._requests.take),
+            **dict.fromkeys(_REQUESTS, self._requests.take),
         }
 
     def open(self) -> None:
@@ -131,6 +140,9 @@ class Server:
             spin: How long to look for it without sleeping before that, in s.
         """
         self._has_news = False
+        self._requests.choose()
+        if self._can_predict():  # held requests that are due now
+            timeout = 0.0
         for peer, events in self._listener.select(timeout, spin):
             if events & selectors.EVENT_WRITE:
                 peer.flush()
@@ -139,20 +151,20 @@ class Server:
                 self._read(peer)
         if self._listener.accept():
             self._has_news = True
-        asked = self._requests.count
-        if not asked or (asked < self._instance_nb and self._expects_more_requests()):
+        if not self._can_predict():
             return False
         return self._requests.predict() and not self._has_news
 
     @property
     def asking(self) -> set[int]:
-        """The instances that wait for a prediction."""
+        """The instances that wait for a prediction or parameters, due or held."""
         return self._requests.asking
 
     def end(self) -> None:
         """Tell all clients to close their environments."""
         self._ending = True
         for peer in self.peers.values():
+            peer.wanted = peer.granted  # nothing is held any more
             peer.send(pack(Kind.CLOSE))
 
     def vacate(self, number: int) -> None:
@@ -175,30 +187,35 @@ class Server:
     def holding_up(self, waited: Iterable[int]) -> set[int]:
         """Return the instances that cause the wait when the server waits for some instances.
 
-        Those that wait for a prediction wait for the others that are at work.
+        Those that wait for a prediction wait for the others that are awaited.
         """
         waited = set(waited)
-        others = self._at_work() if waited & self.asking else set()
+        others = self._awaited() if waited & self.asking else set()
         return (waited | others) - self.asking
 
-    def _expects_more_requests(self) -> bool:
-        """Return whether a client is at work that may yet ask for a prediction.
+    def _can_predict(self) -> bool:
+        """Return whether there are requests for predictions to answer."""
+        due = self._requests.count
+        return bool(due) and not (due < self._instance_nb and self._expects_more_requests())
 
-        A batch is predicted once every client has asked or has nothing to do. So the requests in a
+    def _expects_more_requests(self) -> bool:
+        """Return whether a client makes an awaited row, and may yet ask for a prediction.
+
+        A batch is predicted once every client has asked or owes no row. So the requests in a
         batch depend on the environments, not on their speed: the rounding of a network's result
         may depend on the size of the batch.
         """
         if self._ending or not self._requests.batches:
             return False
         numbers, asking = range(1, self._instance_nb + 1), self._requests.asking
-        return any(n not in asking and self._is_at_work(n) for n in numbers)
+        return any(n not in asking and self._is_awaited(n) for n in numbers)
 
-    def _at_work(self) -> set[int]:
-        return {n for n in range(1, self._instance_nb + 1) if self._is_at_work(n)}
+    def _awaited(self) -> set[int]:
+        return {n for n in range(1, self._instance_nb + 1) if self._is_awaited(n)}
 
-    def _is_at_work(self, number: int) -> bool:
+    def _is_awaited(self, number: int) -> bool:
         peer = self.peers.get(number)
-        if peer is None or not peer.is_at_work:
+        if peer is None or not peer.is_awaited:
             return peer is None
         return peer.vacant or not peer.is_lost or self._replaces(number, peer.failure)
 
@@ -266,7 +283,10 @@ class Server:
         self.peers[peer.instance_id] = peer
         if former is not None:
             peer.succeed(former)
-        elif self._replaces(peer.instance_id, None):
+        else:
+            peer.received = self._skip.rows_of(peer.instance_id, self._instance_nb)
+            peer.rejected.count = self._skip.rejected_of(peer.instance_id)
+        if former is None and self._replaces(peer.instance_id, None):
             peer.journal = Journal()
         peer.send(pack(Kind.SETUP, self._setup(peer)))
 
@@ -289,6 +309,12 @@ class Server:
             raise ConnectionRefusedByPeerError("It reported its end, but nobody ended the run.")
         peer.finished = peer.failure is None
         self._drop(peer)  # for which it waits
+
+
+def _take_parameters(peer: Peer, frame: Frame) -> None:
+    if peer.fields or peer.parameters:
+        raise ConnectionRefusedByPeerError("It defined its parameters twice, or too late.")
+    peer.parameters = parse_parameters(frame.payload)
 
 
 def _take_ready(peer: Peer, frame: Frame) -> None:

@@ -13,8 +13,9 @@ from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.remote_errors import encode_error
 from physx_core.net.values import pack_value
 from physx_core.typing import Batch, Sample
+from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.server.peer import Peer
-from physx_core.workers.server.validation import parse_events, parse_values
+from physx_core.workers.server.validation import parse_choice, parse_events, parse_values
 
 _MOST_UNREAD = 1 << 26
 _KEPT = "the kept parameters"
@@ -27,6 +28,12 @@ Request: TypeAlias = tuple[Peer, int, Sample]
 class ServiceRequests:
     """Answers the requests of clients; those for predictions are collected and answered together.
 
+    A request for a prediction is *due* when the run waits for the row that its environment is
+    making. Until then it is held, so that what a network answers does not depend on how far clients
+    run ahead.
+
+    So are requests for parameters whose choice depends on losses that were not told yet.
+
     If the services have a method ``predict_batch(batch) -> batch``, simultaneous requests with the
     same fields go through it as one batch. Otherwise each goes through `predict`.
 
@@ -34,28 +41,31 @@ class ServiceRequests:
         batches: Whether requests for predictions are answered as one batch.
     """
 
-    def __init__(self, services: Services) -> None:
+    def __init__(self, services: Services, sets: ParameterSets) -> None:
         """Keep the services.
 
         Args:
             services: The services of the run.
+            sets: Chooses the instances' parameters.
         """
         self._services = services
+        self._sets = sets
         self._predict_batch: Callable[[Batch], Batch] | None = getattr(
             services, "predict_batch", None
         )
         self.batches = self._predict_batch is not None
         self._waiting: list[Request] = []
+        self._choices: list[tuple[Peer, int, tuple[int, int]]] = []
 
     @property
     def count(self) -> int:
-        """How many instances wait for a prediction."""
-        return len(self._waiting)
+        """How many instances wait for a prediction that is due."""
+        return len(self._waiting) - sum(peer.is_ahead for peer, _, _ in self._waiting)
 
     @property
     def asking(self) -> set[int]:
-        """The instances that wait for a prediction."""
-        return {peer.instance_id for peer, _, _ in self._waiting}
+        """The instances that wait for a prediction or parameters, due or held."""
+        return {peer.instance_id for peer, _, _ in (*self._waiting, *self._choices)}
 
     def take(self, peer: Peer, frame: Frame) -> None:
         """Answer a request, or keep it for `predict`.
@@ -82,10 +92,33 @@ class ServiceRequests:
         elif frame.kind is Kind.LOAD:
             load = self._services.load_parameters
             self._answer(peer, frame.number, _KEPT, load, peer.instance_id)
+        elif frame.kind is Kind.CHOOSE:
+            self._take_choice(peer, frame)
         else:
             events = parse_events(frame.payload)
             peer.shown += 1
             self._services.show(peer.instance_id, frame.number, events)
+
+    def _take_choice(self, peer: Peer, frame: Frame) -> None:
+        if not peer.parameters:
+            raise ConnectionRefusedByPeerError("It asked for parameters, but defined none.")
+        episode, row = parse_choice(frame.payload, peer.episode, peer.received)
+        row = row * self._sets.instance_nb + peer.instance_id - 1
+        self._choices.append((peer, frame.number, (episode, row)))
+        self.choose()
+
+    def choose(self) -> None:
+        """Answer the requests for parameters that can be chosen, or that the run waits for."""
+        if not self._choices:
+            return
+        waiting, self._choices = self._choices, []
+        for peer, number, (episode, row) in waiting:
+            if peer.is_ahead and not self._sets.is_ready(row):
+                self._choices.append((peer, number, (episode, row)))
+                continue
+            choose = self._sets.choose
+            self._answer(peer, number, "the parameters", choose, peer.instance_id, episode, row)
+            peer.episode = episode
 
     def _keep(self, peer: Peer, frame: Frame) -> None:
         """Keep a request for `predict`; it replaces one that its environment abandoned."""
@@ -105,10 +138,12 @@ class ServiceRequests:
     def forget(self, peer: Peer) -> None:
         """Forget the requests of a client that is lost."""
         self._waiting = [request for request in self._waiting if request[0] is not peer]
+        self._choices = [request for request in self._choices if request[0] is not peer]
 
     def predict(self) -> bool:
-        """Answer the waiting requests for predictions; return whether all answers are sent."""
-        waiting, self._waiting = self._waiting, []
+        """Answer the due requests for predictions; return whether all answers are sent."""
+        waiting = [request for request in self._waiting if not request[0].is_ahead]
+        self._waiting = [request for request in self._waiting if request[0].is_ahead]
         if len(waiting) == 1:
             ((peer, number, sample),) = waiting
             self._answer(peer, number, "the prediction", self._services.predict, sample)

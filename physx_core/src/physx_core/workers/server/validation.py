@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from physx_core.components.parameter import Parameter
 from physx_core.components.scene import Event
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.fields import RESERVED, Field, first_not_finite
@@ -22,6 +23,8 @@ from physx_core.typing import Batch
 _DTYPE = re.compile(r"[<>|=]?[biufc]\d{1,2}")
 _ROLES = ("training", "additional")
 _ACTIONS = ("add", "update")
+_MOST_PARAMETERS = 4096
+_MOST_EPISODES = 2**48
 
 
 def parse_fields(payload: bytes | bytearray) -> list[Field]:
@@ -36,6 +39,41 @@ def parse_fields(payload: bytes | bytearray) -> list[Field]:
     if not fields or len({field.name for field in fields}) < len(fields):
         raise ConnectionRefusedByPeerError("It does not list any fields, or lists one twice.")
     return fields
+
+
+def parse_parameters(payload: bytes | bytearray) -> list[Parameter]:
+    """Return the parameters that a message lists."""
+    plain = decode(payload)
+    is_list = isinstance(plain, list) and 0 < len(plain) <= _MOST_PARAMETERS
+    if not is_list or not all(
+        isinstance(one, dict) and {*map(type, one)} == {str} for one in plain
+    ):
+        raise ConnectionRefusedByPeerError("It does not list parameters.")
+    try:
+        parameters = [Parameter.from_dict(one) for one in plain]
+    except ConfigError as error:
+        raise ConnectionRefusedByPeerError(f"It does not list parameters: {error}") from error
+    if len({parameter.name for parameter in parameters}) < len(parameters):
+        raise ConnectionRefusedByPeerError("It defined a parameter twice.")
+    return parameters
+
+
+def parse_choice(payload: bytes | bytearray, last: int, received: int) -> tuple[int, int]:
+    """Return the episode whose parameters a message asks for, and the row that is being made.
+
+    Args:
+        payload: The message.
+        last: Episode of the last such message, -1 if there was none.
+        received: How many rows of the instance arrived, or were there before.
+    """
+    plain = decode(payload)
+    given = plain if isinstance(plain, dict) else {}
+    episode, row = given.get("episode"), given.get("row")
+    if type(episode) is not int or not last < episode < _MOST_EPISODES:
+        raise ConnectionRefusedByPeerError("It asked for the parameters of an impossible episode.")
+    if type(row) is not int or not 0 <= row <= received:
+        raise ConnectionRefusedByPeerError("It asked for parameters at an impossible row.")
+    return episode, row
 
 
 def _is_field(plain: Any) -> bool:

@@ -1,0 +1,325 @@
+"""Online training: simulating and learning at the same time.
+
+    python benchmarks/online.py
+    python benchmarks/online.py --check
+
+Overlap: one client simulates, with about the cost of a batch that its learner has. Claim: the
+training makes at least 0.92 times as many batches a second as the slower of the two makes alone,
+and neither waits for the other for more than 2 % of the time beyond what counts demand.
+"""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from measure import claim, finish
+
+from physx_core import (
+    DataGeneration,
+    Dataset,
+    DatasetConfig,
+    EnvironmentConfig,
+    NetworkConfig,
+    Training,
+)
+from physx_core.observers import read_scalars
+from physx_core.pipelines.pipeline import Pipeline
+
+BATCH, BATCHES, ROUNDS = 16, 60, 3
+NETWORK = NetworkConfig(
+    "torch/fc",
+    network_kwargs={"layers": [8, 2000, 2000, 1], "opt_fields": "output"},
+    loss="MSELoss",
+    optimizer="Adam",
+    lr=1e-4,
+)
+
+
+def learner_alone(folder: str) -> float:
+    """Return batches per second of a training on stored samples."""
+    training = Training(
+        NETWORK, DatasetConfig(existing_dir=folder), epoch_nb=1, batch_nb=BATCHES, **common(folder)
+    )
+    return batches_per_second(training)
+
+
+def client_alone(folder: str, cost: float, batches: int = BATCHES) -> float:
+    """Return batches per second of one client."""
+    config = environment(cost)
+    options = {key: value for key, value in common(folder).items() if key != "seed"}
+    return batches_per_second(DataGeneration(config, batch_nb=batches, **options))
+
+
+def both(folder: str, cost: float) -> float:
+    """Return batches per second of a training while a client generates."""
+    training = Training(
+        NETWORK, None, environment(cost), epoch_nb=1, batch_nb=BATCHES, **common(folder)
+    )
+    return batches_per_second(training)
+
+
+def environment(cost: float) -> EnvironmentConfig:
+    """Return the configuration of one client."""
+    return EnvironmentConfig(
+        "online_problems:Costly",
+        as_tcp_ip_client=True,
+        num_clients=1,
+        env_kwargs={"cost": cost},
+        seed=0,
+    )
+
+
+def common(folder: str) -> dict[str, Any]:
+    """Return options of all pipelines."""
+    return {"batch_size": BATCH, "session_dir": folder, "quiet": True, "seed": 0}
+
+
+def batches_per_second(pipeline: Pipeline) -> float:
+    """Return the batches per second of a pipeline, from when all is open."""
+    with pipeline:
+        begin = time.perf_counter()
+        pipeline.execute()
+        return BATCHES / (time.perf_counter() - begin)
+
+
+def overlap() -> list[bool]:
+    """Compare a training with the slower of its two sides."""
+    found = []
+    with tempfile.TemporaryDirectory() as name:
+        stored = f"{name}/stored"
+        generation = DataGeneration(
+            environment(0.0), batch_nb=16, batch_size=64, session_dir=name, session_name="stored",
+            quiet=True,
+        )  # fmt: skip
+        generation.execute()
+        for _ in range(ROUNDS):
+            learner = learner_alone(stored)
+            cost = 1.0 / (learner * BATCH)
+            client = client_alone(name, cost)
+            trained = both(name, cost)
+            found.append((trained / min(learner, client), learner, client, trained))
+    ratio, learner, client, trained = map(statistics.median, zip(*found, strict=True))
+    print("Batches/s with a client and a learner of the same cost, on", torch.get_num_threads())
+    print(f"  learner alone {learner:.1f}, client alone {client:.1f}, both {trained:.1f}")
+    return [claim("both against the slower alone", float(ratio), at_least=0.92)]
+
+
+def waits() -> list[bool]:
+    """Measure how long each side waits although the other one has done its part."""
+    met = []
+    with tempfile.TemporaryDirectory() as folder:
+        learner = batches_per_second(
+            Training(
+                NETWORK, None, environment(0.0), epoch_nb=1, batch_nb=BATCHES, **common(folder)
+            )
+        )
+        for name, share, side in (
+            ("network, samples are there", 0.25, "network_waits"),
+            ("environments, rows are wanted", 4.0, "environments_wait"),
+        ):
+            config = environment(share / (learner * BATCH))
+            training = Training(
+                NETWORK, None, config, epoch_nb=1, batch_nb=BATCHES, **common(folder)
+            )
+            training.execute()
+            numbers = read_scalars(training.session.path)["batch", f"online/{side}"]
+            share_of_time = statistics.median(numbers.values())
+            met.append(claim(f"share of time that the {name}, waits", share_of_time, at_most=0.02))
+    return met
+
+
+class Watched(Training):
+    """A training that notes how much memory this process has after each batch."""
+
+    resident: list[float]
+
+    def batch_end(self) -> None:
+        """Note the memory, in MiB."""
+        super().batch_end()
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        self.resident.append(pages * resource.getpagesize() / 2**20)
+
+
+def memory() -> bool:
+    """Measure how the memory grows from when a reservoir is full until ten times as many rows."""
+    capacity, size = 500, 2**13
+    config = EnvironmentConfig(
+        "online_problems:Large", as_tcp_ip_client=True, env_kwargs={"size": size}, seed=0
+    )
+    kwargs = {"layers": [size, 1], "opt_fields": "output"}
+    linear = NetworkConfig(
+        "torch/fc", network_kwargs=kwargs, loss="MSELoss", optimizer="SGD", lr=0.0
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        training = Watched(
+            linear, None, config, epoch_nb=1, batch_nb=10 * capacity // BATCH,
+            online="physx/reservoir", online_kwargs={"capacity": capacity}, **common(folder),
+        )  # fmt: skip
+        training.resident = []
+        training.execute()
+    found = training.resident[len(training.resident) // 4 :]
+    reservoir = capacity * size * 4 / 2**20
+    print(f"A reservoir of {reservoir:.0f} MiB, and ten times as many rows")
+    grown = statistics.mean(found[-10:]) - statistics.mean(found[:10])
+    return claim("memory grows, MiB", grown, at_most=0.1 * reservoir)
+
+
+# What is learned ----------------------------------------------------------------------------------
+
+
+class Problem(NamedTuple):
+    """Simulations with random parameters, and a network that learns them."""
+
+    environment: str
+    network: NetworkConfig
+    simulations: int
+    samples: int
+
+    @property
+    def rows(self) -> int:
+        """Number of samples of all simulations."""
+        return self.simulations * self.samples
+
+
+def network(output: str, *layers: int) -> NetworkConfig:
+    """Return a network that predicts a field."""
+    kwargs = {"layers": list(layers), "activation": "SiLU", "opt_fields": output}
+    return NetworkConfig(
+        "torch/fc", network_kwargs=kwargs, loss="MSELoss", optimizer="Adam", lr=1e-3
+    )
+
+
+HEAT = f"{Path(__file__).parents[1] / 'examples' / 'online' / 'heat.py'}:Heat"
+PROBLEMS = {
+    "Lorenz": Problem("online_problems:Lorenz", network("output", 6, 64, 64, 3), 128, 50),
+    "heat": Problem(HEAT, network("temperature", 5, 128, 128, 128, 576), 192, 10),
+}
+VIEWS, SEEDS, SMALL_BATCH = 8, range(5), 32
+
+
+def stored(problem: Problem, folder: str, name: str, seed: int, simulations: int) -> str:
+    """Generate samples of some simulations, and return the folder of their session."""
+    config = EnvironmentConfig(problem.environment, num_clients=2, seed=seed)
+    rows = simulations * problem.samples
+    DataGeneration(
+        config, batch_nb=1, batch_size=rows, session_dir=folder, session_name=name, quiet=True
+    ).execute()
+    return f"{folder}/{name}"
+
+
+def loss(training: Training, data: Mapping[str, np.ndarray]) -> float:
+    """Train, and return the mean squared error for data that it has not seen."""
+    with training:
+        training.execute()
+        learner = training.learner
+        (field,) = learner.network.opt_fields
+        predicted = learner.predict_in_training({"input": data["input"]})[field]
+    return float(np.mean((predicted - data[field]) ** 2))
+
+
+def losses(problem: Problem, folder: str, seed: int) -> list[float]:
+    """Return the losses of stream, reservoir, and offline training after as many simulations."""
+    seen = EnvironmentConfig(problem.environment, num_clients=2, seed=seed)
+    with Dataset.open(stored(problem, folder, "validation", 10_000, 100)) as dataset:
+        data = {name: view[:] for name, view in dataset["training"].items()}
+    rows = problem.rows
+    once, often = rows // SMALL_BATCH, VIEWS * rows // SMALL_BATCH
+    options = {
+        "batch_size": SMALL_BATCH, "session_dir": folder, "seed": seed, "quiet": True,
+        "epoch_nb": 1,
+    }  # fmt: skip
+    reservoir = {"capacity": rows // 2, "watermark": rows // 5, "views": VIEWS}
+    offline = DatasetConfig(
+        existing_dir=stored(problem, folder, "offline", seed, problem.simulations)
+    )
+    trainings = (
+        Training(problem.network, None, seen, batch_nb=once, **options),
+        Training(
+            problem.network, None, seen, batch_nb=often,
+            online="physx/reservoir", online_kwargs=reservoir, **options,
+        ),
+        Training(
+            problem.network, DatasetConfig(existing_dir=offline), None,
+            **{**options, "epoch_nb": VIEWS},
+        ),
+    )  # fmt: skip
+    return [loss(training, data) for training in trainings]
+
+
+def learned() -> list[bool]:
+    """Compare what is learned from a stream, from a reservoir, and offline."""
+    met = []
+    for name, problem in PROBLEMS.items():
+        found = []
+        for seed in SEEDS:
+            with tempfile.TemporaryDirectory() as folder:
+                found.append(losses(problem, folder, seed))
+        stream, reservoir, offline = np.median(found, axis=0)
+        print(f"{name}: losses after {problem.simulations} simulations, medians of {len(SEEDS)}")
+        print(f"  stream {stream:.3g}, reservoir {reservoir:.3g}, offline shuffled {offline:.3g}")
+        ratios = np.array(found)
+        against = [float(np.median(ratios[:, 1] / ratios[:, other])) for other in (0, 2)]
+        met.append(claim("reservoir against stream", against[0], at_most=0.7))
+        met.append(claim("reservoir against offline shuffled", against[1], at_most=1.1))
+    return met
+
+
+# Which simulations --------------------------------------------------------------------------------
+
+RESONANCE = Problem("online_problems:Resonance", network("output", 2, 64, 64, 2), 1024, 1)
+MANY_VIEWS = 64
+
+
+def tail(sampler: str | None, folder: str, seed: int, data: Mapping[str, np.ndarray]) -> float:
+    """Return the 99th percentile of the error of a training whose sampler chooses simulations."""
+    config = EnvironmentConfig(RESONANCE.environment, num_clients=2, sampler=sampler, seed=seed)
+    kwargs = {
+        "capacity": RESONANCE.rows // 2,
+        "watermark": RESONANCE.rows // 10,
+        "views": MANY_VIEWS,
+    }
+    training = Training(
+        RESONANCE.network, None, config, epoch_nb=1, batch_size=SMALL_BATCH, quiet=True, seed=seed,
+        batch_nb=MANY_VIEWS * RESONANCE.rows // SMALL_BATCH, session_dir=folder,
+        online="physx/reservoir", online_kwargs=kwargs,
+    )  # fmt: skip
+    with training:
+        training.execute()
+        predicted = training.learner.predict_in_training({"input": data["input"]})["output"]
+    errors = np.sqrt(np.mean((predicted - data["output"]) ** 2, axis=1))
+    return float(np.quantile(errors, 0.99))
+
+
+def chosen() -> bool:
+    """Compare simulations that the loss chooses with random ones."""
+    found = []
+    for seed in SEEDS:
+        with tempfile.TemporaryDirectory() as folder:
+            with Dataset.open(stored(RESONANCE, folder, "validation", 10_000, 2000)) as dataset:
+                data = {name: view[:] for name, view in dataset["training"].items()}
+            pair = [tail(sampler, folder, seed, data) for sampler in (None, "physx/active")]
+        found.append((*pair, pair[1] / pair[0]))
+    uniform, active, ratio = np.median(found, axis=0)
+    print(f"Resonance, {RESONANCE.simulations} simulations: 99th percentile of the error, medians")
+    print(f"  uniform {uniform:.3g}, active {active:.3g}; ratios", end=" ")
+    print(*(f"{each:.2f}" for *_, each in found))
+    return claim("active against uniform", float(ratio), at_most=0.7)
+
+
+def main() -> None:
+    """Measure and print."""
+    torch.set_num_threads(1)
+    np.seterr(all="raise")
+    finish([*overlap(), *waits(), memory(), *learned(), chosen()])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""Environments for `benchmarks/online.py`."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from physx_core import Environment, Field, Parameter
+
+POINTS, PERIOD = 50, 0.02
+Vector = np.ndarray
+
+
+class Costly(Environment):
+    """A simulation whose step takes a given time of a processor."""
+
+    def __init__(self, *, cost: float, **kwargs: Any) -> None:
+        """Note the cost of a step, in s."""
+        super().__init__(**kwargs)
+        self._cost = cost
+
+    def create(self) -> None:
+        """Create nothing."""
+
+    def init_database(self) -> None:
+        """Define a field to read and one to predict."""
+        self.define_training_fields([Field("input", shape=(8,)), Field("output", shape=(1,))])
+
+    def step(self) -> None:
+        """Work."""
+        until = time.perf_counter() + self._cost
+        while time.perf_counter() < until:
+            pass
+        x = self.rng.normal(size=8)
+        self.set_training_data(input=x, output=x[:1] * x[1:2])
+
+
+class Large(Environment):
+    """Samples of many numbers."""
+
+    def __init__(self, *, size: int, **kwargs: Any) -> None:
+        """Note how many."""
+        super().__init__(**kwargs)
+        self._size = size
+
+    def create(self) -> None:
+        """Create nothing."""
+
+    def init_database(self) -> None:
+        """Define a field to read and one to predict."""
+        fields = [Field("input", (self._size,), "float32"), Field("output", (1,), "float32")]
+        self.define_training_fields(fields)
+
+    def step(self) -> None:
+        """Draw numbers."""
+        x = self.rng.random(self._size, np.float32)
+        self.set_training_data(input=x, output=x[:1])
+
+
+class Lorenz(Environment):
+    """Trajectories of E. N. Lorenz's system, with random coefficients and beginnings.
+
+    A sample is a state with the coefficients, and the change of the state in 20 ms.
+    """
+
+    def create(self) -> None:
+        """Define coefficients and beginnings."""
+        self.define_parameters(
+            [
+                Parameter("coefficients", [8.0, 20.0, 2.0], [12.0, 35.0, 3.0], shape=(3,)),
+                Parameter("begin", [-15.0, -20.0, 5.0], [15.0, 20.0, 40.0], shape=(3,)),
+            ]
+        )
+
+    def init_database(self) -> None:
+        """Define a field to read and one to predict."""
+        self.define_training_fields([Field("input", shape=(6,)), Field("output", shape=(3,))])
+
+    def reset_parameters(self, coefficients: Vector, begin: Vector) -> None:
+        """Begin a trajectory."""
+        self._coefficients, self._state, self._made = coefficients, begin, 0
+
+    def step(self) -> None:
+        """Make a step of the classic Runge-Kutta method; after the last one begin another."""
+        if self._made == POINTS:
+            self.new_episode()
+        state, half = self._state, PERIOD / 2
+        first = self._speed(state)
+        second = self._speed(state + half * first)
+        third = self._speed(state + half * second)
+        fourth = self._speed(state + PERIOD * third)
+        change = PERIOD / 6 * (first + 2 * second + 2 * third + fourth)
+        self._state, self._made = state + change, self._made + 1
+        self.set_training_data(input=[*state, *self._coefficients], output=change)
+
+    def _speed(self, state: Vector) -> Vector:
+        (sigma, rho, beta), (x, y, z) = self._coefficients, state
+        return np.array([sigma * (y - x), x * (rho - z) - y, x * y - beta * z])
+
+
+class Resonance(Environment):
+    """The response of a damped oscillator to a periodic force, one sample for each simulation.
+
+    Around the resonance with little damping it is large and changes quickly: a small part of the
+    range of parameters.
+    """
+
+    def create(self) -> None:
+        """Define frequency, in natural frequencies, and damping, of the critical one."""
+        self.define_parameters([Parameter("frequency", 0.2, 3.0), Parameter("damping", 0.03, 0.4)])
+        self._is_new = True
+
+    def init_database(self) -> None:
+        """Define a field to read and one to predict."""
+        self.define_training_fields([Field("input", shape=(2,)), Field("output", shape=(2,))])
+
+    def reset_parameters(self, frequency: float, damping: float) -> None:
+        """Note the parameters."""
+        self._frequency, self._damping = frequency, damping
+
+    def step(self) -> None:
+        """Compute the parts of the response in phase with the force, and a quarter behind."""
+        if not self._is_new:
+            self.new_episode()
+        self._is_new = False
+        response = 1 / (1 - self._frequency**2 + 2j * self._damping * self._frequency)
+        scaled = [(self._frequency - 1.6) / 1.4, (self._damping - 0.2) / 0.2]
+        self.set_training_data(input=scaled, output=[response.real, response.imag])

@@ -1,0 +1,61 @@
+"""Heat that spreads in a plate from a hot spot: a simulation for each set of parameters."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physx_core import Environment, Field, Parameter
+
+CELLS, FRAMES, DURATION = 24, 10, 0.02  # along an edge of 1 m; of a simulation; in s
+
+
+class Heat(Environment):
+    """The heat equation on the unit square with insulated edges, by explicit finite differences.
+
+    An episode is a simulation of `FRAMES` samples: parameters and time, scaled to -1..1, and the
+    temperature of all cells. Small and slowly spreading spots are sharp, and hard to learn.
+    """
+
+    PARAMETERS = (
+        Parameter("x", 0.2, 0.8, unit="m"),
+        Parameter("y", 0.2, 0.8, unit="m"),
+        Parameter("width", 0.03, 0.3, unit="m"),
+        Parameter("diffusivity", 0.05, 1.0, unit="m^2/s"),
+    )
+
+    def create(self):
+        """Define the parameters."""
+        self.define_parameters(self.PARAMETERS)
+        self._centers = (np.arange(CELLS) + 0.5) / CELLS
+
+    def init_database(self):
+        """Define what the network reads and predicts."""
+        self.define_training_fields(
+            [Field("input", shape=(5,)), Field("temperature", shape=(CELLS, CELLS), unit="K")]
+        )
+
+    def reset_parameters(self, x, y, width, diffusivity):
+        """Begin with a hot spot."""
+        across, along = self._centers[:, None] - x, self._centers[None, :] - y
+        self._temperature = np.exp(-(across**2 + along**2) / (2 * width**2))
+        self._frame = 0
+        low, high = (
+            [getattr(each, side)[0] for each in self.PARAMETERS] for side in ("low", "high")
+        )
+        given = np.array([x, y, width, diffusivity])
+        self._scaled = 2 * (given - low) / (high - low) - 1
+        share = diffusivity * DURATION / FRAMES * CELLS**2  # of stable steps of 0.2
+        self._steps = int(np.ceil(share / 0.2))
+        self._rate = share / self._steps
+
+    def step(self):
+        """Simulate until the next frame; after the last one, begin the next simulation."""
+        if self._frame == FRAMES:
+            self.new_episode()
+        for _ in range(self._steps):
+            near = np.pad(self._temperature, 1, mode="edge")
+            around = near[2:, 1:-1] + near[:-2, 1:-1] + near[1:-1, 2:] + near[1:-1, :-2]
+            self._temperature = self._temperature + self._rate * (around - 4 * self._temperature)
+        self._frame += 1
+        time = 2 * self._frame / FRAMES - 1
+        self.set_training_data(input=[*self._scaled, time], temperature=self._temperature)

@@ -1,0 +1,31 @@
+"""Reservoir: batches from rows of all ages."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physx_core.buffers.mixing import Mask, MixingBuffer
+from physx_core.typing import Index
+
+
+class Reservoir(MixingBuffer):
+    """Once it is full, a new row replaces a random one of those that were used before.
+
+    So every row is used at least once while rows arrive, and the rows that are kept are of all
+    ages, newer ones more than older ones. Batches are drawn from all of them alike.
+    """
+
+    def place(self, count: int, random: np.random.Generator) -> Index:
+        """Return empty slots, then random ones of used rows: see `Buffer.place`."""
+        empty = np.arange(self.held, min(self.held + count, self.capacity))
+        count -= len(empty)
+        if not count:
+            return empty
+        picked = self.pick(count, random)
+        if len(picked) < count:  # the run was made longer, and many rows arrive at once
+            picked = random.choice(self.capacity, count, replace=False)
+        return np.concatenate([empty, picked])
+
+    def is_allowed(self, slots: Index | slice) -> Mask:
+        """Return which of some slots have a used row."""
+        return self.uses[slots] > 0

@@ -1,0 +1,21 @@
+"""``physx include``: print the folder of physx.h and physx.f90, for programs in C and Fortran."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from physx_core.errors import UsageError
+from physx_core.external import INCLUDE
+
+
+def run(words: Sequence[str]) -> None:
+    """Print the folder."""
+    if words and words[0] in ("-h", "--help"):
+        print(
+            "usage: physx include\n\nPrints the folder that programs are compiled with, as in\n"
+            '  cc -I"$(physx include)" heat.c -o heat'
+        )
+        return
+    if words:
+        raise UsageError(f"physx include takes no options, not {' '.join(words)}.")
+    print(INCLUDE)

@@ -1,0 +1,157 @@
+"""Sampler: base class of what chooses the parameters of the next simulations."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from physx_core.components.parameter import Parameter, Point, random_of, values_at
+from physx_core.errors import ConfigError
+from physx_core.typing import Array, Index
+
+
+class Sampler(ABC):
+    """Chooses sets of parameters; a plugin offers its own with the hook ``physx_samplers``.
+
+    The constructor takes the entries of `EnvironmentConfig.sampler_kwargs`; `begin` follows. Sets
+    are numbered from 0: set k is for episode ``k // instance_nb`` of instance ``k % instance_nb``
+    (from 0 here). They are asked for in any order, and a set is asked for again when a run is
+    continued, so what `ask` returns may depend only on the arguments of `begin`, on the set's
+    number, and on what was told.
+
+    Attributes:
+        learns: Whether it is told the losses of the samples that its sets led to.
+        parameters: The parameters to choose.
+        seed: Seed of the run.
+        size: Number of elements of all parameters.
+    """
+
+    learns: ClassVar[bool] = False
+    parameters: Sequence[Parameter]
+    seed: Sequence[int]
+    size: int
+
+    def begin(self, parameters: Sequence[Parameter], seed: Sequence[int]) -> None:
+        """Take the parameters that the environment defines.
+
+        Args:
+            parameters: The parameters.
+            seed: Seed of the run.
+
+        Raises:
+            ConfigError: If the sampler cannot choose them.
+        """
+        self.parameters, self.seed = list(parameters), list(seed)
+        self.size = sum(parameter.size for parameter in parameters)
+
+    @abstractmethod
+    def ask(self, number: int) -> Mapping[str, Any]:
+        """Return the values of a set by the parameters' names.
+
+        Args:
+            number: Number of the set, from 0.
+        """
+
+    def values(self, point: Point) -> dict[str, Any]:
+        """Return the parameters' values at a point of the unit cube.
+
+        A point that is uniform in the cube has values of the parameters' distributions.
+
+        Args:
+            point: Shape (size,), each from 0 to 1.
+        """
+        return values_at(self.parameters, point)
+
+    def random(self, number: int) -> np.random.Generator:
+        """Return random numbers that only the seed and the number of a set determine."""
+        return random_of(self.seed, number, 1)
+
+
+class LearningSampler(Sampler):
+    """A sampler that learns from the losses of a training's rows.
+
+    What a set may depend on is counted in batches, never in time: for a row of batch n these are
+    the losses of the batches before n - `delay`. So the simulations are the same in every run. With
+    a delay of 1 or more, clients generate the rows of a batch while the network learns from those
+    before.
+
+    Attributes:
+        delay: Number of batches before a row's own whose losses its set does not depend on yet.
+        memory: Number of sets, up to the latest one of which there are losses, that are told.
+    """
+
+    learns: ClassVar[bool] = True
+    delay: int = 1
+    memory: int = 512
+
+    def ask(self, number: int) -> Mapping[str, Any]:
+        """Return the values of a set that depends on no losses."""
+        return self.ask_after(number, 0)
+
+    @abstractmethod
+    def ask_after(self, number: int, batches: int) -> Mapping[str, Any]:
+        """Return the values of a set by the parameters' names.
+
+        Args:
+            number: Number of the set, from 0.
+            batches: Number of batches, from the first one on, whose losses it may depend on: those
+                told by now, or up to `delay` fewer.
+        """
+
+    @abstractmethod
+    def state(self, batches: int) -> Array:
+        """Return what `restore` needs to continue after some batches, as numbers, shape (n,).
+
+        Args:
+            batches: Number of batches: all that were told, or all but the last one.
+        """
+
+    @abstractmethod
+    def restore(self, batches: int, state: Array) -> None:
+        """Continue from a `state` of a sampler with the same options; called after `begin`.
+
+        Args:
+            batches: Number of batches after which that was the state.
+            state: The state.
+
+        Raises:
+            ValueError: If it is not the state of such a sampler.
+        """
+
+    @abstractmethod
+    def tell(
+        self, batches: int, numbers: Index, values: Sequence[Mapping[str, Any]], losses: Array
+    ) -> None:
+        """Learn from a batch.
+
+        Args:
+            batches: Number of batches told by now, this one included.
+            numbers: Numbers of the sets of which the batch holds rows, increasing.
+            values: Their values.
+            losses: Mean loss of the batch's rows of each set.
+        """
+
+
+def checked(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that a sampler chose, after checking that they fit the parameters.
+
+    Raises:
+        ConfigError: If a value is missing, unknown, not finite, or of another shape or type.
+    """
+    names = [parameter.name for parameter in parameters]
+    if not isinstance(values, Mapping) or set(values) != set(names):
+        given = list(values) if isinstance(values, Mapping) else values
+        raise ConfigError(f"The sampler chose {given}, but the parameters are {names}.")
+    fitting: dict[str, Any] = {}
+    for parameter in parameters:
+        try:
+            array: Array = parameter.field.convert(values[parameter.name])
+        except Exception as error:
+            raise ConfigError(f"The sampler's choice does not fit: {error}") from error
+        if not np.isfinite(array).all():
+            raise ConfigError(f'The sampler chose "{parameter.name}" = {array}, not finite.')
+        fitting[parameter.name] = array if parameter.shape else array.item()
+    return fitting

@@ -1,0 +1,219 @@
+"""ExternalProgram: an environment whose samples come from a program, in whatever language."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+from physx_core.components.environment import Environment
+from physx_core.components.parameter import Parameter
+from physx_core.errors import ConfigError, SampleError, UnknownOptionError, listed, nearest
+from physx_core.external.messages import Kind, Message
+from physx_core.external.process import ProgramProcess
+from physx_core.fields import Field
+
+_OPTIONS = {field.name: field for field in dataclasses.fields(Parameter) if field.name != "name"}
+
+
+class ExternalProgram(Environment):
+    """Starts a program, and takes one sample from it in each step.
+
+    The program is compiled with ``physx.h`` or ``physx.f90`` in the folder that ``physx include``
+    prints. It declares the fields itself. When it ends in order and further samples are needed, it
+    is started again, which begins a new episode; so does its request for parameters after a sample.
+    """
+
+    runs_programs: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        *,
+        program: str | Sequence[str],
+        parameters: Mapping[str, Any] | None = None,
+        ranges: Mapping[str, Sequence[Any] | Mapping[str, Any]] | None = None,
+        additional: Sequence[str] = (),
+        units: Mapping[str, str] | None = None,
+        timeout: float = 50.0,
+        **kwargs: Any,
+    ) -> None:
+        """Keep what to start.
+
+        Args:
+            program: The program and its arguments. Paths are relative to the working directory.
+            parameters: Numbers and arrays that the program may ask for by name, beside
+                ``seed`` (from 0 to 2**31 - 1, another one for each episode), ``instance_id``,
+                ``instance_nb`` and ``episode``.
+            ranges: Parameters that are chosen for each episode by the run's sampler, or drawn: name
+                to ``[low, high]``, or to a table of the arguments of `Parameter`.
+            additional: Names of fields that are stored, but not for networks to read.
+            units: Units of fields by name.
+            timeout: How long the program may keep the environment waiting, in s. If it is shorter
+                than that of `EnvironmentConfig`, an error says what the program did.
+            kwargs: See `Environment`.
+
+        Raises:
+            ConfigError: If an argument is malformed.
+        """
+        super().__init__(**kwargs)
+        command = [program] if isinstance(program, str) else program
+        if not (isinstance(command, Sequence) and command and all(map(_is_word, command))):
+            raise ConfigError(
+                f'program must be a list of texts such as ["./heat", "0.1"], not {program!r}.'
+            )
+        if not (isinstance(timeout, (int, float)) and timeout > 0):
+            raise ConfigError(f"timeout must be a number of seconds above 0, not {timeout!r}.")
+        self._command, self._timeout = list(command), timeout
+        self._fixed, self._additional_names = dict(parameters or {}), list(additional)
+        self._ranges = [_as_parameter(name, given) for name, given in (ranges or {}).items()]
+        self._units = dict(units or {})
+        self._chosen: dict[str, Any] = {}
+        names = [*self._own_parameters(), *self._fixed, *(each.name for each in self._ranges)]
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise ConfigError(
+                f"The parameters {listed(twice)} are given more than once: in parameters, in "
+                f"ranges, or by physx, which gives {listed(self._own_parameters())}."
+            )
+        self._process: ProgramProcess | None = None
+        self._declared: Sequence[Field] = ()
+        self._seed: int | None = None
+        self._is_new = True  # whether the episode has no sample yet
+
+    def create(self) -> None:
+        """Start the program."""
+        self.define_parameters(self._ranges)
+        self._process, self._declared = self._start()
+
+    def init_database(self) -> None:
+        """Define the fields that the program declared."""
+        fields = {field.name: field for field in self._declared}
+        for name in (*self._additional_names, *self._units):
+            if name not in fields:
+                raise ConfigError(
+                    f'The program declares no field "{name}".{nearest(name, fields)} '
+                    f"It declares: {listed(fields)}."
+                )
+        for name, unit in self._units.items():
+            fields[name] = dataclasses.replace(fields[name], unit=unit)
+        additional = [fields.pop(name) for name in dict.fromkeys(self._additional_names)]
+        self.define_training_fields(fields.values())
+        self.define_additional_fields(additional)
+
+    def reset_parameters(self, **values: Any) -> None:
+        """Keep the values for when the program asks for them."""
+        self._chosen = values
+
+    def step(self) -> None:
+        """Take the program's next sample, and answer what it asks before it."""
+        while True:
+            assert self._process is not None
+            message = self._process.receive()
+            if message.kind is Kind.SAMPLE:
+                self._process.samples += 1
+                self._is_new = False
+                given, names = message.given, self._additional_names
+                additional = {name: given.pop(name) for name in names if name in given}
+                self.set_training_data(**given)
+                self.set_additional_data(**additional)
+                return
+            if message.kind is Kind.PARAMETERS:
+                self._answer_parameters(self._process, message)
+            elif message.kind is Kind.PREDICT:
+                self._answer_prediction(self._process, message)
+            elif message.kind is Kind.CLOSE:
+                self._restart(self._process)
+            else:
+                raise self._process.error("called physx_open() twice.")
+
+    def close(self) -> None:
+        """End the program."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.close()
+
+    def _start(self) -> tuple[ProgramProcess, Sequence[Field]]:
+        """Start the program; return it and the fields that it declares."""
+        variables = {"PHYSX_INSTANCE": str(self.instance_id)}
+        process = ProgramProcess(self._command, variables, self._timeout)
+        try:
+            message = process.receive()
+            if message.kind is not Kind.FIELDS or not message.wanted:
+                raise process.error("declared no fields in physx_open().")
+        except BaseException:
+            process.close()
+            raise
+        return process, message.wanted
+
+    def _restart(self, process: ProgramProcess) -> None:
+        """Start the program again, after it has ended in order."""
+        if not process.samples:
+            raise process.error("called physx_close() without having sent a sample.")
+        process.end()
+        self._begin_episode()
+        self._process, declared = self._start()
+        if declared != self._declared:
+            raise self._process.error(
+                f"declared other fields when it was started again: {declared}, not "
+                f"{self._declared}."
+            )
+
+    def _begin_episode(self) -> None:
+        self.new_episode()
+        self._is_new, self._seed = True, None
+
+    def _own_parameters(self) -> dict[str, Any]:
+        """Return the parameters of every program but the seed, which has yet to be drawn."""
+        return {
+            "seed": 0,
+            "instance_id": self.instance_id,
+            "instance_nb": self.instance_nb,
+            "episode": self.episode_index,
+        }
+
+    def _answer_parameters(self, process: ProgramProcess, message: Message) -> None:
+        if not self._is_new:
+            self._begin_episode()
+        if self._seed is None:
+            self._seed = int(self.rng.integers(2**31))
+        own = {**self._own_parameters(), "seed": self._seed}
+        values = {**self._fixed, **self._chosen, **own}
+        process.answer([_convert(process, "parameter", values, field) for field in message.wanted])
+
+    def _answer_prediction(self, process: ProgramProcess, message: Message) -> None:
+        if not message.given:
+            raise process.error("called physx_predict() without inputs.")
+        values = dict(self.get_prediction(**message.given))
+        process.answer([_convert(process, "prediction", values, field) for field in message.wanted])
+
+
+def _is_word(value: Any) -> bool:
+    return isinstance(value, str) and bool(value) and "\0" not in value
+
+
+def _as_parameter(name: str, given: Any) -> Parameter:
+    if isinstance(given, Mapping):
+        if unknown := given.keys() - _OPTIONS.keys():
+            raise UnknownOptionError(f'The range of the parameter "{name}"', unknown, _OPTIONS)
+        return Parameter(name, **given)
+    if isinstance(given, Sequence) and not isinstance(given, str) and len(given) == 2:
+        return Parameter(name, *given)
+    raise ConfigError(
+        f"ranges must have [low, high] or a table such as {{low=0.1, high=10.0, distribution="
+        f'"log_uniform"}} for the parameter "{name}", not {given!r}.'
+    )
+
+
+def _convert(process: ProgramProcess, what: str, values: Mapping[str, Any], field: Field) -> Any:
+    """Return one of the values as the program asks for it."""
+    name = field.name
+    if name not in values:
+        raise process.error(
+            f'asked for the {what} "{name}", which does not exist.{nearest(name, values)} '
+            f"There are: {listed(values)}."
+        )
+    try:
+        return field.convert(values[name])
+    except SampleError as error:
+        raise process.error(
+            f'asked for the {what} "{name}" as {field.numpy_dtype} of shape {field.shape}: {error}'
+        ) from None

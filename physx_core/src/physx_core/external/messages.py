@@ -1,0 +1,167 @@
+"""Messages between an environment and its program: a header, descriptions of arrays, their data.
+
+The other side of it is ``include/physx.h``, which describes every array that it sends, and every
+one that it wants to receive; an answer is the data of the latter alone. So a program parses nothing
+but headers.
+"""
+
+from __future__ import annotations
+
+import enum
+import functools
+import math
+import struct
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from physx_core.fields import RESERVED, Field
+from physx_core.typing import Array, Sample
+
+HEADER = struct.Struct("<4sHHQ")
+"""Magic, kind, how many arrays are described, bytes of data after the descriptions."""
+DESCRIPTION = struct.Struct("<52sIiI8q")
+"""Name, type, rank (-1: the shape is open), whether it is wanted rather than sent, shape."""
+
+_MAGIC, _VERSION = b"phy", 1
+_MOST_ARRAYS = 64
+_MOST_AXES = 8
+_OPEN = -1
+_LARGEST = 1 << 30  # bytes of a message, as between client and server
+_TYPES = {
+    ord(name[0]) * 256 + int(name[1:]): np.dtype(f"<{name}")
+    for name in ["b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8", "c8", "c16"]
+}
+"""Number of a type to the type; "b1" stands for a boolean."""
+
+
+class Kind(enum.IntEnum):
+    """Kind of a message."""
+
+    FIELDS = 1
+    """Program, once at its start: the fields of a sample."""
+    PARAMETERS = 2
+    """Program: request for parameters."""
+    SAMPLE = 3
+    """Program: a sample."""
+    PREDICT = 4
+    """Program: request for a prediction."""
+    CLOSE = 5
+    """Program: there are no more samples."""
+    ANSWER = 6
+    """Environment: the data of what was wanted."""
+
+
+class MalformedMessageError(Exception):
+    """What a program sent breaks the protocol; the text completes ``The program ...``."""
+
+
+class Header(NamedTuple):
+    """What a message consists of.
+
+    Attributes:
+        kind: Its kind.
+        arrays: How many arrays it describes.
+        size: Bytes of the data after the descriptions.
+    """
+
+    kind: Kind
+    arrays: int
+    size: int
+
+
+class Message(NamedTuple):
+    """A message of a program.
+
+    Attributes:
+        kind: Its kind.
+        given: The arrays that it holds, by name.
+        wanted: The arrays that it asks for.
+    """
+
+    kind: Kind
+    given: Sample
+    wanted: tuple[Field, ...]
+
+
+def parse_header(data: bytes | bytearray) -> Header:
+    """Return the parts of a header after checking them.
+
+    Raises:
+        MalformedMessageError: If it is none of a message that a program may send.
+    """
+    magic, kind, count, size = HEADER.unpack(data)
+    if magic[:3] != _MAGIC:
+        raise MalformedMessageError(f"sent {magic.hex(' ')}... where a message should begin.")
+    if magic[3] != _VERSION:
+        raise MalformedMessageError(
+            f"was compiled with a physx.h of protocol {magic[3]}, but this one speaks {_VERSION}: "
+            "compile it with the header in the folder that  physx include  prints."
+        )
+    if not Kind.FIELDS <= kind <= Kind.CLOSE or count > _MOST_ARRAYS or size > _LARGEST:
+        raise MalformedMessageError(
+            f"sent a message of kind {kind} with {count} arrays of {size} bytes, which is none "
+            f"that physx.h sends, or is longer than {_LARGEST} bytes."
+        )
+    return Header(Kind(kind), count, size)
+
+
+@functools.lru_cache(maxsize=16)  # all samples of a program have the same
+def parse_descriptions(header: Header, data: bytes) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
+    """Return the arrays whose data follow, and those that are wanted.
+
+    Raises:
+        MalformedMessageError: If a description is malformed, or the data that follow have another
+            size than the header says.
+    """
+    given: list[Field] = []
+    wanted: list[Field] = []
+    for parts in DESCRIPTION.iter_unpack(data):
+        may_be_open = header.kind is Kind.FIELDS
+        (wanted if parts[3] else given).append(_parse_description(parts, may_be_open))
+    for group in (given, wanted):
+        names = [field.name for field in group]
+        if len(set(names)) < len(names):
+            raise MalformedMessageError(f"named two arrays alike in one message: {sorted(names)}.")
+    size = sum(field.nbytes for field in given)
+    if size != header.size or sum(field.nbytes for field in wanted) > _LARGEST:
+        raise MalformedMessageError(
+            f"described arrays of {size} bytes, but announced {header.size}, or wants more than "
+            f"{_LARGEST}."
+        )
+    return tuple(given), tuple(wanted)
+
+
+def _parse_description(parts: tuple[Any, ...], may_be_open: bool) -> Field:
+    raw, number, rank, _, *shape = parts
+    name = raw.partition(b"\0")[0].decode("ascii", errors="replace")
+    if not name.isidentifier() or name in RESERVED:
+        raise MalformedMessageError(
+            f"named an array {name!r}, which is no identifier, or a name that physx uses itself."
+        )
+    if number not in _TYPES:
+        raise MalformedMessageError(f'gave the array "{name}" the unknown type {number}.')
+    if not (0 <= rank <= _MOST_AXES or (rank == _OPEN and may_be_open)):
+        raise MalformedMessageError(f'gave the array "{name}" the rank {rank}.')
+    axes = None if rank == _OPEN else tuple(shape[:rank])
+    dtype = _TYPES[number]
+    if axes and not (min(axes) >= 0 and math.prod(axes) * dtype.itemsize <= _LARGEST):
+        raise MalformedMessageError(f'gave the array "{name}" the shape {axes}.')
+    return Field(name, axes, dtype)
+
+
+def check_values(field: Field, values: Array) -> None:
+    """Check what no other rule does: that the bytes of booleans are zeros and ones.
+
+    Raises:
+        MalformedMessageError: If they are not.
+    """
+    if values.dtype.kind == "b" and values.tobytes().translate(None, b"\0\1"):
+        raise MalformedMessageError(f'sent "{field.name}", which is neither true nor false.')
+
+
+def pack_answer(values: list[Array]) -> list[bytes | memoryview]:
+    """Return the parts of an answer: a header, and the data of each array that was wanted."""
+    size = sum(array.nbytes for array in values)
+    header = HEADER.pack(_MAGIC + bytes([_VERSION]), Kind.ANSWER, len(values), size)
+    return [header, *(np.ascontiguousarray(array).data for array in values if array.size)]

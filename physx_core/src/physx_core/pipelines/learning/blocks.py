@@ -1,0 +1,164 @@
+"""Blocks: the rows that environments generate for a training, block by block."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from physx_core.dataset import Dataset
+from physx_core.dataset.store.manifest import has_statistics
+from physx_core.fields import Field
+from physx_core.pipelines.learning.feeder import Feeder
+from physx_core.pipelines.storage import record_rejected, store_sets
+from physx_core.rows import concatenate
+from physx_core.sources.source import Source
+from physx_core.statistics import Normalization, RunningStatistics
+from physx_core.typing import Batch
+
+_CHUNK = 4096
+
+
+@dataclass(frozen=True)
+class Block:
+    """Consecutive rows that environments generated; they are stored already.
+
+    Attributes:
+        rows: The rows, field name to array with a leading row axis, in physical units; valid until
+            the next block is taken. Empty if the block has no rows.
+        fields: The stored fields by name; empty before the first row.
+        normalization: The normalization of all rows up to the last one of this block, by field;
+            empty if nothing is to be normalized.
+    """
+
+    rows: Batch = field(default_factory=dict)
+    fields: Mapping[str, Field] = field(default_factory=dict)
+    normalization: dict[str, Normalization] = field(default_factory=dict)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the rows in memory."""
+        return sum(array.nbytes for array in self.rows.values())
+
+
+class Blocks:
+    """Takes rows from environments in the order of their numbers, and stores them.
+
+    A run that continues another one first gets the rows that this one has stored, in the same
+    blocks and with the same normalization, bit for bit.
+
+    With a feeder, blocks that are expected are generated and stored in its thread while the
+    training learns: the same calls of source and dataset in the same order, so the same blocks.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        dataset: Dataset,
+        mode: str,
+        *,
+        normalize: bool,
+        first: int,
+        feeder: Feeder[Block] | None = None,
+    ) -> None:
+        """Keep the arguments.
+
+        Args:
+            source: The environments; open.
+            dataset: Stores the rows.
+            mode: Mode to store them in.
+            normalize: Whether the blocks have a normalization.
+            first: Number of rows that the mode had before the first block.
+            feeder: Has a thread for it, not started yet; None: the rows are generated when they
+                are taken.
+        """
+        self._source, self._dataset, self._mode = source, dataset, mode
+        self._normalizes = normalize
+        self._stored = dataset.num_samples(mode) if mode in dataset.modes else 0
+        self._next_row = first
+        self._statistics: dict[str, RunningStatistics] = {}
+        for start in range(0, first if normalize else 0, _CHUNK):
+            self._add(self._read(start, min(start + _CHUNK, first)))
+        self._earlier: dict[int, int] = {}
+        if self._stored > first:
+            ends = self._read(max(first, self._stored - source.instance_nb), self._stored)
+            self._earlier = dict(zip(ends["env_id"].tolist(), ends["step"].tolist(), strict=True))
+        self._last = Block()
+        self._feeder = feeder
+        if feeder is not None:
+            feeder.start(lambda count: self._make(count, copies=True), source.cancel)
+
+    @property
+    def waited(self) -> float | None:
+        """Time in s for which the environments waited; None: whenever the network learns."""
+        return None if self._feeder is None else self._feeder.waited
+
+    def expect(self, counts: Iterable[int]) -> None:
+        """Announce the sizes of the blocks that will be taken after those announced before."""
+        if self._feeder is not None:
+            self._feeder.expect(counts)
+
+    def next(self, count: int) -> Block:
+        """Return the next rows, generated and stored.
+
+        Args:
+            count: Number of rows; with 0 no environment is asked for any.
+
+        Raises:
+            PhysxError: If an environment fails, or a row cannot be stored.
+        """
+        return self._make(count) if self._feeder is None else self._feeder.next(count)
+
+    def skip(self, counts: Iterable[int]) -> None:
+        """Pass over the first blocks, which a checkpoint is ahead of; nothing is expected yet.
+
+        Args:
+            counts: Their numbers of rows.
+        """
+        for count in counts:
+            if self._normalizes or self._next_row + count > self._stored:
+                self._make(count)
+            else:
+                self._next_row += count
+        self._last = Block({}, self._dataset.fields(self._mode), self._last.normalization)
+
+    def close(self) -> None:
+        """Generate nothing more; rows that were generated ahead are stored."""
+        if self._feeder is not None:
+            self._feeder.close()
+
+    def _make(self, count: int, *, copies: bool = False) -> Block:
+        if not count:
+            self._last = Block({}, self._last.fields, self._last.normalization)
+            return self._last
+        start, self._next_row = self._next_row, self._next_row + count
+        stored = min(count, max(0, self._stored - start))
+        rows = self._read(start, start + stored) if stored else {}
+        if stored < count:
+            made = self._generate(count - stored, is_whole=not stored)
+            if rows:
+                rows = concatenate([rows, made])
+            else:
+                rows = {name: array.copy() for name, array in made.items()} if copies else made
+        if self._normalizes:
+            self._add(rows)
+        found = {name: one.normalization() for name, one in self._statistics.items()}
+        self._last = Block(rows, self._dataset.fields(self._mode), found)
+        return self._last
+
+    def _generate(self, count: int, *, is_whole: bool) -> Batch:
+        earlier, self._earlier = self._earlier if is_whole else {}, {}
+        with record_rejected(self._source, self._dataset, earlier):
+            rows = self._source.batch(count)
+            store_sets(self._source, self._dataset)
+            self._dataset.define_fields(self._mode, self._source.fields)
+            self._dataset.append(self._mode, rows, checked=True)
+        return rows
+
+    def _read(self, start: int, stop: int) -> Batch:
+        view = self._dataset[self._mode]
+        return {name: view[name][start:stop] for name in self._dataset.fields(self._mode)}
+
+    def _add(self, rows: Batch) -> None:
+        for name, of in self._dataset.fields(self._mode).items():
+            if has_statistics(of):
+                self._statistics.setdefault(name, RunningStatistics()).update(rows[name])

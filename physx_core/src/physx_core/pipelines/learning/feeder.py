@@ -1,0 +1,213 @@
+"""Feeder: a thread that makes what a training needs next, while the training learns."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any, Generic, ParamSpec, Protocol, TypeVar
+
+_MOST_ITEMS = 64
+_MOST_BYTES = 64 << 20
+
+
+class Item(Protocol):
+    """What a feeder makes."""
+
+    @property
+    def nbytes(self) -> int:
+        """Size in memory."""
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+T = TypeVar("T", bound=Item)
+
+
+class _Closing(BaseException):
+    """The feeder is being closed: unwinds what its thread does."""
+
+
+class _Call:
+    """A call that the training's thread makes for the feeder's."""
+
+    def __init__(self, function: Callable[[], Any], *, is_awaited: bool) -> None:
+        self.is_awaited, self.is_done = is_awaited, False
+        self._function = function
+        self._result: Any = None
+        self._error: Exception | None = None
+
+    def make(self) -> None:
+        """Call the function; its errors are those of `result`."""
+        try:
+            self._result = self._function()
+        except Exception as error:
+            self._error = error
+        self.is_done = True
+
+    def result(self) -> Any:
+        """Return what the function returned, or raise what it raised."""
+        if self._error is not None:
+            raise self._error
+        return self._result
+
+
+class Feeder(Generic[T]):
+    """Makes items in a thread of its own, in order, ahead of the training that takes them.
+
+    What may be called only in the training's thread, such as a network or an observer, is wrapped
+    with `calling` or `telling`: the feeder's thread then has it called there, when the training
+    waits for the next item. Items and these calls keep their order: when a call is made, all items
+    made before it were taken, and the training is done with them.
+
+    Attributes:
+        waited: Time in s for which nothing was made because there was no room for it.
+    """
+
+    def __init__(self) -> None:
+        """Prepare; `start` starts the thread."""
+        self._changed = threading.Condition()
+        self._queue: deque[T | _Call | BaseException] = deque()
+        self._counts: deque[int] = deque()
+        self._taken = self._expected = 0
+        self._items = self._nbytes = 0  # that wait to be taken
+        self.waited = 0.0
+        self._closes = False
+        self._thread: threading.Thread | None = None
+
+    def calling(self, function: Callable[P, R]) -> Callable[P, R]:
+        """Return a function that has another one called in the training's thread.
+
+        In the feeder's thread it waits for the result; in any other it is the function itself.
+        """
+
+        def call(*arguments: P.args, **options: P.kwargs) -> R:
+            if threading.current_thread() is not self._thread:
+                return function(*arguments, **options)
+            request = _Call(partial(function, *arguments, **options), is_awaited=True)
+            with self._changed:
+                self._put(request)
+                self._wait_until(lambda: request.is_done)
+            result: R = request.result()
+            return result
+
+        return call
+
+    def telling(self, function: Callable[P, None]) -> Callable[P, None]:
+        """Return a function as `calling` does that does not wait, for one that never raises."""
+
+        def tell(*arguments: P.args, **options: P.kwargs) -> None:
+            if threading.current_thread() is not self._thread:
+                function(*arguments, **options)
+                return
+            with self._changed:
+                self._put(_Call(partial(function, *arguments, **options), is_awaited=False))
+
+        return tell
+
+    def start(self, make: Callable[[int], T], cancel: Callable[[], None]) -> None:
+        """Start the thread.
+
+        Args:
+            make: Makes the next item of a count.
+            cancel: Called by `close`; has a call of `make` that is in progress end soon.
+        """
+        self._make, self._cancel = make, cancel
+        self._thread = threading.Thread(target=self._run, name="physx-feeder", daemon=True)
+        self._thread.start()
+
+    def expect(self, counts: Iterable[int]) -> None:
+        """Have further items made, of these counts, as far as there is room for them.
+
+        They wait in memory, up to 64 items and 64 MiB, one at least.
+        """
+        with self._changed:
+            before = len(self._counts)
+            self._counts.extend(counts)
+            self._expected += len(self._counts) - before
+            self._changed.notify_all()
+
+    def next(self, count: int) -> T:
+        """Return the next item, and make the calls that come before it.
+
+        Args:
+            count: Its count, if it was not expected yet.
+
+        Raises:
+            BaseException: What its making raised.
+        """
+        if self._taken == self._expected:
+            self.expect((count,))
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._queue)
+                first = self._queue[0]
+                if isinstance(first, BaseException):  # it stays: nothing follows
+                    raise first
+                self._queue.popleft()
+                if not isinstance(first, _Call):
+                    self._taken += 1
+                    self._items -= 1
+                    self._nbytes -= first.nbytes
+                    self._changed.notify_all()
+                    return first
+            first.make()
+            with self._changed:
+                self._changed.notify_all()
+
+    def close(self) -> None:
+        """End the thread, and make the calls that wait for no result; calling it again is allowed.
+
+        Items that were not taken are lost.
+        """
+        with self._changed:
+            self._closes = True
+            self._changed.notify_all()
+        if self._thread is None:
+            return
+        self._cancel()
+        try:
+            self._thread.join()
+        except BaseException:  # a second Ctrl-C
+            self._thread.join()
+            raise
+        self._thread = None
+        queue, self._queue = self._queue, deque()
+        for entry in queue:
+            if isinstance(entry, _Call) and not entry.is_awaited:
+                entry.make()
+
+    # In the feeder's thread ---------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            while True:
+                with self._changed:
+                    self._wait_until(lambda: self._counts)
+                    began = time.monotonic()
+                    self._wait_until(self._has_room)
+                    self.waited += time.monotonic() - began
+                    count = self._counts.popleft()
+                item = self._make(count)
+                with self._changed:
+                    self._items += 1
+                    self._nbytes += item.nbytes
+                    self._put(item)
+        except BaseException as error:
+            with self._changed:
+                self._queue.append(error)
+                self._changed.notify_all()
+
+    def _has_room(self) -> bool:
+        return not self._items or (self._items < _MOST_ITEMS and self._nbytes < _MOST_BYTES)
+
+    def _put(self, entry: T | _Call) -> None:
+        self._queue.append(entry)
+        self._changed.notify_all()
+
+    def _wait_until(self, is_met: Callable[[], object]) -> None:
+        self._changed.wait_for(lambda: self._closes or is_met())
+        if self._closes:
+            raise _Closing

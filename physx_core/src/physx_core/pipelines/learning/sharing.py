@@ -1,0 +1,88 @@
+"""SharedBatches: batches that one process draws and several learn from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from physx_core.components.group import Group
+from physx_core.dataset import Dataset
+from physx_core.fields import Field
+from physx_core.pipelines.learning.blocks import Block
+from physx_core.pipelines.learning.online import OnlineBatches
+from physx_core.statistics import Normalization
+from physx_core.typing import Batch
+
+
+class SharedBatches:
+    """Gives each process of a group its share of the batches that the leading one draws.
+
+    Attributes:
+        block: Fields and normalization after the last block; it has no rows.
+        number: Number of batches so far.
+        weight: Weight of this process's share in the mean over the last batch.
+    """
+
+    def __init__(self, group: Group, online: OnlineBatches | None, fields: Iterable[Field]) -> None:
+        """Tell all processes the fields.
+
+        Args:
+            group: The processes.
+            online: Draws the batches; None but in the leading process.
+            fields: The environments' fields; empty but in the leading process.
+        """
+        self.number, self.weight = 0, 1.0
+        self._group, self._online = group, online
+        told = group.tell([field.to_dict() for field in fields])
+        self.block = _to_block({"fields": told, "normalization": {}})
+        self._last: Block | None = None
+
+    def next(self, names: Sequence[str]) -> Batch:
+        """Return this process's share of the next batch.
+
+        Args:
+            names: Fields that a batch contains.
+
+        Raises:
+            PhysxError: In the leading process, if an environment fails, or rows cannot be stored.
+        """
+        batch: Batch = {}
+        changed = None
+        if self._online is not None:
+            batch = self._online.next(names)
+            batch = {name: batch[name] for name in names if name in batch}
+            block = self._online.block
+            if self._last is None or block.rows:
+                changed = _to_plain(block)
+            self._last = block
+        changed = self._group.tell(changed)
+        if changed is not None:
+            self.block = _to_block(changed)
+        share, self.weight = self._group.deal(batch)
+        self.number += 1
+        return share
+
+    def finish(self, dataset: Dataset) -> None:
+        """Have all processes see the rows that were stored, to read them from now on."""
+        if self._online is not None:
+            dataset.flush()
+        self._group.tell(None)
+        if self._online is None:
+            dataset.refresh()
+
+
+def _to_plain(block: Block) -> dict[str, Any]:
+    return {
+        "fields": [field.to_dict() for field in block.fields.values()],
+        "normalization": {name: one.to_dict() for name, one in block.normalization.items()},
+    }
+
+
+def _to_block(plain: dict[str, Any]) -> Block:
+    fields = [Field.from_dict(one) for one in plain["fields"]]
+    normalization = plain["normalization"].items()
+    return Block(
+        {},
+        {field.name: field for field in fields},
+        {name: Normalization.from_dict(one) for name, one in normalization},
+    )

@@ -1,0 +1,1 @@
+"""The core's own samplers of parameters."""

@@ -1,0 +1,136 @@
+"""Generator: has a generator of the gest-api standard choose the sets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from physx_core.components.parameter import Parameter
+from physx_core.components.sampler import LearningSampler
+from physx_core.errors import ConfigError, MissingLibraryError
+from physx_core.plugins import import_component
+from physx_core.typing import Array, Index
+
+_LOSS = "loss"
+
+
+class Generator(LearningSampler):
+    """Has a generator of the gest-api standard choose the sets, as those of libEnsemble and Xopt.
+
+    The generator gets the parameters' bounds as variables, one for each element (``name_0``,
+    ``name_1`` ... if a parameter has a shape), and the objective ``loss``. After each batch it
+    ingests the batch's sets with their mean losses and suggests `points` new ones, of which set k
+    takes the one with number k modulo `points`. Runs are the same if the generator suggests the
+    same after the same losses: give it a seed. They cannot be resumed while environments generate.
+    """
+
+    def __init__(
+        self,
+        generator: str | Callable[..., Any],
+        generator_kwargs: Mapping[str, Any] | None = None,
+        objective: str = "MAXIMIZE",
+        points: int = 32,
+        memory: int = 512,
+        delay: int = 1,
+    ) -> None:
+        """Keep the options.
+
+        Args:
+            generator: The generator's class, or ``"package.module:Class"``.
+            generator_kwargs: Arguments of its constructor beside the variables and objectives.
+            objective: What it is to do with the loss: ``"MAXIMIZE"`` or ``"EXPLORE"``.
+            points: Number of points that it suggests after each batch: as many as sets are asked
+                for meanwhile, at least.
+            memory: Number of sets, up to the latest one, whose losses it ingests.
+            delay: See `LearningSampler`.
+
+        Raises:
+            ConfigError: If an option is out of range.
+        """
+        for name, number, least in (
+            ("points", points, 1),
+            ("memory", memory, 1),
+            ("delay", delay, 0),
+        ):
+            if type(number) is not int or number < least:
+                raise ConfigError(f'"physx/generator": {name} is {number!r}, not at least {least}.')
+        self._make, self._arguments = generator, dict(generator_kwargs or {})
+        self._objective, self._points = objective, points
+        self.memory, self.delay = memory, delay
+
+    def begin(self, parameters: Sequence[Parameter], seed: Sequence[int]) -> None:
+        """Create the generator: see `Sampler.begin`."""
+        super().begin(parameters, seed)
+        try:
+            from gest_api.vocs import VOCS
+        except ImportError as error:
+            raise MissingLibraryError('"physx/generator"', "gest-api", "samplers") from error
+        domains: dict[str, list[float]] = {}
+        for parameter in parameters:
+            if not parameter.is_bounded:
+                raise ConfigError(
+                    f'"physx/generator" needs bounds: the parameter "{parameter.name}" has none.'
+                )
+            bounds = zip(parameter.columns, parameter.low, parameter.high, strict=True)
+            domains |= {name: [low, high] for name, low, high in bounds}
+        make = self._make
+        if isinstance(make, str):
+            make = import_component("generator", make)
+        self._generator = make(
+            VOCS(variables=domains, objectives={_LOSS: self._objective}), **self._arguments
+        )
+        self._ids: dict[int, Any] = {}
+        self._suggested = {0: self._suggest()}
+
+    def ask_after(self, number: int, batches: int) -> dict[str, Any]:
+        """Return the values of a set: see `LearningSampler.ask_after`."""
+        point = self._suggested[batches][number % self._points]
+        if "_id" in point:
+            self._ids[number] = point["_id"]
+        values = {}
+        for parameter in self.parameters:
+            flat = np.array([point[name] for name in parameter.columns])
+            is_whole = parameter.distribution == "integer"
+            flat = np.rint(flat).astype(np.int64) if is_whole else flat.astype(np.float64)
+            values[parameter.name] = flat.reshape(parameter.shape)
+        return values
+
+    def tell(
+        self, batches: int, numbers: Index, values: Sequence[Mapping[str, Any]], losses: Array
+    ) -> None:
+        """Have the generator learn from a batch: see `LearningSampler.tell`."""
+        results = []
+        for number, given, loss in zip(numbers.tolist(), values, losses.tolist(), strict=True):
+            result: dict[str, Any] = {_LOSS: loss}
+            for parameter in self.parameters:
+                flat = np.ravel(given[parameter.name]).tolist()
+                result |= zip(parameter.columns, flat, strict=True)
+            if number in self._ids:
+                result["_id"] = self._ids[number]
+            results.append(result)
+        if results:
+            for number in [known for known in self._ids if known <= numbers[-1] - self.memory]:
+                del self._ids[number]
+            self._generator.ingest(results)
+        self._suggested[batches] = self._suggest()
+        for former in [known for known in self._suggested if known < batches - self.delay - 1]:
+            del self._suggested[former]
+
+    def state(self, batches: int) -> Array:
+        """Return nothing: a generator's state is its own."""
+        return np.zeros(0)
+
+    def restore(self, batches: int, state: Array) -> None:
+        """Refuse to continue: see `LearningSampler.restore`."""
+        raise ValueError('"physx/generator" cannot be continued')
+
+    def _suggest(self) -> list[dict[str, Any]]:
+        points: list[dict[str, Any]] = self._generator.suggest(self._points)
+        if len(points) != self._points:
+            raise ConfigError(
+                f"{type(self._generator).__name__}.suggest({self._points}) returned {len(points)} "
+                'points: choose a number of "points" that it can suggest.'
+            )
+        return points

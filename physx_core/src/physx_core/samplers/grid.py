@@ -1,0 +1,73 @@
+"""Grid: all combinations of evenly spaced values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from physx_core.components.parameter import Parameter
+from physx_core.components.sampler import Sampler
+from physx_core.errors import ConfigError, nearest
+from physx_core.typing import Array
+
+
+class Grid(Sampler):
+    """All combinations of evenly spaced values, the last parameter varying fastest, over and over.
+
+    Values are spaced evenly in the parameter's distribution: by their logarithms if it is
+    ``log_uniform``. They include the bounds; a distribution without bounds is cut into parts of
+    equal probability, whose medians they are.
+
+    Attributes:
+        count: Number of sets until the grid starts over.
+    """
+
+    def __init__(self, points: int | Mapping[str, int] = 10) -> None:
+        """Keep the numbers.
+
+        Args:
+            points: Number of values of each element of each parameter, or by parameter's name.
+        """
+        self._points = points
+        self.count = 0
+
+    def begin(self, parameters: Sequence[Parameter], seed: Sequence[int]) -> None:
+        """Take the parameters: see `Sampler.begin`."""
+        super().begin(parameters, seed)
+        points, names = self._points, [parameter.name for parameter in parameters]
+        if isinstance(points, Mapping):
+            for name in (*points, *names):
+                if name not in names or name not in points:
+                    known = nearest(name, names) if name not in names else ""
+                    raise ConfigError(
+                        f'"physx/grid": points must name exactly the parameters {names}, and '
+                        f'"{name}" is {"missing" if name in names else "none of them"}.{known}'
+                    )
+        self._levels: list[Array] = []
+        for parameter in parameters:
+            number = points[parameter.name] if isinstance(points, Mapping) else points
+            if type(number) is not int or number < 1:
+                raise ConfigError(
+                    f'"physx/grid": the number of points of "{parameter.name}" is {number!r}; it '
+                    "must be a whole number, at least 1."
+                )
+            self._levels += [_levels(parameter, number)] * parameter.size
+        self.count = int(np.prod([len(levels) for levels in self._levels], dtype=object))
+
+    def ask(self, number: int) -> dict[str, Any]:
+        """Return the values of a set."""
+        point, rest = np.empty(self.size), number % self.count
+        for element in reversed(range(self.size)):
+            levels = self._levels[element]
+            rest, place = divmod(rest, len(levels))
+            point[element] = levels[place]
+        return self.values(point)
+
+
+def _levels(parameter: Parameter, number: int) -> Array:
+    """Return evenly spaced shares of a distribution."""
+    if parameter.is_bounded and number > 1:
+        return np.linspace(0.0, 1.0, number)
+    return (np.arange(number) + 0.5) / number

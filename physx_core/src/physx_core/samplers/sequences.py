@@ -1,0 +1,104 @@
+"""Sobol and LatinHypercube: sets that fill the space of parameters evenly."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from physx_core.components.parameter import Parameter
+from physx_core.components.sampler import Sampler
+from physx_core.errors import ConfigError, MissingLibraryError
+from physx_core.typing import Array
+
+_BLOCK = 1024
+_LONGEST = 2**30  # of a Sobol sequence
+_KEPT = 4
+
+
+class _Blocks(Sampler):
+    """Sets that are computed a block at a time; the last few blocks are kept."""
+
+    block: int
+
+    def begin(self, parameters: Sequence[Parameter], seed: Sequence[int]) -> None:
+        """Take the parameters: see `Sampler.begin`."""
+        super().begin(parameters, seed)
+        self._blocks: dict[int, Array] = {}
+
+    def ask(self, number: int) -> dict[str, Any]:
+        """Return the values of a set."""
+        index, place = divmod(number, self.block)
+        if index not in self._blocks:
+            while len(self._blocks) >= _KEPT:
+                del self._blocks[min(self._blocks)]
+            self._blocks[index] = self._points(index)
+        return self.values(self._blocks[index][place])
+
+    @abstractmethod
+    def _points(self, index: int) -> Array:
+        """Return the points of a block, shape (block, size)."""
+
+
+class Sobol(_Blocks):
+    """A scrambled Sobol sequence: any number of sets fills the space more evenly than random ones.
+
+    Uses `scipy.stats.qmc.Sobol`. Powers of two of sets are most even.
+    """
+
+    block = _BLOCK
+
+    def begin(self, parameters: Sequence[Parameter], seed: Sequence[int]) -> None:
+        """Take the parameters: see `Sampler.begin`."""
+        super().begin(parameters, seed)
+        most = _qmc().Sobol.MAXDIM
+        if self.size > most:
+            raise ConfigError(
+                f'"physx/sobol" chooses {most} numbers at most, and the environment\'s parameters '
+                f'have {self.size} elements: use "physx/uniform".'
+            )
+
+    def _points(self, index: int) -> Array:
+        first = index * _BLOCK % _LONGEST
+        engine = _qmc().Sobol(self.size, scramble=True, rng=self.random(0))
+        if first:  # it takes no 0
+            engine.fast_forward(first)
+        points: Array = engine.random(_BLOCK)
+        return points
+
+
+class LatinHypercube(_Blocks):
+    """Latin hypercubes: of each `points` sets one lies in each of `points` parts of each parameter.
+
+    Uses `scipy.stats.qmc.LatinHypercube`.
+    """
+
+    def __init__(self, points: int = 100) -> None:
+        """Keep the size.
+
+        Args:
+            points: Number of sets in a hypercube; after them the next one begins.
+        """
+        if type(points) is not int or points < 1:
+            raise ConfigError(f'"physx/latin_hypercube": points is {points!r}, not at least 1.')
+        self.block = points
+
+    def begin(self, parameters: Sequence[Parameter], seed: Sequence[int]) -> None:
+        """Take the parameters: see `Sampler.begin`."""
+        super().begin(parameters, seed)
+        _qmc()  # a missing library is an error before anything is simulated
+
+    def _points(self, index: int) -> Array:
+        engine = _qmc().LatinHypercube(self.size, rng=self.random(index))
+        points: Array = np.asarray(engine.random(self.block))
+        return points
+
+
+def _qmc() -> Any:
+    try:
+        from scipy.stats import qmc
+    except ImportError as error:
+        raise MissingLibraryError("This sampler", "scipy", "samplers") from error
+    return qmc
