@@ -13,13 +13,14 @@ class Heat(Environment):
     """The heat equation on the unit square with insulated edges, by explicit finite differences.
 
     An episode is a simulation of `FRAMES` samples: parameters and time, scaled to -1..1, and the
-    temperature of all cells. Small and slowly spreading spots are sharp, and hard to learn.
+    temperature of all cells. All spots have the same heat, so small ones are hot, sharp, and hard
+    to learn.
     """
 
     PARAMETERS = (
         Parameter("x", 0.2, 0.8, unit="m"),
         Parameter("y", 0.2, 0.8, unit="m"),
-        Parameter("width", 0.03, 0.3, unit="m"),
+        Parameter("width", 0.04, 0.4, unit="m"),
         Parameter("diffusivity", 0.05, 1.0, unit="m^2/s"),
     )
 
@@ -37,11 +38,11 @@ class Heat(Environment):
     def reset_parameters(self, x, y, width, diffusivity):
         """Begin with a hot spot."""
         across, along = self._centers[:, None] - x, self._centers[None, :] - y
-        self._temperature = np.exp(-(across**2 + along**2) / (2 * width**2))
+        spot = np.exp(-(across**2 + along**2) / (2 * width**2))
+        self._temperature = (0.1 / width) ** 2 * spot
         self._frame = 0
-        low, high = (
-            [getattr(each, side)[0] for each in self.PARAMETERS] for side in ("low", "high")
-        )
+        low = np.array([each.low[0] for each in self.PARAMETERS])
+        high = np.array([each.high[0] for each in self.PARAMETERS])
         given = np.array([x, y, width, diffusivity])
         self._scaled = 2 * (given - low) / (high - low) - 1
         share = diffusivity * DURATION / FRAMES * CELLS**2  # of stable steps of 0.2

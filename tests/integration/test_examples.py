@@ -203,3 +203,12 @@ def test_normalization_is_part_of_a_saved_policy(root, tmp_path):
         seen = env.observation_space.sample()
         wanted, _ = model.predict(many.normalize_obs(seen), deterministic=True)
         np.testing.assert_allclose(policy(seen), wanted, atol=1e-5)
+
+
+def test_heat_is_learned_while_it_is_simulated(root, run, tmp_path):
+    pytest.importorskip("matplotlib")
+    picture = tmp_path / "online.png"
+    words = "--small", "--sessions", str(tmp_path / "sessions"), "--picture", str(picture)
+    text = run(root / "examples/online/run.py", *words).stdout
+    assert "physx/uniform: 64 simulations" in text and "physx/active: 64 simulations" in text
+    assert picture.stat().st_size > 10_000
