@@ -234,6 +234,8 @@ def against_jiminy(python: str) -> list[bool]:
         theirs = zoo.measure(name.lower(), 0.1)
         envs = [registered(name), registered(name)]
         envs[1].simulator.set_options({"world": {"period": theirs["period"]}})
+        if abs(envs[0].simulator.period - theirs["period"]) < 1e-12:
+            envs.pop()
         if abs(envs[0].step_dt - theirs["step_dt"]) > 1e-12:
             raise RuntimeError(f"{name}: step_dt is {envs[0].step_dt}, not {theirs['step_dt']}")
         envs[0].action_space.seed(0)
@@ -249,12 +251,12 @@ def against_jiminy(python: str) -> list[bool]:
         # Rounds, candidates, with and without resets.
         measured = np.array(rounds)
         middle = np.median(measured, axis=0)
-        ratios = np.median(measured[:, :4] / measured[:, 4:], axis=0)
+        ratios = np.median(measured[:, :-1] / measured[:, -1:], axis=0)
         print(f"{name}, steps of {envs[0].step_dt:g} s under random actions, resets included")
         print(f"  gym_jiminy, integrating every {1e3 * theirs['period']:g} ms", end=": ")
-        print(f"{middle[4, 0]:,.0f} steps/s, {middle[4, 1]:,.0f} without the resets")
+        print(f"{middle[-1, 0]:,.0f} steps/s, {middle[-1, 1]:,.0f} without the resets")
         for env, rate, alone, ratio, bound in zip(
-            envs, middle, middle[2:], ratios, ratios[2:], strict=False
+            envs, middle, middle[len(envs) :], ratios, ratios[len(envs) :], strict=False
         ):
             print(f"  physx, every {1e3 * env.simulator.period:g} ms", end=": ")
             print(f"{rate[0]:,.0f} steps/s, {rate[1]:,.0f} without the resets", end=", ")
