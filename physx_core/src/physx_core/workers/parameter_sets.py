@@ -33,7 +33,11 @@ from physx_core.workers.instance import NOTHING, Skip
 
 _DEFAULT = "physx/uniform"
 _OF_PARAMETERS = (
-    *(EnvironmentFailedError, ClientError, ProgramError, NotFiniteError, WrongSamplesError),
+    EnvironmentFailedError,
+    ClientError,
+    ProgramError,
+    NotFiniteError,
+    WrongSamplesError,
 )
 """Failures of a simulation that its parameters may have caused."""
 
