@@ -188,12 +188,11 @@ def test_a_training_whose_sampler_learns_is_killed_and_resumed_bit_for_bit(
 
 
 @pytest.mark.faults
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("words", [("clients", "stream"), ("clients", "reservoir")], ids=str)
 def test_such_a_training_survives_being_killed_at_any_moments(
-    tmp_path, words, seed, nothing_stays_behind
+    tmp_path, words, nothing_stays_behind
 ):
-    assert survives(tmp_path, seed, 20, words)
+    assert survives(tmp_path, 0, 10, words)
 
 
 def test_after_failed_sets_resuming_is_refused_if_rejected_samples_are_recorded(tmp_path):
