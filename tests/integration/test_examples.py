@@ -175,7 +175,7 @@ def test_equations_of_motion_help_a_network(root, run):
 def test_a_policy_is_trained_and_evaluated(root, run, tmp_path, capsys):
     """The network that is saved acts as the one that was trained."""
     pytest.importorskip("stable_baselines3", reason="needs stable-baselines3")
-    words = ("--steps", "1024", "--threshold", "50", "--save", str(tmp_path / "policy"))
+    words = ("--steps", "2048", "--threshold", "50", "--save", str(tmp_path / "policy"))
     text = run(root / "examples/train_ppo.py", *words).stdout
     assert "solved" in text
     evaluate.run([str(tmp_path / "policy"), "--env", "physx/Cartpole-v0", "--backend", "dart"])

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from urllib.request import urlopen
 
 import pytest
 
@@ -136,8 +137,10 @@ def test_tensorboard(number, port):
     Path("session/stats/tensorboard").mkdir(parents=True)
 
     def is_running():
-        with socket.socket() as probe:
-            return probe.connect_ex(("127.0.0.1", port)) == 0
+        try:  # it listens before it has started
+            return urlopen(f"http://127.0.0.1:{port}/data/logdir", timeout=5).status == 200
+        except OSError:
+            return False
 
     words = ["stats", "session", "--tensorboard", "--port", str(port)]
     error = end(words, is_running, number)
