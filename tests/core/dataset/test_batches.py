@@ -113,6 +113,7 @@ def test_options_are_checked_at_once(dataset, options):
 
 
 def test_nothing_to_read(dataset):
+    assert dataset.num_samples("validation") == 0
     with pytest.raises(DatasetError, match="no mode"):
         dataset.batches("validation", 4)
     with pytest.raises(DatasetError, match='no field "z"'):

@@ -182,7 +182,7 @@ def check_full(tmp_path, folder, limit, file_size):
 
 def check_rows(folder, total):
     with Dataset.open(folder) as dataset:
-        stored = dataset.num_samples("training") if dataset.modes else 0
+        stored = dataset.num_samples("training")
         assert total <= stored < total + 100
         if stored:
             for name in ("n", "x"):
@@ -259,7 +259,7 @@ def fill_up(folder, free):
                     except DatasetError as error:
                         assert "the disk is full" in str(error)
                         errors += 1
-                        total = dataset.num_samples("training") if dataset.modes else 0
+                        total = dataset.num_samples("training")
             if total:
                 dataset.update("training", 0, {"y": expected(1)["y"][0]})
     except DatasetError as error:
@@ -281,7 +281,7 @@ def fill_up(folder, free):
 
 
 def check_all(dataset, least):
-    total = dataset.num_samples("training") if dataset.modes else 0
+    total = dataset.num_samples("training")
     assert total >= least
     for name, values in expected(total).items() if total else ():
         assert_array_equal(dataset["training"][name][:], values)

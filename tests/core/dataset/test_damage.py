@@ -249,7 +249,7 @@ def damaged(content, chance):
 
 def check_prefix(dataset):
     """Check that the rows are the first of those that were written; return how many."""
-    count = dataset.num_samples("training") if "training" in dataset else 0
+    count = dataset.num_samples("training")
     for name, values in ROWS.items() if count else ():
         assert_array_equal(dataset["training"][name][:], values[:count])
     return count

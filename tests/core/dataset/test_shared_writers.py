@@ -77,7 +77,7 @@ def test_two_writers_of_100_000_rows_lose_nothing(tmp_path, folder, sessions):
     seen = 0
     while any(writer.poll() is None for writer in writers):
         with Dataset.open(folder) as reader:
-            count = reader.num_samples("training") if "training" in reader else 0
+            count = reader.num_samples("training")
             assert count >= seen
             seen = count
             if count:

@@ -51,7 +51,7 @@ def opened(folder, work, durable):
 def appended(folder, work, durable, chance):
     """Append blocks to one dataset, in few large or many small partitions."""
     dataset = opened(folder, work, durable)
-    total = dataset.num_samples("training") if dataset.modes else 0
+    total = dataset.num_samples("training")
     while True:
         count = chance.randrange(1, 400)
         dataset.append("training", expected(count, total))
@@ -63,7 +63,7 @@ def sealed(folder, work, durable, chance):
     """Open, append and close, again and again; the first time is the creation."""
     while True:
         with opened(folder, work, durable) as dataset:
-            total = dataset.num_samples("training") if dataset.modes else 0
+            total = dataset.num_samples("training")
             count = chance.randrange(1, 50)
             dataset.append("training", expected(count, total))
             yield total + count
@@ -150,7 +150,7 @@ def check_h5py(folder):
 def check_rows(folder, least):
     """Check all rows, and return how many there are."""
     with Dataset.open(folder) as dataset:
-        total = dataset.num_samples("training") if dataset.modes else 0
+        total = dataset.num_samples("training")
         assert total >= least, f"{least - total} of {least} rows are lost"
         if total:
             rows = expected(total)

@@ -246,7 +246,7 @@ def check_writing(folder, n, durable):
 def check_appended(folder, durable, promised, told):
     try:
         with Dataset.open(folder) as dataset:
-            total = dataset.num_samples("training") if dataset.modes else 0
+            total = dataset.num_samples("training")
             compare(dataset, range(total))
             dataset.verify()
     except DatasetNotFoundError:
@@ -261,7 +261,7 @@ def check_created(folder, durable, promised, told):
         place = folder / str(number)
         try:
             with Dataset.open(place) as dataset:
-                total = dataset.num_samples("training") if dataset.modes else 0
+                total = dataset.num_samples("training")
         except DatasetNotFoundError:
             demand(number >= promised, Lost, f"dataset {number}")
             total = 0
@@ -275,7 +275,7 @@ def check_described(folder, durable, promised, told):
     with Dataset.open(folder) as dataset:
         done = dataset.info.get("done", -1)
         demand(promised <= done <= told + 1, Lost, f"info {promised}: there is {done}")
-        total = dataset.num_samples("training") if dataset.modes else 0
+        total = dataset.num_samples("training")
         demand(total == 100 or promised < 0, Lost, f"{100 - total} of 100 rows")
         compare(dataset, range(total))
     check_writing(folder, range(total), durable)
@@ -300,7 +300,7 @@ def check_updated(folder, durable, promised, told):
         return
     for writable in (False, True, False):
         with Dataset.open(folder, writable=writable) as dataset:
-            total = dataset.num_samples("training") if dataset.modes else 0
+            total = dataset.num_samples("training")
             least = UPDATED * (promised >= 0) + ADDED * (promised >= 1)
             demand(total >= least, Lost, f"{least - total} of {least} rows")
             for name in ("n", "x") if total else ():

@@ -175,13 +175,13 @@ class Dataset(Closeable):
         return dict(self._reader.mode(mode).fields)
 
     def num_samples(self, mode: str) -> int:
-        """Return the number of committed samples of a mode.
+        """Return the number of committed samples of a mode, 0 if there is no such mode.
 
         Raises:
-            DatasetError: If there is no such mode, or a partition is missing or damaged.
+            DatasetError: If a partition is missing or damaged.
         """
         self._prepare_reading()
-        return self._reader.rows(mode)
+        return self._reader.rows(mode) if mode in self else 0
 
     def __getitem__(self, mode: str) -> ModeView:
         self._prepare_reading()

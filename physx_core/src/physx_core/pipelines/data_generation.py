@@ -139,7 +139,7 @@ class DataGeneration(NewSessionPipeline):
         seed = choose_seed(config.seed)
         self.session = self._create_session()
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
-        offset = self.dataset.num_samples(self._mode) if self._mode in self.dataset.modes else 0
+        offset = self.dataset.num_samples(self._mode)
         self._seed = seed
         self._record_config(seed)
         self._observe(resources, config)

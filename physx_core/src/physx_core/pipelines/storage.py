@@ -73,7 +73,7 @@ def other_samples(directory: Path, mode: str) -> str:
     found = []
     for other in related_sessions(directory.parent) if directory.name == "dataset" else ():
         with contextlib.suppress(PhysxError, OSError), Dataset.open(other / "dataset") as dataset:
-            count = dataset.num_samples(mode) if mode in dataset.modes else 0
+            count = dataset.num_samples(mode)
             found += [f"{other} ({count:,})"] if count else []
     return f" There are such samples in {', '.join(found)}." if found else ""
 

@@ -40,7 +40,7 @@ class StoredRows:
             rows: Indices of the rows of a pass; None: all current rows.
             random: Draws the order of each pass; None: the order of `rows`.
         """
-        if mode not in dataset.modes or not dataset.num_samples(mode):
+        if not dataset.num_samples(mode):
             raise DatasetError(
                 f'The dataset in {dataset.directory} has no samples of mode "{mode}" to send '
                 f"through an environment. It has: {listed(dataset.modes)}."

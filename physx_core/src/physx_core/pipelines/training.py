@@ -647,7 +647,7 @@ class Training(NewSessionPipeline):
     ) -> Source:
         seed = self._seed_of(config)
         dataset.update_info(**describe_environment(config, seed))
-        stored = dataset.num_samples("training") if "training" in dataset.modes else 0
+        stored = dataset.num_samples("training")
         if self._generation is not None:
             stored = self._generation.offset
         return self._open_source(

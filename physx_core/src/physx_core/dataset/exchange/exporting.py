@@ -119,10 +119,9 @@ def _make_tables(dataset: Dataset, modes: Sequence[str], advance: Advance) -> li
     names = modes or [name for name in dataset.modes if dataset.num_samples(name)]
     tables = []
     for name in dict.fromkeys(names):
-        rows = dataset.num_samples(name)
+        fields, rows = dataset.fields(name), dataset.num_samples(name)
         if not rows:
             raise ExchangeError(f'Mode "{name}" has no samples to export.')
-        fields = dataset.fields(name)
         tables.append(Table(name, fields, rows, dataset.info, dataset[name], advance))
     if not tables:
         raise ExchangeError(f"The dataset in {dataset.directory} has no samples to export.")

@@ -73,7 +73,7 @@ class Blocks:
         """
         self._source, self._dataset, self._mode = source, dataset, mode
         self._normalizes = normalize
-        self._stored = dataset.num_samples(mode) if mode in dataset.modes else 0
+        self._stored = dataset.num_samples(mode)
         self._next_row = first
         self._statistics: dict[str, RunningStatistics] = {}
         for start in range(0, first if normalize else 0, _CHUNK):

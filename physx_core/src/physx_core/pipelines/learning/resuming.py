@@ -74,7 +74,7 @@ class Generation:
     ) -> Self:
         """Return the description of a training that begins now."""
         counted = (mode, WRONG, SETS, "training")
-        first, wrong, sets, offset = (_count(dataset, name) for name in counted)
+        first, wrong, sets, offset = (dataset.num_samples(name) for name in counted)
         return cls(mode, first, wrong, sets, offset, seed, batch_size, batch_nb)
 
     def start(self, dataset: Dataset, **info: Any) -> None:
@@ -115,11 +115,12 @@ class Generation:
                 )
         restore_parameters(dataset.directory)
         rejected: tuple[int, ...] = ()
-        if _count(dataset, WRONG) > self.first_wrong:
+        if dataset.num_samples(WRONG) > self.first_wrong:
             numbers = dataset[WRONG]["env_id"][self.first_wrong :]
             found = np.bincount(numbers, minlength=environment.num_clients + 1)
             rejected = tuple(int(count) for count in found[1:])
-        rows, sets = _count(dataset, self.mode) - self.first, _count(dataset, SETS) - self.first_set
+        rows = dataset.num_samples(self.mode) - self.first
+        sets = dataset.num_samples(SETS) - self.first_set
         begun = {}
         if rows:
             view = dataset[self.mode]
@@ -197,10 +198,6 @@ def _parse(plain: Any) -> Generation | None:
         return Generation(**plain)
     except TypeError:
         return None
-
-
-def _count(dataset: Dataset, mode: str) -> int:
-    return dataset.num_samples(mode) if mode in dataset.modes else 0
 
 
 def can_resume(environment: EnvironmentConfig | None, epochs: int) -> bool:

@@ -111,7 +111,7 @@ class TrainingData:
         self._reader: Iterator[Batch] | None = None
         self._has_source = self._uses_source = source is not None or generates
         self._changed = False
-        if not self._has_source and not self._count(self._mode):
+        if not self._has_source and not self.dataset.num_samples(self._mode):
             raise DatasetError(
                 f'The dataset in {dataset.directory} has no samples of mode "{self._mode}" to '
                 f"train on. It has: {listed(dataset.modes)}."
@@ -147,7 +147,7 @@ class TrainingData:
                 "DatasetConfig.validation_split holds back stored samples, but environments "
                 'generate these. Generate the samples first, or others in the mode "validation".'
             )
-        if self._count("validation"):
+        if self.dataset.num_samples("validation"):
             return {}
         shares = {"training": 1 - share, "validation": share}
         return self.dataset.split(self._mode, shares, by=self._config.split_by)
@@ -288,7 +288,7 @@ class TrainingData:
     @property
     def has_validation(self) -> bool:
         """Whether there are validation samples."""
-        return bool(self.parts) or self._count("validation") > 0
+        return bool(self.parts) or self.dataset.num_samples("validation") > 0
 
     @property
     def fields(self) -> Mapping[str, Field]:
@@ -297,7 +297,7 @@ class TrainingData:
             return self._shared.block.fields
         if self.online is not None and self.online.block.fields:
             return self.online.block.fields
-        if self.source is not None and not self._count(self._mode):
+        if self.source is not None and not self.dataset.num_samples(self._mode):
             return {field.name: field for field in self.source.fields}
         return self.dataset.fields(self._mode)
 
@@ -308,7 +308,7 @@ class TrainingData:
             return self._shared.block.normalization
         if self.produces and self.online is not None and self.online.block.fields:
             return self.online.block.normalization
-        if not self._config.normalize or not self._count(self._mode):
+        if not self._config.normalize or not self.dataset.num_samples(self._mode):
             return {}
         if self.parts:
             return self.parts["training"].normalization()
@@ -319,7 +319,4 @@ class TrainingData:
     @property
     def _samples(self) -> int:
         part = self.parts.get("training")
-        return part.num_samples if part else self._count(self._mode)
-
-    def _count(self, mode: str) -> int:
-        return self.dataset.num_samples(mode) if mode in self.dataset.modes else 0
+        return part.num_samples if part else self.dataset.num_samples(self._mode)
