@@ -3,3 +3,4 @@
 from .arguments import argument_registry as argument_registry
 from .command import main as main
 from .output import show as show
+from .output import show_table as show_table

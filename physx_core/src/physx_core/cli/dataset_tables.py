@@ -1,4 +1,4 @@
-"""Prints the contents of a dataset as tables of 100 columns."""
+"""Prints the contents of a dataset as tables."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.cli.output import show
+from physx_core.cli.output import show, show_table, width
 from physx_core.dataset import Dataset
 from physx_core.dataset.read.episodes import episode_lengths
 from physx_core.errors import DatasetError
 from physx_core.statistics import Normalization
 from physx_core.typing import Array
 
-_WIDTH = 100
 _SMALL = 9
 """Largest number of components that are shown on lines of their own."""
 
@@ -76,9 +75,9 @@ def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> 
             show(f"  reading strategy: {dataset.reading_strategy(mode)}")
             _print_episodes(dataset, mode, stored)
     except DatasetError as error:
-        show(textwrap.fill(f"damaged: {error}", _WIDTH, initial_indent="  "))
+        show(textwrap.fill(f"damaged: {error}", width(), initial_indent="  "))
         stored = 0
-    _print_table(
+    show_table(
         ["field", "role", "type", "shape", "size", "unit"],
         [
             [
@@ -91,6 +90,7 @@ def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> 
             ]
             for row in rows
         ],
+        indent=2,
     )
     if stored:
         _print_normalization(dataset, mode)
@@ -111,12 +111,13 @@ def _print_normalization(dataset: Dataset, mode: str) -> None:
     try:
         found = dataset.normalization_of(mode)
     except DatasetError as error:
-        show(textwrap.fill(f"normalization: {error}", _WIDTH, initial_indent="  "))
+        show(textwrap.fill(f"normalization: {error}", width(), initial_indent="  "))
         return
     lines = [line for name, item in found.items() for line in _components(name, item)]
     if lines:
         show()
-        _print_table(["normalization", "component", "mean", "std", "min", "max"], lines)
+        numbers = ("mean", "std", "min", "max")
+        show_table(["normalization", "component", *numbers], lines, numbers=numbers, indent=2)
 
 
 def _components(name: str, item: Normalization) -> list[list[str]]:
@@ -144,17 +145,4 @@ def _print_integrity(dataset: Dataset, *, content: bool) -> None:
     found = count(len(problems), "problem") if problems else "sound"
     show(f"integrity: {found} ({what})")
     for text in problems:
-        show(textwrap.fill(text, _WIDTH, initial_indent="  ", subsequent_indent="    "))
-
-
-def _print_table(names: Sequence[str], lines: Sequence[Sequence[str]]) -> None:
-    """Print columns side by side; the last one is wrapped to the remaining width."""
-    cells = [list(names), *(list(line) for line in lines)]
-    widths = [max(len(line[column]) for line in cells) for column in range(len(names))]
-    rest = max(12, _WIDTH - sum(widths[:-1]) - 2 * len(names))
-    for line in cells:
-        wrapped = textwrap.wrap(line[-1], rest) or [""]
-        for number, part in enumerate(wrapped):
-            shown = line[:-1] if number == 0 else [""] * (len(line) - 1)
-            parts = [f"{cell:{width}}" for cell, width in zip(shown, widths, strict=False)]
-            show("  " + "  ".join([*parts, part]).rstrip())
+        show(textwrap.fill(text, width(), initial_indent="  ", subsequent_indent="    "))

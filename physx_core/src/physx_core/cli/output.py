@@ -2,9 +2,62 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
+from collections.abc import Collection, Sequence
+
 from physx_core.errors import printable
+
+WIDTH = 100
+"""Columns of what is printed to a file or a pipe; a terminal has its own."""
 
 
 def show(text: object = "") -> None:
     """Print text with names from files or packages, which must not control the terminal."""
     print(printable(text))
+
+
+def width() -> int:
+    """Return how many columns a line may have."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH
+
+
+def show_table(
+    head: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    *,
+    numbers: Collection[str] = (),
+    curve: str | None = None,
+    indent: int = 0,
+) -> None:
+    """Print columns side by side, as wide as the terminal; color only where there is a terminal.
+
+    Args:
+        head: Names of the columns.
+        rows: Their texts. What is too long for its column continues on the next line.
+        numbers: Columns of numbers, which are never wrapped.
+        curve: Column of spark lines.
+        indent: Spaces in front of each line.
+    """
+    from rich.console import Console  # not imported before it is needed: `physx --help` is quick
+    from rich.padding import Padding
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console(file=sys.stdout, highlight=False, width=width())
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for name in head:
+        wraps = name not in numbers and name != curve
+        table.add_column(
+            Text(name, "bold"),
+            justify="right" if name in numbers else "left",
+            style="cyan" if name == curve else "",
+            no_wrap=not wraps,
+            overflow="fold",
+        )
+    for row in rows:
+        table.add_row(*(Text(printable(text)) for text in row))
+    with console.capture() as captured:
+        console.print(Padding(table, (0, 0, 0, indent)))
+    for line in captured.get().splitlines():
+        print(line.rstrip())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from physx_core import PhysxError, plugins
-from physx_core.cli import show
+from physx_core.cli import show, show_table
 from physx_core.errors import UsageError
 from physx_core.origin import install_hint
 from physx_core.simulation import RobotInfo
@@ -43,14 +43,15 @@ def _robots() -> Iterator[RobotInfo]:
 
 
 def _print_table(robots: Sequence[RobotInfo]) -> None:
-    width = max(len(info.name) for info in robots)
-    print(f"{'name':{width}}  dof  mass [kg]  collisions")
+    rows = []
     for info in robots:
         if info.error:
             reason = info.error.splitlines()[0].rstrip(":")
-            show(f"{info.name:{width}}  cannot be loaded: {reason}")
-            continue
-        line = f"{info.name:{width}}  {info.joints:3}  {info.mass:9.4g}  {info.collisions:10}"
-        show(f"{line}  {info.warning}".rstrip())
+            rows.append([info.name, "", "", "", f"cannot be loaded: {reason}"])
+        else:
+            figures = [str(info.joints), f"{info.mass:.4g}"]
+            rows.append([info.name, *figures, info.collisions, info.warning])
+    numbers = ("dof", "mass [kg]")
+    show_table(["name", *numbers, "collisions", ""], rows, numbers=numbers)
     if any(info.warning for info in robots):
-        print('slow: with Robot(collisions="boxes") or "capsules" each mesh is its bounding shape')
+        show('slow: with Robot(collisions="boxes") or "capsules" each mesh is its bounding shape')

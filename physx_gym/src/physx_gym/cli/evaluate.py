@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 import tyro
 
-from physx_core.cli import argument_registry, show
+from physx_core.cli import argument_registry, show, show_table
 from physx_core.errors import ConfigError
 from physx_gym.bridge.make_env import make_env
 from physx_gym.bridge.policy import Policy
@@ -126,11 +126,12 @@ def summary(episodes: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]
 
 def print_table(figures: dict[str, dict[str, float]]) -> None:
     """Print what `summary` returned."""
-    show(f"{'':8}  {'mean':>10}  {'std':>10}  {'min':>10}  {'max':>10}")
-    units = {"length": "steps", "speed": "m/s"}
-    for name, values in figures.items():
-        text = "  ".join(f"{value:10.4g}" for value in values.values())
-        show(f"{name:8}  {text}  {units.get(name, '')}".rstrip())
+    units, numbers = {"length": "steps", "speed": "m/s"}, ("mean", "std", "min", "max")
+    lines = [
+        [name, *(f"{value:.4g}" for value in values.values()), units.get(name, "")]
+        for name, values in figures.items()
+    ]
+    show_table(["", *numbers, "unit"], lines, numbers=numbers)
 
 
 def _show_episode(env: gymnasium.Env[Any, Any], act: Any, options: Evaluate) -> None:

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from physx_core.cli import show
+from physx_core.cli import show, show_table
 from physx_gym.telemetry.episode_log import TIME, Log
 from physx_gym.telemetry.log_file import read_log
 
@@ -57,10 +57,11 @@ def _print_table(log: Log, columns: tuple[str, ...]) -> None:
     show(f"{log.path}: {environment} on {backend}, seed {log.constants.get('seed', '?')}")
     show(f"{rows} rows of {len(log.variables)} columns, {duration:g} s\n")
     chosen = [name for name in log.variables if name.startswith(columns or "") and name != TIME]
-    width = max(map(len, chosen), default=4)
-    show(f"{'column':{width}}  {'min':>10}  {'max':>10}  {'mean':>10}  {'last':>10}  unit")
+    numbers = ("min", "max", "mean", "last")
+    lines = []
     for name in chosen:
         values = log.variables[name]
-        figures = (values.min(), values.max(), np.mean(values), values[-1]) if rows else ()
-        text = "  ".join(f"{figure:10.4g}" for figure in figures)
-        show(f"{name:{width}}  {text}  {log.units.get(name, '')}".rstrip())
+        figures = (values.min(), values.max(), np.mean(values), values[-1]) if rows else [""] * 4
+        texts = [f"{figure:.4g}" if rows else "" for figure in figures]
+        lines.append([name, *texts, log.units.get(name, "")])
+    show_table(["column", *numbers, "unit"], lines, numbers=numbers)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 from physx_core import plugins
-from physx_core.cli.output import show
+from physx_core.cli.output import show, width
 from physx_core.errors import PhysxError, UsageError, printable
 from physx_core.plugins.entries import find_unreadable
 
@@ -26,6 +27,16 @@ def run(words: Sequence[str]) -> None:
             show(f"  broken: {error}")
             continue
         for kind, components in plugin.components.items():
-            show(f"  {kind}: {', '.join(f'{name}/{key}' for key in components)}")
+            text = f"{kind}: {', '.join(f'{name}/{key}' for key in components)}"
+            show(
+                textwrap.fill(
+                    text,
+                    width(),
+                    initial_indent="  ",
+                    subsequent_indent=" " * 4,
+                    break_long_words=False,
+                    break_on_hyphens=False,
+                )
+            )
     for package, problem in find_unreadable().items():
         show(f"The entry points of the package {package} cannot be read: {problem}")

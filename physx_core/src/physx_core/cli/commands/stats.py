@@ -14,12 +14,13 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli.output import show
+from physx_core.cli.output import show_table, width
 from physx_core.errors import MissingLibraryError, SessionError
 from physx_core.observers import read_scalars
 from physx_core.processes import ChildProcess
 
 BARS = "▁▂▃▄▅▆▇█"
+_FEWEST_BARS = 12
 
 
 @dataclass
@@ -28,8 +29,8 @@ class Stats:
 
     session: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SESSION")]
     """The session's folder."""
-    width: int = 32
-    """Width of the spark lines, in characters."""
+    width: int | None = None
+    """Width of the spark lines, in characters; by default what the terminal leaves."""
     tensorboard: bool = False
     """Start TensorBoard and print its address; Ctrl-C ends it."""
     port: int = 6006
@@ -42,17 +43,17 @@ def run(words: Sequence[str]) -> None:
     if options.tensorboard:
         _start_tensorboard(Path(options.session), options.port)
         return
-    numbers = read_scalars(Path(options.session))
-    if not numbers:
+    series = read_scalars(Path(options.session))
+    if not series:
         raise SessionError(f"{options.session} has no statistics: a training records them.")
-    head = ("name", "per", "number", "last", "min", "max", "mean")
-    lines = [head, *(_line(*key, list(steps.values())) for key, steps in numbers.items())]
-    curves = ["", *(spark_line(list(steps.values()), options.width) for steps in numbers.values())]
-    widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
-    for line, curve in zip(lines, curves, strict=True):
-        columns = [f"{line[0]:{widths[0]}}", f"{line[1]:{widths[1]}}"]
-        columns += [f"{text:>{width}}" for text, width in zip(line[2:], widths[2:], strict=True)]
-        show("  ".join([*columns, curve]).rstrip())
+    numbers = ("number", "last", "min", "max", "mean")
+    lines = [_line(*key, list(steps.values())) for key, steps in series.items()]
+    head = ("name", "per", *numbers)
+    used = sum(2 + max(map(len, column)) for column in zip(head, *lines, strict=True))
+    bars = max(_FEWEST_BARS, width() - used) if options.width is None else options.width
+    curves = [spark_line(list(steps.values()), bars) for steps in series.values()]
+    rows = [(*line, curve) for line, curve in zip(lines, curves, strict=True)]
+    show_table((*head, ""), rows, numbers=numbers, curve="")
 
 
 def _line(timeline: str, name: str, values: list[float]) -> tuple[str, ...]:
