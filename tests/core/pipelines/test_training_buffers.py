@@ -98,8 +98,11 @@ def assert_equal_runs(one, other):
     with Dataset.open(one / "dataset") as a, Dataset.open(other / "dataset") as b:
         for name in ("x", "y", "number"):
             assert np.array_equal(a["training"][name][:], b["training"][name][:])
-    losses = [read_scalars(path)["batch", "loss/batch"] for path in (one, other)]
-    assert losses[0] == losses[1]
+    numbers = [read_scalars(path) for path in (one, other)]
+    names = [name for name in numbers[0] if name[1] == "loss/batch" or name[1].startswith("fields")]
+    assert ("batch", "fields/y/1/q95") in names
+    for name in names:
+        assert numbers[0][name] == numbers[1][name]
 
 
 @pytest.mark.parametrize("online", BUFFERS)
@@ -257,6 +260,34 @@ def test_an_interrupted_run_leaves_the_state_of_its_buffer_in_the_checkpoint():
     counts = np.bincount(drawn.ravel(), minlength=20)
     assert all(counts[row] == number for row, number in uses.items())
     assert (found.path / BUFFER).is_file()
+
+
+@pytest.mark.parametrize("online", ["stream", "reservoir"])
+def test_statistics_summarize_the_rows_that_were_generated(online, capsys):
+    path = train("run", online, batch_nb=300)
+    numbers = {name: steps for (_, name), steps in read_scalars(path).items()}
+    with Dataset.open(path / "dataset") as dataset:
+        x, grid = dataset["training"]["x"][:], dataset["training"]["grid"][:]
+    assert len(x) == (2400 if online == "stream" else 800)
+    of_x = {name: list(steps.values()) for name, steps in numbers.items() if "s/x/0/" in name}
+    assert len(of_x) == 5
+    for values in of_x.values():
+        assert len(values) < 60
+    assert of_x["fields/x/0/mean"][-1] == pytest.approx(x[:, 0].mean(), abs=1e-12)
+    assert of_x["fields/x/0/std"][-1] == pytest.approx(x[:, 0].std(), abs=1e-12)
+    for name, share in (("q05", 0.05), ("median", 0.5), ("q95", 0.95)):
+        below = (x[:, 0] < of_x[f"fields/x/0/{name}"][-1]).mean()
+        assert below == pytest.approx(share, abs=0.05 if online == "stream" else 0.002)
+    assert not any(name.startswith("fields/number") for name in numbers)
+    of_grid = [list(steps.values())[-1] for name, steps in numbers.items() if "s/grid/" in name]
+    wanted = [grid.mean(), grid.std(), *np.quantile(grid, [0.05, 0.5, 0.95])]
+    assert of_grid == pytest.approx(wanted, abs=0.2)
+    capsys.readouterr()
+    main(["stats", str(path)])
+    said = capsys.readouterr().out.splitlines()
+    line = next(line for line in said if line.startswith("x/0"))
+    assert line.split()[1] == f"{of_x['fields/x/0/mean'][-1]:.4g}"
+    assert any(line.split() == ["field", "mean", "std", "q05", "median", "q95"] for line in said)
 
 
 def test_statistics_say_how_the_buffer_and_both_sides_are_doing(capfd):

@@ -21,7 +21,9 @@ class Drawn(Environment):
 
     def init_database(self):
         self.define_training_fields([Field("x", shape=(3,)), Field("y", shape=(2,))])
-        self.define_additional_fields([Field("number", shape=(), dtype="int64")])
+        self.define_additional_fields(
+            [Field("number", shape=(), dtype="int64"), Field("grid", shape=(20, 20))]
+        )
 
     def step(self):
         if self.count == self.fails_at:
@@ -30,5 +32,5 @@ class Drawn(Environment):
             time.sleep(random.Random(os.urandom(4)).random() * self.delay)
         x = self.rng.normal(size=3)
         self.set_training_data(x=x, y=np.array([x[0] - x[1], 2 * x[2]]))
-        self.set_additional_data(number=self.count)
+        self.set_additional_data(number=self.count, grid=np.tile(np.arange(20), (20, 1)) + x[1])
         self.count += 1

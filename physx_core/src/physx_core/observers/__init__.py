@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from physx_core.observers.chosen import statistics_observers
 from physx_core.observers.progress import ProgressBar
-from physx_core.observers.scalars_file import ScalarsFile, read_scalars
+from physx_core.observers.scalars_file import FIELDS, ScalarsFile, read_scalars
 from physx_core.observers.several import Observers
 
-__all__ = ["Observers", "ProgressBar", "ScalarsFile", "read_scalars", "statistics_observers"]
+__all__ = [
+    "FIELDS",
+    "Observers",
+    "ProgressBar",
+    "ScalarsFile",
+    "read_scalars",
+    "statistics_observers",
+]

@@ -13,6 +13,8 @@ from physx_core.components.visualizer import Observer
 from physx_core.errors import SessionError
 
 HEADER = ("timeline", "step", "name", "value")
+FIELDS = "fields"
+"""Group of the names of the statistics of rows: ``fields/<field>/<component>/<figure>``."""
 FLUSH_SECONDS = 0.2
 _LONGEST_LINE = 2**16
 

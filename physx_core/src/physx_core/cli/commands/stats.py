@@ -7,20 +7,21 @@ import itertools
 import math
 import statistics
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from physx_core.cli.output import show_table, width
+from physx_core.cli.output import show, show_table, width
 from physx_core.errors import MissingLibraryError, SessionError
-from physx_core.observers import read_scalars
+from physx_core.observers import FIELDS, read_scalars
 from physx_core.processes import ChildProcess
 
 BARS = "▁▂▃▄▅▆▇█"
 _FEWEST_BARS = 12
+_ROWS = f"{FIELDS}/"
 
 
 @dataclass
@@ -46,6 +47,8 @@ def run(words: Sequence[str]) -> None:
     series = read_scalars(Path(options.session))
     if not series:
         raise SessionError(f"{options.session} has no statistics: a training records them.")
+    of_rows = {name: steps for (_, name), steps in series.items() if name.startswith(_ROWS)}
+    series = {key: steps for key, steps in series.items() if key[1] not in of_rows}
     numbers = ("number", "last", "min", "max", "mean")
     lines = [_line(*key, list(steps.values())) for key, steps in series.items()]
     head = ("name", "per", *numbers)
@@ -54,6 +57,20 @@ def run(words: Sequence[str]) -> None:
     curves = [spark_line(list(steps.values()), bars) for steps in series.values()]
     rows = [(*line, curve) for line, curve in zip(lines, curves, strict=True)]
     show_table((*head, ""), rows, numbers=numbers, curve="")
+    if of_rows:
+        show()
+        _show_rows(of_rows)
+
+
+def _show_rows(numbers: Mapping[str, Mapping[int, float]]) -> None:
+    """Print the last statistics of the rows that environments generated, by field."""
+    table: dict[str, dict[str, str]] = {}
+    for name, steps in numbers.items():
+        of, _, figure = name.removeprefix(_ROWS).rpartition("/")
+        table.setdefault(of, {})[figure] = f"{list(steps.values())[-1]:.4g}"
+    figures = list(dict.fromkeys(figure for values in table.values() for figure in values))
+    rows = [(of, *(values.get(name, "") for name in figures)) for of, values in table.items()]
+    show_table(("field", *figures), rows, numbers=figures)
 
 
 def _line(timeline: str, name: str, values: list[float]) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ from physx_core.dataset import Dataset
 from physx_core.dataset.store.manifest import has_statistics
 from physx_core.fields import Field
 from physx_core.pipelines.learning.feeder import Feeder
+from physx_core.pipelines.learning.row_statistics import RowStatistics
 from physx_core.pipelines.storage import record_rejected, store_sets
 from physx_core.rows import concatenate
 from physx_core.sources.source import Source
@@ -28,11 +29,14 @@ class Block:
         fields: The stored fields by name; empty before the first row.
         normalization: The normalization of all rows up to the last one of this block, by field;
             empty if nothing is to be normalized.
+        statistics: Mean, deviation and quantiles of the rows up to the last one of this block, if
+            they are due: see `RowStatistics`.
     """
 
     rows: Batch = field(default_factory=dict)
     fields: Mapping[str, Field] = field(default_factory=dict)
     normalization: dict[str, Normalization] = field(default_factory=dict)
+    statistics: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def nbytes(self) -> int:
@@ -58,6 +62,7 @@ class Blocks:
         *,
         normalize: bool,
         first: int,
+        statistics: RowStatistics,
         feeder: Feeder[Block] | None = None,
     ) -> None:
         """Keep the arguments.
@@ -68,11 +73,12 @@ class Blocks:
             mode: Mode to store them in.
             normalize: Whether the blocks have a normalization.
             first: Number of rows that the mode had before the first block.
+            statistics: Summarizes the rows; it has none yet.
             feeder: Has a thread for it, not started yet; None: the rows are generated when they
                 are taken.
         """
         self._source, self._dataset, self._mode = source, dataset, mode
-        self._normalizes = normalize
+        self._normalizes, self._summary = normalize, statistics
         self._stored = dataset.num_samples(mode)
         self._next_row = first
         self._statistics: dict[str, RunningStatistics] = {}
@@ -115,10 +121,7 @@ class Blocks:
             counts: Their numbers of rows.
         """
         for count in counts:
-            if self._normalizes or self._next_row + count > self._stored:
-                self._make(count)
-            else:
-                self._next_row += count
+            self._make(count)
         self._last = Block({}, self._dataset.fields(self._mode), self._last.normalization)
 
     def close(self) -> None:
@@ -142,7 +145,9 @@ class Blocks:
         if self._normalizes:
             self._add(rows)
         found = {name: one.normalization() for name, one in self._statistics.items()}
-        self._last = Block(rows, self._dataset.fields(self._mode), found)
+        fields = self._dataset.fields(self._mode)
+        summary = self._summary.add(rows, _counted(fields))
+        self._last = Block(rows, fields, found, summary)
         return self._last
 
     def _generate(self, count: int, *, is_whole: bool) -> Batch:
@@ -159,6 +164,9 @@ class Blocks:
         return {name: view[name][start:stop] for name in self._dataset.fields(self._mode)}
 
     def _add(self, rows: Batch) -> None:
-        for name, of in self._dataset.fields(self._mode).items():
-            if has_statistics(of):
-                self._statistics.setdefault(name, RunningStatistics()).update(rows[name])
+        for name in _counted(self._dataset.fields(self._mode)):
+            self._statistics.setdefault(name, RunningStatistics()).update(rows[name])
+
+
+def _counted(fields: Mapping[str, Field]) -> list[str]:
+    return [name for name, of in fields.items() if has_statistics(of)]

@@ -51,6 +51,7 @@ class OnlineBatches:
         self._store: RowStore | None = None
         self._arrived = 0
         self._meter = _Meter()
+        self._summary: Mapping[str, float] = {}
 
     def next(self, names: Sequence[str]) -> Batch:
         """Return the next batch, in physical units; valid until the next call.
@@ -76,6 +77,7 @@ class OnlineBatches:
         """Return the rows of the next block."""
         with self._meter.waiting():
             self.block = self._blocks.next(size)
+        self._summary = self.block.statistics or self._summary
         return self.block.rows
 
     def _draw(self, count: int, names: Sequence[str]) -> Batch:
@@ -184,19 +186,22 @@ class OnlineBatches:
         return self._buffer.state(batches)
 
     def recent_statistics(self) -> dict[str, float]:
-        """Return how the buffer and both sides are doing, once a second; otherwise nothing.
+        """Return how the rows, the buffer and both sides are doing; nothing if it is not due.
 
+        ``fields/...`` of the rows are those of `RowStatistics`; the others are due once a second:
         ``online/rows_kept`` and ``online/mean_age`` of the buffer, the age in rows that came since;
         ``online/views``, how many times a row was used on average; and of the time since the last
         call: ``online/rows_per_s``, ``online/batches_per_s``, and the shares of it in which the
         network waited for rows, ``online/network_waits``, and the environments for the network,
         ``online/environments_wait``.
         """
+        summary, self._summary = self._summary, {}
         rates = self._meter.read_recent()
         if not rates or not self._buffer.capacity:
-            return rates
+            return {**summary, **rates}
         kept = self._buffer.kept
         return {
+            **summary,
             "online/rows_kept": float(len(kept)),
             "online/mean_age": self._arrived - float(kept.mean()) if len(kept) else 0.0,
             "online/views": self._views,

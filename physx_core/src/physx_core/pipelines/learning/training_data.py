@@ -18,6 +18,7 @@ from physx_core.pipelines.learning.blocks import Block, Blocks
 from physx_core.pipelines.learning.drawn_rows import DrawnRows
 from physx_core.pipelines.learning.feeder import Feeder
 from physx_core.pipelines.learning.online import OnlineBatches
+from physx_core.pipelines.learning.row_statistics import RowStatistics
 from physx_core.pipelines.learning.sharing import SharedBatches
 from physx_core.pipelines.storage import other_samples, record_rejected
 from physx_core.pipelines.stored_rows import StoredRows
@@ -126,7 +127,13 @@ class TrainingData:
             self._stored = self._stored_rows(source)
         elif source is not None:
             blocks = Blocks(
-                source, dataset, self._mode, normalize=config.normalize, first=first, feeder=feeder
+                source,
+                dataset,
+                self._mode,
+                normalize=config.normalize,
+                first=first,
+                statistics=RowStatistics(seed, buffer.total),
+                feeder=feeder,
             )
             self.online = OnlineBatches(blocks, buffer, data_type, drawn, first)
             source.sets.follow(buffer.needed)
