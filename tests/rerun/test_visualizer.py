@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 import rerun as rr
 from rerun.experimental import ViewerClient
 
-from physx_core import plugins
+from physx_core import DataGeneration, EnvironmentConfig, plugins
 from physx_core.components import Factory
 from physx_core.errors import ConfigError, UnknownOptionError, VisualizerError
 from physx_rerun import visualizer as visualizer_module
@@ -213,6 +214,38 @@ def test_events_in_the_order_of_their_arrival(opened, read):
     visualizer.close()
     steps = [s for s, _ in read(visualizer.file, "/env_1/tf", "Transform3D:translation")]
     assert steps == [0, 1, 2, 3]
+
+
+def test_what_is_drawn_has_simulated_time_that_goes_on_after_a_new_episode(opened, read):
+    visualizer = opened()
+    factory = Factory()
+    for step, seconds in enumerate([0.0, 0.5, 1.0, 0.0, 0.5]):
+        factory.set_time(seconds)
+        if step:
+            factory.update_sphere("ball", position=[step, 0, 0])
+        else:
+            factory.add_sphere("ball", 0.1)
+        visualizer.events(1, step, factory.take_events())
+    assert visualizer._layout.timeline == "sim_time"
+    visualizer.close()
+    rows = read(visualizer.file, "/env_1/tf", "Transform3D:translation", "sim_time")
+    assert [(time.total_seconds(), xyz[0][0]) for time, xyz in rows] == [
+        *((0.0, 0), (0.5, 1), (1.0, 2), (1.0, 3), (1.5, 4))
+    ]
+
+
+@pytest.mark.parametrize("clients", [False, True])
+def test_the_steps_of_an_environment_have_the_simulated_time_that_it_says(
+    tmp_path, monkeypatch, read, clients
+):
+    monkeypatch.chdir(tmp_path)
+    config = EnvironmentConfig(
+        "toy/spring", as_tcp_ip_client=clients, visualizer="rerun", env_kwargs={"period": 0.25}
+    )
+    DataGeneration(config, batch_nb=1, batch_size=4, quiet=True).execute()
+    (path,) = Path("sessions").rglob("*.rrd")
+    rows = read(path, "/env_1/tf", "Transform3D:translation", "sim_time")
+    assert [time.total_seconds() for time, _ in rows] == [0, 0, 0.25, 0.5, 0.75]
 
 
 def test_big_updates_do_not_pile_up(opened):

@@ -60,6 +60,7 @@ class Spring(Environment):
 
     def create(self) -> None:
         """Place the mass at random."""
+        self.step_time = self.period
         self.state = self.rng.standard_normal(2)
 
     def init_database(self) -> None:

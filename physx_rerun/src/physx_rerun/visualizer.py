@@ -18,7 +18,8 @@ from physx_core.config import at_least, options
 from physx_core.errors import ConfigError, VisualizerError
 from physx_core.typing import Array
 from physx_rerun.drawing import colors
-from physx_rerun.drawing.chunks import TIME, ChunkBuilder
+from physx_rerun.drawing.chunks import SIM_TIME, TIME, ChunkBuilder
+from physx_rerun.drawing.clock import SimulatedClock
 from physx_rerun.drawing.drawing import Drawing
 from physx_rerun.drawing.windows import WindowLayout
 from physx_rerun.viewer.headless import render_picture
@@ -88,6 +89,7 @@ class RerunVisualizer(Visualizer):
         self._flushed, self._waiting = float("-inf"), 0
         self._rows, self._layout = ChunkBuilder(), WindowLayout(1)
         self._drawings: dict[int, Drawing] = {}
+        self._clocks: dict[int, SimulatedClock] = {}
         self._curves: set[str] = set()
         self._positions: dict[str, int] = {}
 
@@ -164,7 +166,13 @@ class RerunVisualizer(Visualizer):
                 self._layout,
                 draws_shapes=instance_id <= self.max_instances,
             )
-        self._drawings[instance_id].draw(events, {"step": step, TIME: self._now()})
+        clock = self._clocks.setdefault(instance_id, SimulatedClock())
+        events = clock.read(events)
+        times = {"step": step, TIME: self._now()}
+        if clock.seconds is not None:
+            times[SIM_TIME] = clock.seconds
+            self._layout.has_sim_time = True
+        self._drawings[instance_id].draw(events, times)
         self._flush_if_due()
 
     def capture(self) -> Array | None:

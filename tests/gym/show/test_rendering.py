@@ -82,11 +82,11 @@ def recorded(steps=20, robot="cartpole", **options):
     return env
 
 
-def transforms(path, instance=1):
+def transforms(path, instance=1, timeline="step"):
     """Return how many poses each step of a recording has."""
     counts: dict[int, int] = {}
     for chunk in rr.chunk.RrdReader(path).stream().filter(content=f"env_{instance}/tf"):
-        for step in chunk.to_record_batch().column("step").to_pylist():
+        for step in chunk.to_record_batch().column(timeline).cast("int64").to_pylist():
             counts[step] = counts.get(step, 0) + 1
     return counts
 
@@ -148,6 +148,8 @@ def test_a_replay_is_a_recording_in_real_time(tmp_path):
     assert env.replay(path=tmp_path / "a.rrd") == tmp_path / "a.rrd"
     frames = transforms(tmp_path / "a.rrd")
     assert sorted(frames) == list(range(16))  # 0.5 s at 30 a second
+    simulated = np.array(list(transforms(tmp_path / "a.rrd", timeline="sim_time")))  # in ns
+    np.testing.assert_allclose(simulated * 1e-9, np.arange(16) / 30, atol=1e-8)
     assert set(frames.values()) == {3}
 
 
@@ -295,7 +297,8 @@ class Fake(Visualizer):
         self.opened.append(self)
 
     def events(self, instance_id, step, events):
-        self.steps.append((instance_id, step, [event.action for event in events]))
+        actions = [event.action for event in events if event.kind != "time"]
+        self.steps.append((instance_id, step, actions))
         self.drawn |= {event.name: event.values for event in events}
 
     def close(self):

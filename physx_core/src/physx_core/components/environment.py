@@ -111,8 +111,11 @@ class Environment:
         episode_index: Index of the current trajectory, from 0.
         sample_episode: Index of the trajectory of the last training data.
         runs_programs: Whether arguments name programs to run, so that no file may give them.
+        step_time: Simulated time of a step, in s; None, the default: unknown. Viewers play what is
+            drawn in simulated time; if steps differ, call `Factory.set_time` instead.
     """
 
+    step_time: float | None = None
     runs_programs: ClassVar[bool] = False
 
     def __init__(
@@ -317,6 +320,8 @@ class Environment:
     def update_visualization(self) -> None:
         """Send the drawing events that `factory` collected since the last call to the viewers."""
         if self.factory:
+            if self.step_time is not None:
+                self.factory.set_time(self.step_index * self.step_time)
             self._run().show(self.instance_id, self.step_index, self.factory.take_events())
 
     def begin_episodes(self, episode: int | None = None) -> None:

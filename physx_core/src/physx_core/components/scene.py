@@ -212,6 +212,14 @@ class Factory:
         wanted = {} if follow is None else {"follow": follow}
         self._add("view", "view", title=title, **wanted, **camera)
 
+    def set_time(self, seconds: float) -> None:
+        """Set the simulated time of what is drawn until the next call, in s.
+
+        Viewers play what is drawn in this time; call it before the first object is added, too. With
+        `Environment.step_time` this is done.
+        """
+        self._events.append(Event("update", "time", "time", {"seconds": float(seconds)}))
+
     def _add(self, kind: str, name: str, **values: Any) -> str:
         if name in self._kinds:
             raise ConfigError(f'The factory already has an object "{name}".')
@@ -243,6 +251,9 @@ class NullFactory(Factory):
     def __bool__(self) -> bool:
         """Return False."""
         return False
+
+    def set_time(self, seconds: float) -> None:
+        """Do nothing."""
 
     def _add(self, kind: str, name: str, **values: Any) -> str:
         return name

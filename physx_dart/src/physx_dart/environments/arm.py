@@ -117,6 +117,7 @@ class ArmEnvironment(Environment):
         self.frequencies = (float(frequencies[0]), float(frequencies[1]))
         self.stiffness, self.damping = _gains("stiffness", stiffness), _gains("damping", damping)
         self.prediction_field = prediction_field
+        self.step_time = period * steps_per_sample
         self._steps = 0
         self._added = np.zeros(_JOINTS + 2)
 

@@ -52,6 +52,7 @@ class DoublePendulumEnvironment(Environment):
             raise ConfigError("steps_per_sample and episode_steps must be at least 1.")
         self.period, self.steps_per_sample = period, steps_per_sample
         self.episode_steps, self.torque_amplitude = episode_steps, torque_amplitude
+        self.step_time = period * steps_per_sample
         self._steps = 0
 
     def create(self) -> None:

@@ -94,6 +94,7 @@ class Renderer:
         else:
             self._drawing.move(poses)
             self._env._redraw(self._factory)
+        self._factory.set_time(simulator.simulation.time)
         self._viewer.events(1, self._frames, self._factory.take_events())
         self._frames += 1
         if self.mode == "human":

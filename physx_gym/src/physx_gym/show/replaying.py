@@ -136,6 +136,7 @@ class _Motion:
             self._drawing.add(poses)
         else:
             self._drawing.move(poses)
+        self._factory.set_time(time)
         shown.events(self._number, frame, self._factory.take_events())
 
     def close(self) -> None:

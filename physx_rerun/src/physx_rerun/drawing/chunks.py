@@ -16,10 +16,13 @@ import rerun as rr
 from physx_core.typing import Array
 
 Times = Mapping[str, float]
-"""Timeline to position: the timeline ``time`` in s, all others counted."""
+"""Timeline to position: the timelines `TIME` and `SIM_TIME` in s, all others counted."""
 
 TIME = "time"
 """Timeline of the seconds since the run began."""
+
+SIM_TIME = "sim_time"
+"""Timeline of the simulated time."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +149,7 @@ def _length(batch: Any) -> int:
 
 def _index(timeline: str, block: _Block) -> rr.TimeColumn:
     positions = np.repeat([times[timeline] for times in block.times], block.counts)
-    if timeline == TIME:
+    if timeline in (TIME, SIM_TIME):
         return rr.TimeColumn(timeline, duration=positions)
     return rr.TimeColumn(timeline, sequence=positions.astype(np.int64))
 

@@ -12,7 +12,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from physx_core.typing import Array
-from physx_rerun.drawing.chunks import TIME
+from physx_rerun.drawing.chunks import SIM_TIME, TIME
 
 _VIEW_FROM = np.array([1.0, -1.1, 0.65]) / np.linalg.norm([1.0, -1.1, 0.65])
 _BACKGROUND = (25, 28, 36)
@@ -35,11 +35,13 @@ class WindowLayout:
         instance_nb: Number of environment instances that can draw.
         changed: Whether something was added since the last call of `blueprint`.
         has_time_panel: Whether to show the time panel.
+        has_sim_time: Whether the simulated time is known.
     """
 
     instance_nb: int
     changed: bool = False
     has_time_panel: bool = True
+    has_sim_time: bool = False
     _kinds: set[tuple[str, str]] = field(default_factory=set)
     _scenes: dict[int, dict[str, Box]] = field(default_factory=dict)
     _plots: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -117,7 +119,8 @@ class WindowLayout:
     def timeline(self) -> str:
         """Timeline that the viewer begins with: one on which everything is visible."""
         if self._scenes or self._texts or "step" in self._timelines:
-            return "step" if self._timelines <= {"step"} else TIME
+            known = SIM_TIME if self.has_sim_time else "step"
+            return known if self._timelines <= {"step"} else TIME
         return "batch" if "batch" in self._timelines else next(iter(self._timelines), TIME)
 
     def blueprint(self) -> rrb.Blueprint:
