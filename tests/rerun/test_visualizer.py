@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
+import urllib.parse
+import urllib.request
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import rerun as rr
 from rerun.experimental import ViewerClient
@@ -32,7 +36,7 @@ def test_the_plugin_is_found_by_its_name():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"mode": "show"}, "'save', 'spawn', 'connect', 'headless'"),
+        ({"mode": "show"}, "'save', 'spawn', 'connect', 'web', 'headless'"),
         ({"mode": "connect"}, "HOST:PORT"),
         ({"mode": "connect", "address": "localhost"}, "HOST:PORT"),
         ({"address": "localhost:9876"}, 'mode "connect"'),
@@ -41,6 +45,9 @@ def test_the_plugin_is_found_by_its_name():
         ({"save": False}, "save=True"),
         ({"max_instances": -1}, "at least 0"),
         ({"port": "auto"}, "port"),
+        ({"mode": "connect", "address": ["localhost:1", "here"]}, "HOST:PORT"),
+        ({"page_port": 8000}, 'mode "web"'),
+        ({"every": 0}, "at least 1"),
         ({"picture_size": (10, 10)}, "64"),
     ],
 )
@@ -99,10 +106,66 @@ def test_a_viewer_of_its_own_outlives_the_run(monkeypatch, opened):
         visualizer.viewer.end()
 
 
-def test_nobody_listens(tmp_path):
-    address = f"127.0.0.1:{find_free_port()}"
-    with pytest.raises(VisualizerError, match=f"No Rerun viewer listens at {address}"):
-        RerunVisualizer(mode="connect", address=address).open("run", tmp_path, 1)
+def test_nobody_listens(opened):
+    port = find_free_port()
+    visualizer = opened(mode="connect", address=f"127.0.0.1:{port}")
+    (line,) = visualizer.announcements()
+    assert f"127.0.0.1:{port}" in line and line.endswith(f"rerun --bind 127.0.0.1 --port {port}")
+    ball(visualizer)
+    with pytest.warns(UserWarning, match=f"127.0.0.1:{port} was never there"):
+        visualizer.close()
+    assert visualizer.file.is_file()
+
+
+def test_nothing_is_drawn_nor_written_in_the_mode_none(opened, tmp_path):
+    visualizer = opened(mode="none")
+    ball(visualizer)
+    visualizer.scalars({"loss": 1.0}, 0, "batch")
+    visualizer.close()
+    assert not list(tmp_path.iterdir()) and not visualizer.outputs()
+
+
+def test_a_page_for_browsers(opened, tmp_path):
+    before = {child.pid for child in psutil.Process().children(recursive=True)}
+    visualizer = opened(mode="web")
+    (line,) = visualizer.announcements()
+    page, _, viewer = line.removeprefix("viewer: ").partition("?url=")
+    with urllib.request.urlopen(page, timeout=30) as answer:
+        assert answer.status == 200 and b"<html" in answer.read()
+    ball(visualizer)
+    visualizer.scalars({"loss/training": 1.0}, 0, "batch")
+    visualizer._flush()
+    received = tmp_path / "received.rrd"  # what a page that is opened now gets
+    with Viewer(0, (urllib.parse.unquote(viewer), "--save", str(received))).process:
+        deadline = time.monotonic() + 60
+        while not {"/env_1/ball", "/run/loss/training"} <= entities_of(received):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+    visualizer.close()
+    assert {child.pid for child in psutil.Process().children(recursive=True)} == before
+    assert visualizer.file.is_file()
+
+
+def entities_of(path):
+    with contextlib.suppress(FileNotFoundError, ValueError):  # there is nothing in it yet
+        return {chunk.entity_path for chunk in rr.chunk.RrdReader(path).stream()}
+    return set()
+
+
+def test_every_third_step_is_recorded_and_the_last(opened, read):
+    visualizer = opened(every=3)
+    factory = ball(visualizer)
+    factory.add_scalars("error", ["x"])
+    for step in range(1, 12):
+        factory.update_scalars("error", [step])
+        if step < 6:
+            factory.update_sphere("ball", position=[step, 0.0, 0.0])
+        visualizer.events(1, step, factory.take_events())
+    visualizer.close()
+    numbers = read(visualizer.file, "/env_1/error", "Scalars:scalars")
+    assert numbers == [(step, [step]) for step in (1, 3, 6, 9, 11)]  # at 1 it was added
+    places = read(visualizer.file, "/env_1/tf", "Transform3D:translation")
+    assert [(step, place[0][0]) for step, place in places] == [(0, 0), (1, 1), (3, 3), (6, 5)]
 
 
 def test_the_file_lies_in_the_session_and_is_never_overwritten(opened, tmp_path):

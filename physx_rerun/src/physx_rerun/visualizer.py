@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import physx_rerun.viewer.messages  # isort: skip  # noqa: F401  (before Rerun is imported)
+
 import re
 import shlex
 import time
@@ -18,6 +20,7 @@ from physx_core.config import at_least, options
 from physx_core.errors import ConfigError, VisualizerError
 from physx_core.typing import Array
 from physx_rerun.drawing import colors
+from physx_rerun.drawing.changes import Changes
 from physx_rerun.drawing.chunks import SIM_TIME, TIME, ChunkBuilder
 from physx_rerun.drawing.clock import SimulatedClock
 from physx_rerun.drawing.drawing import Drawing
@@ -25,9 +28,9 @@ from physx_rerun.drawing.windows import WindowLayout
 from physx_rerun.viewer.headless import render_picture
 from physx_rerun.viewer.offscreen import OffscreenViewer
 from physx_rerun.viewer.streams import RecordingStreams
-from physx_rerun.viewer.viewer import Viewer, has_display, is_listening
+from physx_rerun.viewer.viewer import Viewer, has_display, is_listening, start_web_viewer
 
-MODES = ("save", "spawn", "connect", "headless", "offscreen")
+MODES = ("save", "spawn", "connect", "web", "headless", "offscreen", "none")
 BINS = 30
 FLUSH_SECONDS = 0.2
 FLUSH_STEPS = 100
@@ -46,17 +49,19 @@ class RerunVisualizer(Visualizer):
     """
 
     mode: str = field(default="save", metadata={"choices": MODES})
-    """"save": only write a file; "spawn": open a viewer; "connect": show in a running viewer;
-    "headless": write a file, and a picture at the end; "offscreen": render pictures for
-    `capture`."""
+    """"save": only write a file; "spawn": open a viewer; "connect": show in running viewers;
+    "web": serve a page for browsers; "headless": write a file, and a picture at the end;
+    "offscreen": render pictures for `capture`; "none": neither draw nor write."""
     path: str | Path | None = None
     """The .rrd file; None: a new file in the session's folder, named like the run."""
     save: bool = True
     """Whether to write the file."""
-    address: str | None = None
-    """Viewer to connect to, "HOST:PORT"."""
+    address: str | Sequence[str] | None = None
+    """Viewers to connect to, each "HOST:PORT"; they can be started later, and again."""
     port: int = at_least(0, 0)
     """Port of the opened viewer; 0: any free one."""
+    page_port: int = at_least(0, 0)
+    """Port of the page of the mode "web"; 0: any free one."""
     memory_limit: str = "2GB"
     """Memory of the opened viewer, beyond which it drops the oldest rows."""
     picture: str | Path | None = None
@@ -65,6 +70,8 @@ class RerunVisualizer(Visualizer):
     """Width and height in pixels of the pictures of the headless and offscreen modes."""
     max_instances: int = at_least(0, 4)
     """Number of instances to draw completely; of others only numbers and texts are recorded."""
+    every: int = at_least(1, 1)
+    """Number of steps of an environment from one that is recorded to the next."""
 
     def __post_init__(self) -> None:
         """Check that the options are consistent, and start with an empty scene.
@@ -80,9 +87,10 @@ class RerunVisualizer(Visualizer):
         self._offscreen: OffscreenViewer | None = None
         self._step, self._pictures = 0, 0
         self.file: Path | None = None
+        self._announcements: list[str] = []
         self._outputs: list[str] = []
         self._run_name = "run"
-        self._address: str | None = None
+        self._addresses: list[str] = []
         self._recording: RecordingStreams | None = None
         self._is_open = False
         self._begun = time.monotonic()
@@ -90,20 +98,28 @@ class RerunVisualizer(Visualizer):
         self._rows, self._layout = ChunkBuilder(), WindowLayout(1)
         self._drawings: dict[int, Drawing] = {}
         self._clocks: dict[int, SimulatedClock] = {}
+        self._changes: dict[int, Changes] = {}
         self._curves: set[str] = set()
         self._positions: dict[str, int] = {}
 
     def _check_options(self) -> None:
-        if self.mode == "connect" and not re.fullmatch(r".+:\d{1,5}", self.address or ""):
-            raise ConfigError('mode "connect" needs address="HOST:PORT" of a running viewer.')
+        addresses = self._given_addresses()
+        if self.mode == "connect" and not (addresses and all(map(_is_address, addresses))):
+            raise ConfigError('mode "connect" needs address="HOST:PORT" of a viewer, or several.')
         if self.mode != "connect" and self.address is not None:
             raise ConfigError(f'address is for mode "connect", not for "{self.mode}".')
         if self.mode != "headless" and self.picture is not None:
             raise ConfigError(f'picture is for mode "headless", not for "{self.mode}".')
+        if self.mode != "web" and self.page_port:
+            raise ConfigError(f'page_port is for mode "web", not for "{self.mode}".')
         if self.mode in ("save", "headless") and not self.save:
             raise ConfigError(f'mode "{self.mode}" needs the file: set save=True.')
         if min(self.picture_size) < 64:
             raise ConfigError(f"picture_size {self.picture_size} is smaller than 64 pixels.")
+
+    def _given_addresses(self) -> list[str]:
+        given = self.address or ()
+        return [given] if isinstance(given, str) else list(given)
 
     # What the pipeline calls ----------------------------------------------------------------
 
@@ -111,23 +127,31 @@ class RerunVisualizer(Visualizer):
         """Connect to or start the viewer and choose the file; see `Observer.open`.
 
         Raises:
-            VisualizerError: If no viewer listens at `address`, or there is no display.
+            VisualizerError: If a viewer cannot be started, for example without a display.
         """
         self._reset()
+        if self.mode == "none":
+            return
         self._run_name, self._layout = run_name, WindowLayout(instance_nb)
         self._layout.has_time_panel = self.mode != "offscreen"
         if self.mode == "connect":
-            self._address = str(self.address)
-            if not is_listening(self._address):
-                raise VisualizerError(
-                    f"No Rerun viewer listens at {self._address}. Start one there with: "
-                    f"rerun --bind 127.0.0.1 --port {self._address.rpartition(':')[2]}"
-                )
+            self._addresses = self._given_addresses()
+            self._announcements = [
+                f"viewer: none at {address} yet; start one there with: "
+                f"rerun --bind 127.0.0.1 --port {address.rpartition(':')[2]}"
+                for address in self._addresses
+                if not is_listening(address)
+            ]
         if self.mode == "spawn":
             self._spawn()
+        if self.mode == "web":
+            limit = ("--server-memory-limit", self.memory_limit)
+            self.viewer = start_web_viewer(self.port, self.page_port, *limit)
+            self._addresses = [self.viewer.address]
+            self._announcements = [f"viewer: {self.viewer.page}"]
         if self.mode == "offscreen":
             self._offscreen = OffscreenViewer(self.picture_size, self.memory_limit)
-            self._address = self._offscreen.address
+            self._addresses = [self._offscreen.address]
         if self.save:
             self.file = Path(self.path) if self.path else _unused_path(Path(session_dir), run_name)
         self._is_open = True
@@ -147,7 +171,11 @@ class RerunVisualizer(Visualizer):
         self.viewer = Viewer(self.port, options, lives_on=True)
         self.viewer.wait_until_ready()
         self.viewer.check(wait=1.0)  # it listens before its window opens
-        self._address = self.viewer.address
+        self._addresses = [self.viewer.address]
+
+    def announcements(self) -> Sequence[str]:
+        """Tell where the viewer is, or how to start one: see `Observer.announcements`."""
+        return self._announcements
 
     def events(self, instance_id: int, step: int, events: list[Event]) -> None:
         """Draw the events of one step; see `Observer.events`.
@@ -159,6 +187,15 @@ class RerunVisualizer(Visualizer):
         if not self._is_open:
             return
         self._step = step
+        events = self._clocks.setdefault(instance_id, SimulatedClock()).read(events)
+        if self.every > 1:
+            changes = self._changes.setdefault(instance_id, Changes())
+            if changes.add(step, events) and step % self.every:
+                return
+            events = changes.pop()
+        self._draw(instance_id, step, events)
+
+    def _draw(self, instance_id: int, step: int, events: list[Event]) -> None:
         if instance_id not in self._drawings:
             self._drawings[instance_id] = Drawing(
                 instance_id,
@@ -166,14 +203,17 @@ class RerunVisualizer(Visualizer):
                 self._layout,
                 draws_shapes=instance_id <= self.max_instances,
             )
-        clock = self._clocks.setdefault(instance_id, SimulatedClock())
-        events = clock.read(events)
         times = {"step": step, TIME: self._now()}
-        if clock.seconds is not None:
-            times[SIM_TIME] = clock.seconds
+        seconds = self._clocks[instance_id].seconds
+        if seconds is not None:
+            times[SIM_TIME] = seconds
             self._layout.has_sim_time = True
         self._drawings[instance_id].draw(events, times)
         self._flush_if_due()
+
+    def _draw_changes(self) -> None:
+        for instance_id, changes in self._changes.items():
+            self._draw(instance_id, changes.step, changes.pop())
 
     def capture(self) -> Array | None:
         """Return a picture of the last step in the offscreen mode; see `Visualizer.capture`.
@@ -183,6 +223,7 @@ class RerunVisualizer(Visualizer):
         """
         if self._offscreen is None:
             return None
+        self._draw_changes()
         self._pictures += 1
         # Rows arrive in order: once this one has arrived, all rows of the picture have.
         self._rows.add(_MARK, rr.Scalars, {_MARK: self._pictures}, scalars=[0.0])
@@ -234,6 +275,7 @@ class RerunVisualizer(Visualizer):
             return
         self._is_open = False
         try:
+            self._draw_changes()
             self._flush()
         finally:
             if self._recording is not None:
@@ -241,6 +283,8 @@ class RerunVisualizer(Visualizer):
             if self._offscreen is not None:
                 self._offscreen.close()
                 self._offscreen = None
+            if self.mode == "web" and self.viewer is not None:
+                self.viewer.end()
         if self._recording is None:
             return
         self._recording = self._offscreen = None
@@ -277,12 +321,16 @@ class RerunVisualizer(Visualizer):
                 f"physx {self._run_name} {self._layout.digest}",
                 self._run_name,
                 self.file,
-                self._address,
+                self._addresses,
                 owns_viewer=self.viewer is not None or self._offscreen is not None,
             )
         self._recording.write(chunks)
         if self._layout.changed:
             self._recording.write_blueprint(self._layout.blueprint())
+
+
+def _is_address(text: str) -> bool:
+    return re.fullmatch(r".+:\d{1,5}", text) is not None
 
 
 def _entity_of(name: str) -> str:

@@ -15,8 +15,8 @@ import rerun as rr
 
 from physx_core.components import Factory
 from physx_rerun.drawing.chunks import ChunkBuilder
-from physx_rerun.viewer import streams
 from physx_rerun.viewer.streams import LiveWriter
+from physx_rerun.viewer.viewer import Viewer, find_free_port
 
 
 def steps_of(path, entity="/env_1/error"):
@@ -26,6 +26,18 @@ def steps_of(path, entity="/env_1/error"):
         if "Scalars:scalars" in batch.schema.names:
             steps += batch.column("step").to_pylist()
     return sorted(steps)
+
+
+def wait_for_steps(path, is_enough):
+    """Wait until a receiver, which writes its file behind what it has taken, has these steps."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        with contextlib.suppress(FileNotFoundError, ValueError):  # there is nothing in it yet
+            steps = steps_of(path)
+            if is_enough(steps):
+                return steps
+        time.sleep(0.05)
+    raise TimeoutError(f"{path} has the steps {steps_of(path)}.")
 
 
 def run_steps(visualizer, count, first=0, factory=None):
@@ -43,12 +55,7 @@ def test_a_live_viewer_gets_everything(opened, receiver):
     visualizer = opened(mode="connect", address=viewer.address)
     run_steps(visualizer, 350)
     visualizer.close()
-    deadline = time.monotonic() + 60  # the receiver writes its file behind what it has taken
-    while time.monotonic() < deadline:
-        with contextlib.suppress(FileNotFoundError, ValueError):  # there is nothing in it yet
-            if len(steps_of(path)) == 350:
-                break
-        time.sleep(0.05)
+    wait_for_steps(path, lambda steps: len(steps) == 350)
     assert steps_of(path) == steps_of(visualizer.file) == list(range(350))
     live, file = (rr.chunk.RrdReader(p).recordings()[0] for p in (path, visualizer.file))
     assert (live.application_id, live.recording_id) == (file.application_id, file.recording_id)
@@ -64,6 +71,84 @@ def test_a_viewer_that_dies(opened, receiver):
     with pytest.warns(UserWarning, match=f"{viewer.address}"):
         visualizer.close()
     assert steps_of(visualizer.file) == list(range(400))
+
+
+COMING = """
+    import pathlib, sys
+    from physx_rerun.visualizer import RerunVisualizer
+    from physx_rerun.viewer import streams
+    from physx_core.components import Factory
+
+    streams.RETRY_SECONDS = 0.05
+    folder, *addresses = sys.argv[1:]
+    visualizer = RerunVisualizer(mode="connect", address=addresses)
+    visualizer.open("run", pathlib.Path(folder), 1)
+    factory = Factory()
+    factory.add_scalars("error", ["x"])
+    for name in ("fixed", "moving"):
+        factory.add_box(name, (1.0, 1.0, 1.0))
+    for step, _ in enumerate(sys.stdin):
+        factory.update_scalars("error", [step])
+        factory.update_box("moving", position=[step, 0.0, 0.0])
+        visualizer.events(1, step, factory.take_events())
+    visualizer.close()
+"""
+
+
+@contextlib.contextmanager
+def receiving(port, path):
+    viewer = Viewer(port, ("--save", str(path)))
+    viewer.wait_until_ready()
+    yield
+    viewer.process.send_signal(signal.SIGKILL)
+    viewer.end()
+
+
+def test_viewers_that_come_late_and_come_back_get_the_last_state_and_go_on(python, tmp_path):
+    """Two viewers: one is there from the start, is killed, and comes back; the other comes late."""
+    one, two = find_free_port(), find_free_port()
+    command = [python, "-c", textwrap.dedent(COMING), str(tmp_path)]
+    command += [f"127.0.0.1:{port}" for port in (one, two)]
+    pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "bufsize": 1}
+    first, back, late = (tmp_path / f"{name}.rrd" for name in ("first", "back", "late"))
+    with contextlib.ExitStack() as viewers, subprocess.Popen(command, **pipes) as run:
+
+        def step_until_it_has_some(path):
+            deadline = time.monotonic() + 60
+            while time.monotonic() < deadline:
+                for _ in range(5):
+                    run.stdin.write("step\n")
+                time.sleep(0.05)
+                with contextlib.suppress(FileNotFoundError, ValueError):
+                    if len(steps_of(path)) > 20:
+                        return
+            raise TimeoutError(path)
+
+        with receiving(one, first):
+            step_until_it_has_some(first)
+        viewers.enter_context(receiving(one, back))
+        step_until_it_has_some(back)
+        viewers.enter_context(receiving(two, late))
+        step_until_it_has_some(late)
+        _, errors = run.communicate(timeout=60)
+        assert run.returncode == 0, errors
+        assert "\x1b" not in errors  # Rerun's own messages are colored
+        assert errors.count("not there all the time") == 2
+        every = steps_of(tmp_path / "run.rrd")
+        assert every == list(range(len(every)))
+        for path in (back, late):
+            steps = wait_for_steps(path, lambda steps: steps[-1:] == every[-1:])
+            assert steps[0] > 0 and steps == list(range(steps[0], len(every)))
+            assert frames_of(path) == {"env_1/fixed", "env_1/moving"}
+            assert rr.chunk.RrdReader(path).blueprints()
+
+
+def frames_of(path):
+    frames = set()
+    for chunk in rr.chunk.RrdReader(path).stream().filter(content="/env_1/tf"):
+        names = chunk.to_record_batch()["Transform3D:child_frame"].to_pylist()
+        frames |= {name for (name,) in names}
+    return frames
 
 
 HANGING = """
@@ -103,7 +188,6 @@ def test_a_viewer_that_hangs_holds_up_neither_run_nor_exit(receiver, python, tmp
 
 def test_rows_for_a_viewer_that_hangs_are_dropped_and_counted(receiver, monkeypatch):
     viewer, _ = receiver
-    monkeypatch.setattr(streams, "CLOSE_SECONDS", 0.2)
     monkeypatch.setattr(rr, "unregister_shutdown", lambda: None)
     writer = LiveWriter("test", "test", "test", viewer.address)
     rows = ChunkBuilder()
@@ -113,15 +197,16 @@ def test_rows_for_a_viewer_that_hangs_are_dropped_and_counted(receiver, monkeypa
     viewer.process.send_signal(signal.SIGSTOP)
     try:
         puts = 0
-        while writer.dropped < 3 and puts < 200:
+        while writer.missed < 3 and puts < 200:
             writer.put(chunk)
             puts += 1
             time.sleep(0.02)
-        assert 0 < writer.dropped < puts
+        assert 0 < writer.missed < puts
         with pytest.warns(UserWarning) as warned:
-            writer.close()
+            writer.end()
+            writer.close(time.monotonic() + 0.2)
         texts = [str(warning.message) for warning in warned]
-        assert any(f"missed {writer.dropped} blocks" in text for text in texts)
+        assert any(f"missed {writer.missed} blocks" in text for text in texts)
     finally:
         viewer.process.send_signal(signal.SIGCONT)
 

@@ -27,6 +27,13 @@ class Observer:
             instance_nb: Number of environment instances that can draw.
         """
 
+    def announcements(self) -> Sequence[str]:
+        """Return lines for the user at the start of a run, for example ``viewer: URL``.
+
+        Called after `open`.
+        """
+        return ()
+
     def begin(self, task: str, total: int | None, unit: str) -> None:
         """Called at the start of a loop.
 

@@ -35,6 +35,10 @@ class Observers(Observer):
             self.close()
             raise
 
+    def announcements(self) -> Sequence[str]:
+        """Return the lines of all observers."""
+        return [line for lines in self._call("announcements") for line in lines]
+
     def begin(self, task: str, total: int | None, unit: str) -> None:
         """Announce a loop."""
         self._call("begin", task, total, unit)

@@ -115,7 +115,8 @@ class Pipeline(ABC):
             if self.session is not None:
                 remove_unused(self.session, opened=False)
             raise
-        self._say(f"session: {self.session.path}{self._why_here()}", *self._plan())
+        announcements = (*self._plan(), *self.observers.announcements())
+        self._say(f"session: {self.session.path}{self._why_here()}", *announcements)
         return self
 
     def __exit__(

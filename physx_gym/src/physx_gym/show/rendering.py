@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,7 @@ def open_viewer(title: str, instances: int = 1, **options: Any) -> Visualizer:
     kind: Any = plugins.resolve("visualizer", options.pop("visualizer", VIEWER))
     viewer: Visualizer = kind(**options)
     viewer.open(title, Path(tempfile.gettempdir()), instances)
+    sys.stderr.write("".join(f"{line}\n" for line in viewer.announcements()))
     return viewer
 
 

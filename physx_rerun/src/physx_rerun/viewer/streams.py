@@ -1,13 +1,15 @@
-"""RecordingStreams: writes a recording to a file, to a live viewer, or to both."""
+"""RecordingStreams: writes a recording to a file, to live viewers, or to both."""
 
 from __future__ import annotations
 
 import contextlib
 import queue
+import socket
 import threading
+import time
 import uuid
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import rerun as rr
@@ -15,24 +17,29 @@ import rerun.blueprint as rrb
 
 from physx_core.errors import VisualizerError
 from physx_rerun.drawing.chunks import Chunk
+from physx_rerun.viewer.viewer import connect
 
 QUEUE_BYTES = 64_000_000
 """Largest size of the rows that wait for a live viewer; further rows are dropped."""
 QUEUE_LENGTH = 4096
 """Largest number of chunks that wait for a live viewer; further rows are dropped."""
 CLOSE_SECONDS = 3.0
-"""Time that the end of a run waits for a live viewer."""
+"""Time that the end of a run waits for live viewers."""
+RETRY_SECONDS = 2.0
+"""Time between two looks for a live viewer that is not there."""
+
+_FRAME = "Transform3D:child_frame"
 
 
 class RecordingStreams:
-    """A run's recording. The file gets all rows, a live viewer those that it can keep up with."""
+    """A run's recording. The file gets all rows, live viewers those that they can keep up with."""
 
     def __init__(
         self,
         application_id: str,
         run_name: str,
         path: Path | None,
-        address: str | None,
+        addresses: Sequence[str],
         *,
         owns_viewer: bool,
     ) -> None:
@@ -42,7 +49,7 @@ class RecordingStreams:
             application_id: Name under which viewers store the user's layout.
             run_name: Name of the recording.
             path: File to write; None: none.
-            address: Address of a live viewer, ``HOST:PORT``; None: none.
+            addresses: Addresses of live viewers, ``HOST:PORT``.
             owns_viewer: Whether the viewer was started for this run, so that its layout can be
                 replaced.
         """
@@ -58,33 +65,35 @@ class RecordingStreams:
                     f"The recording {path} cannot be written: {error}."
                 ) from error
             self._file.send_recording_name(run_name)
-        self._live = (
-            LiveWriter(application_id, recording_id, run_name, address) if address else None
-        )
+        self._live = [
+            LiveWriter(application_id, recording_id, run_name, address) for address in addresses
+        ]
 
     def write(self, chunks: Iterable[Chunk]) -> None:
-        """Write chunks, without waiting for a live viewer."""
+        """Write chunks, without waiting for live viewers."""
         for chunk in chunks:
             if self._file:
                 chunk.send(self._file)
-            if self._live:
-                self._live.put(chunk)
+            for live in self._live:
+                live.put(chunk)
 
     def write_blueprint(self, blueprint: rrb.Blueprint) -> None:
         """Write the layout of the windows."""
         if self._file:
             self._file.send_blueprint(blueprint)
-        if self._live:
-            self._live.put(_QueuedBlueprint(blueprint, make_active=self._owns_viewer))
+        for live in self._live:
+            live.put(_QueuedBlueprint(blueprint, make_active=self._owns_viewer))
 
     def close(self) -> None:
-        """Finish the file and disconnect the live viewer; warn of rows that it did not get."""
+        """Finish the file and disconnect live viewers; warn of rows that they did not get."""
         if self._file:
             self._file.disconnect()
             self._file = None
-        if self._live:
-            self._live.close()
-            self._live = None
+        for live in self._live:
+            live.end()
+        deadline = time.monotonic() + CLOSE_SECONDS
+        while self._live:
+            self._live.pop(0).close(deadline)
 
 
 class _QueuedBlueprint:
@@ -101,11 +110,17 @@ class _QueuedBlueprint:
         stream.send_blueprint(self._blueprint, make_active=self._make_active)
 
 
+_Item = Chunk | _QueuedBlueprint
+
+
 class LiveWriter:
     """Writes to a live viewer in a thread of its own, as a hanging viewer blocks its writer.
 
+    There need not be a viewer. One that is started later, or again, is sent the layout and the
+    last state of everything, and from then on all rows.
+
     Attributes:
-        dropped: Chunks that were dropped because the viewer could not keep up.
+        missed: Blocks of rows that the viewer did not get, as it was too slow or not there.
     """
 
     def __init__(self, application_id: str, recording_id: str, run_name: str, address: str) -> None:
@@ -117,59 +132,156 @@ class LiveWriter:
             run_name: Name of the recording.
             address: Address of the viewer, ``HOST:PORT``.
         """
-        self.dropped = 0
+        self.missed = 0
+        self._identity = (application_id, recording_id, run_name)
         self._address = address
-        self._queue: queue.SimpleQueue[Chunk | _QueuedBlueprint | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[_Item | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._waiting_bytes = 0
+        self._state = _LastState()
+        self._stream: rr.RecordingStream | None = None
+        self._canary: socket.socket | None = None
         self._failure: BaseException | None = None
-        self._thread = threading.Thread(
-            target=self._run,
-            args=(application_id, recording_id, run_name),
-            name="physx-rerun",
-            daemon=True,
-        )
+        self._thread = threading.Thread(target=self._run, name="physx-rerun", daemon=True)
         self._thread.start()
 
-    def put(self, item: Chunk | _QueuedBlueprint) -> None:
+    def put(self, item: _Item) -> None:
         """Queue an item; rows are dropped while the queue is full, static data never."""
         with self._lock:
             is_full = self._waiting_bytes > QUEUE_BYTES or self._queue.qsize() > QUEUE_LENGTH
             if is_full and not item.is_static:
-                self.dropped += 1
+                self.missed += 1
                 return
             self._waiting_bytes += item.nbytes
         self._queue.put(item)
 
-    def close(self) -> None:
-        """Give the viewer some time to receive the rest, then disconnect."""
+    def end(self) -> None:
+        """Let the thread end once it has sent what is queued."""
         self._queue.put(None)
-        self._thread.join(CLOSE_SECONDS)
+
+    def close(self, deadline: float) -> None:
+        """Wait until the viewer has received everything; warn if it has not.
+
+        Args:
+            deadline: Time after which to give up, as of `time.monotonic`.
+        """
+        self._thread.join(max(0.0, deadline - time.monotonic()))
         if self._thread.is_alive():
             # Rerun would otherwise wait for the viewer when the interpreter ends.
             rr.unregister_shutdown()
-            warnings.warn(f"The Rerun viewer at {self._address} does not respond.", stacklevel=3)
+            problem = "does not respond"
         elif self._failure is not None:
-            text = f"The Rerun viewer at {self._address} disconnected: {self._failure}."
-            warnings.warn(text, stacklevel=3)
-        if self.dropped:
-            warnings.warn(
-                f"The Rerun viewer at {self._address} was too slow: it missed "
-                f"{self.dropped} blocks of rows. A saved file contains them.",
-                stacklevel=3,
-            )
+            problem = f"disconnected ({self._failure})"
+        elif self._stream is None:
+            problem = "was never there"
+        elif self.missed:
+            problem = "was too slow, or not there all the time"
+        else:
+            return
+        warnings.warn(
+            f"The Rerun viewer at {self._address} {problem}: it missed {self.missed} blocks of "
+            "rows. A saved file contains them.",
+            stacklevel=3,
+        )
 
-    def _run(self, application_id: str, recording_id: str, run_name: str) -> None:
-        stream = rr.RecordingStream(application_id, recording_id=recording_id)
-        try:
-            stream.connect_grpc(f"rerun+http://{self._address}/proxy")
-            stream.send_recording_name(run_name)
-            while (item := self._queue.get()) is not None:
-                item.send(stream)
-                with self._lock:
-                    self._waiting_bytes -= item.nbytes
-            stream.flush(timeout_sec=CLOSE_SECONDS)
-        except Exception as error:  # a viewer can fail in any way, which must not end a run
-            self._failure = error
-        with contextlib.suppress(Exception):
+    def _run(self) -> None:
+        look_at, is_over = 0.0, False
+        while not is_over:
+            item = None
+            with contextlib.suppress(queue.Empty):
+                item = self._queue.get(timeout=RETRY_SECONDS)
+                is_over = item is None
+            if self._stream is not None and self._is_gone():
+                self._disconnect(ConnectionError("it is gone"))
+            if self._stream is None and (is_over or time.monotonic() >= look_at):
+                self._connect()
+                look_at = time.monotonic() + RETRY_SECONDS
+            if item is not None:
+                self._send(item)
+        stream = self._stream
+        if stream is not None:
+            with self._disconnecting_on_failure():
+                stream.flush(timeout_sec=CLOSE_SECONDS)
             stream.disconnect()
+
+    def _send(self, item: _Item) -> None:
+        self._state.add(item)
+        if self._stream is not None:
+            with self._disconnecting_on_failure():
+                item.send(self._stream)
+        with self._lock:
+            self._waiting_bytes -= item.nbytes
+            self.missed += self._stream is None and not item.is_static
+
+    def _connect(self) -> None:
+        """Connect to the viewer if it is there, and send it what it has missed."""
+        # Rerun's own connection takes 5 s where nobody listens, and never tells that it is lost.
+        self._canary = connect(self._address)
+        if self._canary is None:
+            return
+        self._canary.setblocking(False)
+        application_id, recording_id, run_name = self._identity
+        with self._disconnecting_on_failure():
+            self._stream = rr.RecordingStream(application_id, recording_id=recording_id)
+            self._stream.connect_grpc(f"rerun+http://{self._address}/proxy")
+            self._stream.send_recording_name(run_name)
+            for item in self._state.items():
+                item.send(self._stream)
+            self._failure = None
+
+    def _is_gone(self) -> bool:
+        """Return whether the viewer has closed its end of the connection."""
+        assert self._canary is not None
+        try:
+            return not self._canary.recv(1024)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+
+    @contextlib.contextmanager
+    def _disconnecting_on_failure(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # a viewer can fail in any way, which must not end a run
+            self._disconnect(error)
+
+    def _disconnect(self, reason: Exception) -> None:
+        self._failure = reason
+        with self._lock:
+            self.missed += 1  # what was on its way, at least
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            with contextlib.suppress(Exception):
+                stream.disconnect()
+        if self._canary is not None:
+            self._canary.close()
+
+
+class _LastState:
+    """The last value of everything that was drawn, for a viewer that has missed it."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._items: dict[tuple[str, ...], tuple[int, _Item]] = {}
+
+    def add(self, item: _Item) -> None:
+        """Add an item, and forget those that it overrides."""
+        self._count += 1
+        for key in _keys(item):
+            self._items[key] = (self._count, item)
+
+    def items(self) -> list[_Item]:
+        """Return the items that are not overridden, in the order in which they came."""
+        numbered = dict(self._items.values())
+        return [numbered[number] for number in sorted(numbered)]
+
+
+def _keys(item: _Item) -> Iterable[tuple[str, ...]]:
+    """Return what an item sets: the components of an entity, for each of the frames it moves."""
+    if not isinstance(item, Chunk):
+        return [("blueprint",)]
+    columns = {str(column.component_descriptor()): column for column in item.columns}
+    frames = columns.get(_FRAME)
+    moved = {()} if frames is None else set(map(tuple, frames.as_arrow_array().to_pylist()))
+    return [(item.entity, *columns, *frame) for frame in moved]

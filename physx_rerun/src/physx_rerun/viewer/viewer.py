@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from urllib.parse import quote
 
 import rerun_cli
 
@@ -39,14 +40,22 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def is_listening(address: str, timeout: float = 0.5) -> bool:
-    """Return whether a process listens at ``HOST:PORT``."""
+def connect(address: str, timeout: float = 0.5) -> socket.socket | None:
+    """Return a connection to the process that listens at ``HOST:PORT``; None if there is none."""
     host, _, port = address.rpartition(":")
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), timeout):
-            return True
+        return socket.create_connection((host.strip("[]"), int(port)), timeout)
     except OSError:
+        return None
+
+
+def is_listening(address: str) -> bool:
+    """Return whether a process listens at ``HOST:PORT``."""
+    connection = connect(address)
+    if connection is None:
         return False
+    connection.close()
+    return True
 
 
 def find_free_port() -> int:
@@ -62,8 +71,11 @@ class Viewer:
 
     Attributes:
         address: Address of the viewer, ``127.0.0.1:PORT``.
+        page: Its page for browsers, if it is one of `start_web_viewer`.
         process: The process.
     """
+
+    page: str | None = None
 
     def __init__(
         self,
@@ -120,3 +132,22 @@ class Viewer:
     def end(self) -> None:
         """End the process and wait for it."""
         self.process.close()
+
+
+def start_web_viewer(port: int, page_port: int, *options: str) -> Viewer:
+    """Start a viewer that serves a page to browsers on this machine.
+
+    Args:
+        port: Port of the viewer; 0: any free one.
+        page_port: Port of the page; 0: any free one.
+        options: Further command-line options, and recordings to show.
+    """
+    page_port = page_port or find_free_port()
+    if is_listening(f"127.0.0.1:{page_port}"):
+        raise VisualizerError(f"Port {page_port} is taken: choose another one for the page.")
+    viewer = Viewer(port, ("--serve-web", "--web-viewer-port", str(page_port), *options))
+    viewer.page = (
+        f"http://127.0.0.1:{page_port}/?url={quote(f'rerun+http://{viewer.address}/proxy', '')}"
+    )
+    viewer.wait_until_ready()
+    return viewer
