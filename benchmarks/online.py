@@ -1,20 +1,31 @@
 """Online training: simulating and learning at the same time.
 
-    python benchmarks/online.py
     python benchmarks/online.py --check
+    python benchmarks/online.py --only overlap waits        # timings: these need a quiet machine
 
-Overlap: one client simulates, with about the cost of a batch that its learner has. Claim: the
-training makes at least 0.92 times as many batches a second as the slower of the two makes alone,
-and neither waits for the other for more than 2 % of the time beyond what counts demand.
+overlap: one client simulates, with about the cost of a batch that its learner has. The training
+makes at least 0.92 times as many batches a second as the slower of the two makes alone.
+waits: neither waits for the other for more than 2 % of the time beyond what counts demand.
+memory: it does not grow while ten times as many rows come as a reservoir holds.
+repeated: with clients of any speed and one busy core a training ends with the same network, bit for
+bit, and so does one whose sampler learns.
+learned: a reservoir learns more from as many simulations than a stream, and as much as a training
+on stored samples, shuffled.
+chosen: simulations where the loss is high make the largest errors smaller than random ones do.
 """
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import ctypes
 import resource
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -137,20 +148,33 @@ def waits() -> list[bool]:
 
 
 class Watched(Training):
-    """A training that notes how much memory this process has after each batch."""
+    """A training that notes how much memory this process has after each batch.
+
+    It lets the clients run ahead as far as they may, so that as many rows wait for it each time.
+    The C library gives back what is freed, so that this is the memory in use.
+    """
 
     resident: list[float]
 
     def batch_end(self) -> None:
-        """Note the memory, in MiB."""
+        """Wait until the clients are ahead, and note the memory, in MiB."""
         super().batch_end()
+        dataset, deadline = self.data.dataset, time.monotonic() + 10
+        rows = min(self.batch_id + RUN_AHEAD, self.batch_nb or 0) * BATCH
+        while dataset.num_samples("training") < rows and time.monotonic() < deadline:
+            time.sleep(0.001)
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         self.resident.append(pages * resource.getpagesize() / 2**20)
 
 
-def memory() -> bool:
+CAPACITY, TIMES, RUN_AHEAD = 500, 10, 60
+MMAP_THRESHOLD, SMALL = -3, 2**16  # from which size on memory is mapped, and unmapped when freed
+
+
+def memory() -> list[bool]:
     """Measure how the memory grows from when a reservoir is full until ten times as many rows."""
-    capacity, size = 500, 2**13
+    ctypes.CDLL(None).mallopt(MMAP_THRESHOLD, SMALL)
+    size = 2**13
     config = EnvironmentConfig(
         "online_problems:Large", as_tcp_ip_client=True, env_kwargs={"size": size}, seed=0
     )
@@ -160,16 +184,16 @@ def memory() -> bool:
     )
     with tempfile.TemporaryDirectory() as folder:
         training = Watched(
-            linear, None, config, epoch_nb=1, batch_nb=10 * capacity // BATCH,
-            online="physx/reservoir", online_kwargs={"capacity": capacity}, **common(folder),
+            linear, None, config, epoch_nb=1, batch_nb=TIMES * CAPACITY // BATCH,
+            online="physx/reservoir", online_kwargs={"capacity": CAPACITY}, **common(folder),
         )  # fmt: skip
         training.resident = []
         training.execute()
-    found = training.resident[len(training.resident) // 4 :]
-    reservoir = capacity * size * 4 / 2**20
-    print(f"A reservoir of {reservoir:.0f} MiB, and ten times as many rows")
+    found = training.resident[len(training.resident) // 4 : -RUN_AHEAD]
+    reservoir = CAPACITY * size * 4 / 2**20
+    print(f"A reservoir of {reservoir:.0f} MiB, and {TIMES} times as many rows")
     grown = statistics.mean(found[-10:]) - statistics.mean(found[:10])
-    return claim("memory grows, MiB", grown, at_most=0.1 * reservoir)
+    return [claim("memory grows, MiB", grown, at_most=0.1 * reservoir)]
 
 
 # What is learned ----------------------------------------------------------------------------------
@@ -237,9 +261,7 @@ def losses(problem: Problem, folder: str, seed: int) -> list[float]:
         "epoch_nb": 1,
     }  # fmt: skip
     reservoir = {"capacity": rows // 2, "watermark": rows // 5, "views": VIEWS}
-    offline = DatasetConfig(
-        existing_dir=stored(problem, folder, "offline", seed, problem.simulations)
-    )
+    offline = stored(problem, folder, "offline", seed, problem.simulations)
     trainings = (
         Training(problem.network, None, seen, batch_nb=once, **options),
         Training(
@@ -278,27 +300,36 @@ RESONANCE = Problem("online_problems:Resonance", network("output", 2, 64, 64, 2)
 MANY_VIEWS = 64
 
 
+def resonance(
+    environment: str, sampler: str | None, folder: str, seed: int, views: int
+) -> Training:
+    """Return a training whose sampler chooses simulations."""
+    rows = RESONANCE.rows
+    return Training(
+        RESONANCE.network,
+        None,
+        EnvironmentConfig(environment, num_clients=2, sampler=sampler, seed=seed),
+        epoch_nb=1,
+        batch_nb=views * rows // SMALL_BATCH,
+        batch_size=SMALL_BATCH,
+        seed=seed,
+        session_dir=folder,
+        quiet=True,
+        online="physx/reservoir",
+        online_kwargs={"capacity": rows // 2, "watermark": rows // 10, "views": views},
+    )
+
+
 def tail(sampler: str | None, folder: str, seed: int, data: Mapping[str, np.ndarray]) -> float:
     """Return the 99th percentile of the error of a training whose sampler chooses simulations."""
-    config = EnvironmentConfig(RESONANCE.environment, num_clients=2, sampler=sampler, seed=seed)
-    kwargs = {
-        "capacity": RESONANCE.rows // 2,
-        "watermark": RESONANCE.rows // 10,
-        "views": MANY_VIEWS,
-    }
-    training = Training(
-        RESONANCE.network, None, config, epoch_nb=1, batch_size=SMALL_BATCH, quiet=True, seed=seed,
-        batch_nb=MANY_VIEWS * RESONANCE.rows // SMALL_BATCH, session_dir=folder,
-        online="physx/reservoir", online_kwargs=kwargs,
-    )  # fmt: skip
-    with training:
+    with resonance(RESONANCE.environment, sampler, folder, seed, MANY_VIEWS) as training:
         training.execute()
         predicted = training.learner.predict_in_training({"input": data["input"]})["output"]
     errors = np.sqrt(np.mean((predicted - data["output"]) ** 2, axis=1))
     return float(np.quantile(errors, 0.99))
 
 
-def chosen() -> bool:
+def chosen() -> list[bool]:
     """Compare simulations that the loss chooses with random ones."""
     found = []
     for seed in SEEDS:
@@ -311,14 +342,73 @@ def chosen() -> bool:
     print(f"Resonance, {RESONANCE.simulations} simulations: 99th percentile of the error, medians")
     print(f"  uniform {uniform:.3g}, active {active:.3g}; ratios", end=" ")
     print(*(f"{each:.2f}" for *_, each in found))
-    return claim("active against uniform", float(ratio), at_most=0.7)
+    return [claim("active against uniform", float(ratio), at_most=0.7)]
+
+
+# Repeated -----------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def busy_core() -> Iterator[None]:
+    """Have a process keep a processor core busy."""
+    process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
+
+
+def parameters(sampler: str | None, *, is_late: bool, seed: int = 0) -> np.ndarray:
+    """Return the bytes of the parameters that a training ends with."""
+    name = "Late" if is_late else "Resonance"
+    with tempfile.TemporaryDirectory() as folder:
+        training = resonance(f"online_problems:{name}", sampler, folder, seed, views=8)
+        with training:
+            training.execute()
+            found = training.learner.network.get_parameters().values()
+    return np.concatenate([each.detach().numpy().ravel() for each in found]).view(np.uint8)
+
+
+def repeated() -> list[bool]:
+    """Count the bits in which the networks of equal trainings differ."""
+    met = []
+    for sampler in ("physx/uniform", "physx/active"):
+        expected = parameters(sampler, is_late=False)
+        differing = {}
+        with busy_core():
+            for what, options in (
+                ("the same again", {"is_late": False}),
+                ("clients that dawdle at random", {"is_late": True}),
+                ("another seed", {"is_late": False, "seed": 1}),
+            ):
+                found = parameters(sampler, **options)
+                differing[what] = int(np.unpackbits(expected ^ found).sum())
+        print(f"{sampler}, one core busy: bits of {8 * len(expected)} that differ", end="")
+        print(f"; {(what := 'another seed')}: {differing.pop(what)}")
+        met += [claim(what, count, at_most=0) for what, count in differing.items()]
+    return met
+
+
+CLAIMS: dict[str, Callable[[], list[bool]]] = {
+    "overlap": overlap,
+    "waits": waits,
+    "memory": memory,
+    "repeated": repeated,
+    "learned": learned,
+    "chosen": chosen,
+}
 
 
 def main() -> None:
     """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--only", nargs="+", choices=CLAIMS, default=CLAIMS, help="what to measure")
+    parser.add_argument("--check", action="store_true", help="exit with 1 if a target is missed")
+    options = parser.parse_args()
     torch.set_num_threads(1)
-    np.seterr(all="raise")
-    finish([*overlap(), *waits(), memory(), *learned(), chosen()])
+    np.seterr(all="raise", under="ignore")
+    finish([met for name in options.only for met in CLAIMS[name]()])
 
 
 if __name__ == "__main__":

@@ -128,3 +128,18 @@ class Resonance(Environment):
         response = 1 / (1 - self._frequency**2 + 2j * self._damping * self._frequency)
         scaled = [(self._frequency - 1.6) / 1.4, (self._damping - 0.2) / 0.2]
         self.set_training_data(input=scaled, output=[response.real, response.imag])
+
+
+class Late(Resonance):
+    """The same from simulations that take different times in every run."""
+
+    def create(self) -> None:
+        """Define the same parameters; nothing determines the times."""
+        super().create()
+        self._delays = np.random.default_rng()
+
+    def step(self) -> None:
+        """Dawdle now and then, then compute."""
+        if self._delays.random() < 0.2:
+            time.sleep(self._delays.exponential(0.01))
+        super().step()
