@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from physx_core.typing import Vector
+from physx_dart.pinocchio.contact_problem import unit
 from physx_dart.pinocchio.contacts import ContactPoints, Indices
 from physx_dart.pinocchio.limits import JointConstraints, solve
 from physx_dart.pinocchio.solver import ImpulseSolver
@@ -40,9 +41,11 @@ class Constraints:
     """The constraints of one robot or object in a step.
 
     Attributes:
+        joints: Constraints of its joints.
+        inverse: Returns the inverse of its mass matrix, shape (nv, nv).
         touching: Points that touch planes, or None.
+        acts: Which rows of the joints act, shape (rows,).
         impulses: Impulses of these points along their axes, shape (k, 3), once they are known.
-        base: Degrees of freedom of the robot's base.
         nv: Length of its velocities.
     """
 
@@ -55,7 +58,6 @@ class Constraints:
         positions: Vector,
         velocities: Vector,
         *,
-        base: int,
         touched: bool,
     ) -> None:
         """Note which rows of the joints act.
@@ -71,63 +73,58 @@ class Constraints:
             touching: Points that touch planes.
             positions: Of the joints, shape (n,).
             velocities: Of the joints, without constraints.
-            base: Degrees of freedom of its base.
             touched: Whether it touches anything.
         """
-        self.joints, self.warmth, self.touching = joints, warmth, touching
-        self._invert = inverse
-        self._inverse: Vector | None = None
-        self.bounds = joints.bounds(positions)
-        self.acts = joints.acting(self.bounds, velocities, _REACH if touched else 0.0)
-        self.base, self.nv = base, base + len(velocities)
+        self.joints, self.inverse, self.touching = joints, inverse, touching
+        self._warmth, self._bounds = warmth, joints.bounds(positions)
+        self.acts = joints.acting(self._bounds, velocities, _REACH if touched else 0.0)
+        self.nv = joints.base + len(velocities)
         self.impulses = np.zeros((0, 3))
 
-    @property
-    def inverse(self) -> Vector:
-        """The inverse of the mass matrix, shape (nv, nv)."""
-        if self._inverse is None:  # `cached_property` locks, which takes longer than this
-            self._inverse = self._invert()
-        return self._inverse
+    def aims(self) -> Vector:
+        """Return the target velocities of all rows, shape (rows,)."""
+        return self.joints.aims(self._bounds)
 
-    def rows(self) -> Indices:
-        """Return the rows of the joints that act."""
-        found: Indices = self.acts.nonzero()[0]
-        return found
+    def rows(self) -> tuple[Indices, Vector, Vector, Vector, Vector]:
+        """Return columns, smallest and largest impulses, aims, and last impulses of all rows."""
+        joints = self.joints
+        return joints.columns, joints.least, joints.most, self.aims(), self._warmth.rows
 
-    def limits(self, rows: Indices) -> tuple[Indices, Vector, Vector, Vector, Vector]:
-        """Return columns, smallest and largest impulses, aims, and last impulses of some rows."""
-        joints, column = self.joints, self.joints.joints[rows] + self.base
-        least, most, aims = joints.least[rows], joints.most[rows], joints.aims(self.bounds)[rows]
-        return column, least, most, aims, self.warmth.rows[rows]
+    def last(self) -> Vector:
+        """Return the last impulses of the points that touch, shape (3 k,)."""
+        numbers = slice(0) if self.touching is None else self.touching.numbers
+        return self._warmth.points[numbers].ravel()
 
     def add_missed(self, velocities: Vector) -> bool:
-        """Let limits that velocities (nv,) violate act; return whether there are any."""
-        if not self.joints.violated(self.bounds, velocities[self.base :], _MISSED):
-            return False
-        ahead = self.joints.acting(self.bounds, velocities[self.base :], -_MISSED)
-        missed = ahead & ~self.acts
+        """Let rows that velocities (nv,) demand act; return whether there are any that did not."""
+        ahead = self.joints.acting(self._bounds, velocities[self.joints.base :], -_MISSED)
+        missed = ahead > self.acts
         self.acts |= missed
-        return bool(missed.any())
+        return bool(np.count_nonzero(missed))
 
-    def keep(self, points: Vector, rows: Indices, impulses: Vector) -> None:
-        """Keep the impulses of points and rows."""
-        self.impulses, warmth = points.reshape(-1, 3), self.warmth
-        warmth.forget()
+    def forget(self) -> None:
+        """Let the next step begin with no impulses."""
+        self._warmth.forget()
+
+    def keep(self, points: Vector, rows: Vector) -> None:
+        """Keep the impulses of the points that touch, and of all rows."""
+        self.impulses = points.reshape(-1, 3)
+        self._warmth.points.fill(0.0)
         if self.touching is not None:
-            warmth.points[self.touching.numbers] = self.impulses
-        warmth.rows[rows] = impulses
+            self._warmth.points[self.touching.numbers] = self.impulses
+        self._warmth.rows[:] = rows
 
 
 def limited(part: Constraints, v: Vector) -> Vector:
     """Return the velocities after the impulses of the rows of the joints alone."""
-    joints, rows = part.joints, part.rows()
-    part.warmth.forget()
+    joints, rows = part.joints, part.acts.nonzero()[0]
+    part.forget()
     if not len(rows):
         return v
-    index = joints.joints[rows] + part.base
-    spread = part.inverse[:, index]
-    change = joints.aims(part.bounds)[rows] - v[index]
-    return v + spread @ solve(spread[index], change, joints.least[rows], joints.most[rows])
+    column = joints.columns[rows]
+    spread = part.inverse().take(column, 1)
+    change = part.aims()[rows] - v[column]
+    return v + spread.dot(solve(spread[column], change, joints.least[rows], joints.most[rows]))
 
 
 def constrained(
@@ -150,53 +147,51 @@ def constrained(
         pairs: Points between them, or with static shapes, shape (k,).
         warm: Impulses of these points to begin with, shape (k, 3).
     """
-    ends = list(itertools.accumulate((part.nv for part in parts), initial=0))
+    ends = itertools.accumulate((part.nv for part in parts), initial=0)
     spans = [slice(*pair) for pair in itertools.pairwise(ends)]
-    inverse = _diagonal([part.inverse for part in parts], spans)
+    inverse = _diagonal([part.inverse() for part in parts], spans)
     touching = [] if pairs is None else [pairs]
-    guess = [] if warm is None else [warm.ravel()]
+    guess = [np.zeros(0) if warm is None else warm.ravel()]
     for part, span in zip(parts, spans, strict=True):
         if part.touching is not None:
             touching.append(part.touching.widened(span, len(v)))
-            guess.append(part.warmth.points[part.touching.numbers].ravel())
+        guess.append(part.last())
     points = joined([each.jacobian for each in touching])
-    wanted = -joined([each.bias(before, period) for each in touching])
-    friction, unit = joined([each.friction for each in touching]), np.eye(len(v))
-    while True:
-        rows = [part.rows() for part in parts]
-        limits = [part.limits(some) for part, some in zip(parts, rows, strict=True)]
-        column = joined(
-            [joint + span.start for (joint, *_), span in zip(limits, spans, strict=True)]
-        )
-        least, most, aims, begin = (
-            joined(list(each)) for each in list(zip(*limits, strict=True))[1:]
-        )
-        order: Any = slice(None)
+    bias = joined([each.bias(before, period) for each in touching])
+    friction = joined([each.friction for each in touching])
+    of_parts = zip(*(part.rows() for part in parts), strict=True)
+    columns, least, most, aims, last = (joined(each) for each in of_parts)
+    if len(parts) > 1:
+        starts, counts = [span.start for span in spans], [len(part.acts) for part in parts]
+        columns = columns + np.repeat(starts, counts)
+    missed = True
+    while missed:
+        rows = joined([part.acts for part in parts]).nonzero()[0]
         if len(parts) > 1:  # the solver wants rows with one bound first
-            order = np.argsort(np.isinf(least) == np.isinf(most), kind="stable")
-        jacobian = np.concatenate([points, unit.take(column[order], 0)])
-        spread = inverse @ jacobian.T
+            two_sided = np.isinf(least[rows]) == np.isinf(most[rows])
+            rows = rows[np.argsort(two_sided, kind="stable")]
+        jacobian = np.concatenate([points, unit(len(v)).take(columns[rows], 0)])
+        spread = inverse.dot(jacobian.T)
         impulses = solver.solve(
-            jacobian @ spread,
-            jacobian @ v - np.concatenate([wanted, aims[order]]),
+            jacobian.dot(spread),
+            jacobian.dot(v) + np.concatenate([bias, -aims[rows]]),
             friction,
-            least[order],
-            most[order],
-            np.concatenate([*guess, begin[order]]),
+            least[rows],
+            most[rows],
+            np.concatenate([*guess, last[rows]]),
         )
-        after = v + spread @ impulses
-        missed = [part.add_missed(after[span]) for part, span in zip(parts, spans, strict=True)]
-        if not any(missed):
-            break
-    of_rows = np.empty(len(column))
-    of_rows[order] = impulses[len(wanted) :]
-    first = place = 0 if pairs is None else 3 * len(pairs.gaps)
-    of_pairs, last = impulses[:first].reshape(-1, 3), 0
-    for part, some in zip(parts, rows, strict=True):
-        count = 0 if part.touching is None else 3 * len(part.touching.gaps)
-        part.keep(impulses[place : place + count], some, of_rows[last : last + len(some)])
-        place, last = place + count, last + len(some)
-    return after, of_pairs
+        after = v + spread.dot(impulses)
+        missed = False
+        for part, span in zip(parts, spans, strict=True):
+            missed |= part.add_missed(after[span])
+    of_rows = np.zeros(len(columns))
+    of_rows[rows] = impulses[len(bias) :]
+    place, row = len(guess[0]), 0
+    for part, each in zip(parts, guess[1:], strict=True):
+        end, last_row = place + len(each), row + len(part.acts)
+        part.keep(impulses[place:end], of_rows[row:last_row])
+        place, row = end, last_row
+    return after, impulses[: len(guess[0])].reshape(-1, 3)
 
 
 def _diagonal(blocks: Sequence[Vector], spans: Sequence[slice]) -> Vector:

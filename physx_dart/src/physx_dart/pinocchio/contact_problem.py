@@ -46,22 +46,22 @@ class ContactProblem:
 
         A direction in which nothing can move, as across a rail, gets no impulse, as any would do.
         """
+        self.matrix = regularized(response)
         # Lists, as operations on short arrays take longer.
-        rates = ((1 + _REGULARIZATION) * response.diagonal()).tolist()
+        rates = self.matrix.diagonal().tolist()
         largest = max(rates, default=0.0) or 1.0
         if min(rates, default=1.0) <= (least_rate := _STUCK * largest):
             free = np.where(np.array(rates) <= least_rate, 0.0, free)
             rates = [largest if rate <= least_rate else rate for rate in rates]
-        self.matrix = response.copy()
-        self.matrix.flat[:: len(free) + 1] = rates
+            self.matrix.flat[:: len(free) + 1] = rates
         self.free = free
         self.friction, self.least, self.most = friction, least, most
-        self._unit = _unit(len(free))
         for place in range(0, 3 * len(friction), 3):
             rates[place : place + 3] = [max(rates[place : place + 3])] * 3
         self._rates = np.array(rates)
         # A step against the velocities, scaled row by row.
-        self._back = self._unit - self.matrix / self._rates[:, None]
+        self._unit, self._scaled = unit(len(free)), self.matrix / self._rates[:, None]
+        self._back = self._unit - self._scaled
         self._start = -free / self._rates
         self._coefficients = friction.tolist()
         self._bounds = list(zip(least.tolist(), most.tolist(), strict=True))
@@ -69,14 +69,14 @@ class ContactProblem:
 
     def error(self, impulses: Vector) -> float:
         """Return the distance of impulses from a solution, as a velocity."""
-        projected, _ = self._project(self._back @ impulses + self._start)
+        projected, _ = self._project(impulses)
         return self._error(projected - impulses)
 
     def newton(self, impulses: Vector, most: int) -> tuple[Vector, float]:
         """Return the best impulses of at most `most` steps from given ones, and their error."""
         best, least_error = impulses, math.inf
         for _ in range(most):
-            projected, slope = self._project(self._back @ impulses + self._start)
+            projected, slope = self._project(impulses)
             change = projected - impulses
             error = self._error(change)
             if error < least_error:
@@ -85,40 +85,57 @@ class ContactProblem:
                     break
             elif not error < math.inf:
                 break
-            lower_upper = eigenpy.PartialPivLU(self._unit - slope @ self._back)
-            impulses = impulses + lower_upper.solve(change)
+            impulses = impulses + eigenpy.PartialPivLU(slope).solve(change)
         return best, least_error
 
     def _error(self, change: Vector) -> float:
         velocities = change * self._rates
         return math.sqrt(velocities.dot(velocities))
 
-    def _project(self, moved: Vector) -> tuple[Vector, Vector]:
-        """Return impulses (n,), projected onto cones and bounds, and the derivative (n, n)."""
-        slope, values, place = self._unit.copy(), moved.tolist(), 0
+    def _project(self, impulses: Vector) -> tuple[Vector, Vector]:
+        """Return impulses (n,) after a step and a projection onto cones and bounds.
+
+        Also return the derivative of the impulses minus these, shape (n, n).
+        """
+        values = (self._back.dot(impulses) + self._start).tolist()
+        unit, slope, place = self._unit, self._scaled.copy(), 0
         for friction in self._coefficients:
             x, y, normal = values[place : place + 3]
             if normal <= 0:
                 values[place : place + 3] = 0.0, 0.0, 0.0
-                slope[place : place + 3] = 0.0
+                slope[place : place + 3] = unit[place : place + 3]
             elif (across := math.hypot(x, y)) > (bound := friction * normal):
                 share, x, y = bound / across, x / across, y / across
                 values[place], values[place + 1] = bound * x, bound * y
-                slope[place : place + 2, place : place + 3] = (
-                    (share * y * y, -share * x * y, friction * x),
-                    (-share * x * y, share * x * x, friction * y),
+                turn = np.array(
+                    (
+                        (share * y * y, -share * x * y, friction * x),
+                        (-share * x * y, share * x * x, friction * y),
+                    )
                 )
+                rows = unit[place : place + 2] - turn.dot(self._back[place : place + 3])
+                slope[place : place + 2] = rows
             place += 3
         for least, most in self._bounds:
             value = values[place]
             if value <= least or value >= most:
                 values[place] = least if value <= least else most
-                slope[place, place] = 0.0
+                slope[place] = unit[place]
             place += 1
         return np.array(values), slope
 
 
+def regularized(response: Vector) -> Vector:
+    """Return a matrix with a diagonal that is slightly larger."""
+    return response * _factors(len(response))
+
+
 @functools.lru_cache(maxsize=100)
-def _unit(n: int) -> Vector:
+def _factors(n: int) -> Vector:
+    return 1.0 + _REGULARIZATION * np.eye(n)
+
+
+@functools.lru_cache(maxsize=100)
+def unit(n: int) -> Vector:
     """Return the unit matrix, which must not be changed."""
     return np.eye(n)

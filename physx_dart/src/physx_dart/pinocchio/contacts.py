@@ -32,11 +32,6 @@ _BOUNCE = 0.1
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _THIRDS = np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
 """Cosines and sines of three directions around a rim."""
-CROSS = np.zeros((3, 9))
-CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = -1.0, 1.0, -1.0, 1.0, -1.0, 1.0
-"""Maps a vector to its cross-product matrix, flattened by columns: times a row, it is the cross
-product of the vector and the row."""
-
 
 Indices = NDArray[np.intp]
 
@@ -46,8 +41,6 @@ class ContactPoints:
     """Points that touch, or may touch within the next step.
 
     Attributes:
-        links: Index of each point's link in the robot, shape (k,).
-        statics: Index of the static thing that it touches, shape (k,).
         numbers: Number of each, by which it is found again in the next step, shape (k,).
         points: In the world frame, in m, shape (k, 3).
         axes: Two tangents and the outward normal of each, as rows, shape (k, 3, 3).
@@ -57,8 +50,6 @@ class ContactPoints:
         jacobian: Of the points along their axes, shape (3 k, nv).
     """
 
-    links: Indices
-    statics: Indices
     numbers: Indices
     points: Vector
     axes: Vector
@@ -98,15 +89,15 @@ class ContactPoints:
             before: Velocities before the step, shape (nv,).
             period: Length of the step, in s.
         """
-        pace = self.gaps / period
-        along = np.maximum(pace, np.minimum(_RETURN * pace, 0.0))
-        np.maximum(along, -_FASTEST_RETURN, out=along)
-        if self.restitution.any():
+        found = np.zeros(3 * len(self.gaps))
+        found[2::3] = [
+            gap / period if gap > 0 else max(_RETURN * gap / period, -_FASTEST_RETURN)
+            for gap in self.gaps.tolist()
+        ]
+        if any(self.restitution.tolist()):
             approach = self.jacobian[2::3] @ before
             bounces = (self.restitution > 0) & (approach < -_BOUNCE)
-            along = np.where(bounces, self.restitution * approach, along)
-        found = np.zeros(3 * len(along))
-        found[2::3] = along
+            found[2::3] = np.where(bounces, self.restitution * approach, found[2::3])
         return found
 
 
@@ -165,11 +156,14 @@ class ContactFinder:
     def _arrange(self, points: list[Any], rims: list[Any]) -> None:
         """Collect points, then the centers of rims, in arrays."""
         model, anchors, around = self._model, [*points, *rims], len(_THIRDS)
-        self._turns, self._places = joint_poses(self._data)
+        self._poses = poses_of(self._data)
         moved = supports_of(model)
         joints = np.array([row[0] for row in anchors], np.intp)
         self._joints, self._first_rim = joints, len(points)
-        self._centers = np.array([row[1] for row in anchors]).reshape(-1, 3, 1)
+        # A point is a sum of the axes and the origin of its joint.
+        self._weights = np.zeros((len(anchors), 4 * len(self._poses)))
+        for weights, (joint, center, *_) in zip(self._weights, anchors, strict=True):
+            weights[4 * joint : 4 * joint + 4] = *center, 1.0
         self._rim_radii = np.array([row[2] for row in rims])
         self._rim_axes = np.array([row[5] for row in rims]).reshape(-1, 3, 3)
         spread = np.repeat(np.arange(len(anchors)), [1] * len(points) + [around] * len(rims))
@@ -195,7 +189,7 @@ class ContactFinder:
             period: Length of the step, in s.
         """
         motions = pinocchio.computeJointJacobians(self._model, self._data, q)
-        points = (self._turns[self._joints] @ self._centers)[:, :, 0] + self._places[self._joints]
+        points = self._weights.dot(self._poses.reshape(-1, 3))
         if self._first_rim < len(points):
             points = np.concatenate([points[: self._first_rim], self._rims(points)])
         found = []
@@ -206,32 +200,37 @@ class ContactFinder:
             touched = points - depths[:, None] * axes[:, 2]
             frames = self._frames
             frames[:, :, :3] = axes
-            frames[:, :, 3:] = axes @ (touched @ CROSS).reshape(-1, 3, 3)
-            jacobian = frames.reshape(-1, 6) @ motions
+            frames[:, :, 3:] = surface.moments(touched, axes)
+            jacobian = frames.reshape(-1, 6).dot(motions)
             jacobian *= self._moved
-            ahead = gaps + period * (jacobian[2::3] @ v)
+            ahead = gaps + period * jacobian[2::3].dot(v)
             rows = (np.minimum(gaps, ahead) < MARGIN).nonzero()[0]
             if not len(rows):
                 continue
+            numbers = place * len(points) + rows
             found.append(
                 ContactPoints(
-                    self._links[rows],
-                    np.full(len(rows), place),
-                    place * len(points) + rows,
-                    touched[rows],
-                    frames[rows, :, :3],
-                    gaps[rows],
-                    self._friction[place, rows],
-                    self._restitution[place, rows],
-                    jacobian.reshape(len(points), 3, -1)[rows].reshape(3 * len(rows), -1),
+                    numbers,
+                    touched.take(rows, 0),
+                    frames.take(rows, 0)[:, :, :3],
+                    gaps.take(rows),
+                    self._friction.take(numbers),
+                    self._restitution.take(numbers),
+                    jacobian.reshape(len(points), 3, -1).take(rows, 0).reshape(3 * len(rows), -1),
                 )
             )
         return _together(found) if found else None
 
+    def bodies(self, numbers: Indices) -> tuple[Indices, Indices]:
+        """Return links in the robot, and static things, by `ContactPoints.numbers`."""
+        statics, points = np.divmod(numbers, len(self._links))
+        return self._links[points], statics
+
     def _rims(self, points: Vector) -> Vector:
         """Return three points of each rim, one of them the deepest, shape (3 rims, 3)."""
         first = self._first_rim
-        axes = self._turns[self._joints[first:]] @ self._rim_axes
+        turns = self._poses[self._joints[first:], :3].transpose(0, 2, 1)
+        axes = turns @ self._rim_axes
         along = axes[:, :, 2]
         downward = (along @ self._up)[:, None] * along - self._up
         lengths = np.sqrt(np.einsum("ij,ij->i", downward, downward))[:, None]
@@ -251,16 +250,15 @@ def supports_of(model: Any) -> Vector:
     return moved
 
 
-def joint_poses(data: Any) -> tuple[Vector, Vector]:
-    """Return views of the joints' rotations (n, 3, 3) and positions (n, 3) in Pinocchio's memory.
+def poses_of(data: Any) -> Vector:
+    """Return a view of the joints' axes and positions in Pinocchio's memory, shape (n, 4, 3).
 
     They change with each algorithm that places joints, and live as long as the data.
     """
     first, second = data.oMi[0].rotation, data.oMi[1].rotation
     pace = second.__array_interface__["data"][0] - first.__array_interface__["data"][0]
-    count, place = len(data.oMi), data.oMi[0].translation
-    turns = np.lib.stride_tricks.as_strided(first, (count, 3, 3), (pace, *first.strides))
-    return turns, np.lib.stride_tricks.as_strided(place, (count, 3), (pace, *place.strides))
+    strides = (pace, 3 * first.itemsize, first.itemsize)
+    return np.lib.stride_tricks.as_strided(first, (len(data.oMi), 4, 3), strides)
 
 
 def _together(found: list[ContactPoints]) -> ContactPoints:

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from physx_core.typing import Vector
 from physx_dart.models.urdf import Joint
+from physx_dart.pinocchio.contact_problem import regularized, unit
 
-_REGULARIZATION = 1e-9
-"""Relative addition to the diagonal, as in DART's solver."""
 _FASTEST_RETURN = 10.0
 """Largest speed, in rad/s or m/s, at which a joint returns into its limits, as in DART."""
 
@@ -29,7 +28,8 @@ class JointConstraints:
     joints come first, then the upper limits, then friction and motors, if any.
 
     Attributes:
-        joints: Joint of each row, shape (rows,).
+        base: Degrees of freedom of the robot's base.
+        columns: Place of each row's joint in the robot's velocities, shape (rows,).
         least: Smallest impulse of each row, in N m s or N s, shape (rows,).
         most: Largest impulse of each row.
         targets: Target velocities of the motors, shape (n,), in rad/s or m/s.
@@ -37,8 +37,9 @@ class JointConstraints:
         limits: Whether any joint has limits.
     """
 
-    def __init__(self, joints: Sequence[Joint], period: float) -> None:
-        """Keep the bounds of all joints, and the period in s."""
+    def __init__(self, joints: Sequence[Joint], period: float, base: int) -> None:
+        """Keep the bounds of all joints, the period in s, and the base's degrees of freedom."""
+        self.base = base
         modes = np.array([joint.settings.mode for joint in joints], dtype=object)
         lower = np.array([joint.lower for joint in joints])
         upper = np.array([joint.upper for joint in joints])
@@ -68,7 +69,8 @@ class JointConstraints:
     def _arrange(self, friction: Vector, strength: Vector, n: int) -> None:
         """Set the constant parts of the rows."""
         nothing, places = np.zeros(n), np.arange(n)
-        self.joints = np.concatenate([places, places, self._rubs, self._motors])
+        joints = np.concatenate([places, places, self._rubs, self._motors])
+        self.columns, self._every = joints + self.base, np.ones(len(joints), np.bool_)
         self.least = np.concatenate([nothing, nothing - np.inf, -friction, -strength])
         self.most = np.concatenate([nothing + np.inf, nothing, friction, strength])
 
@@ -103,11 +105,9 @@ class JointConstraints:
             Shape (2, n), in rad/s or m/s: mostly negative, as most joints need not move.
         """
         needed = self._limits - self._pace * positions
-        bounds = np.maximum(needed, self._slowest)
-        if needed.max(initial=0.0) > 0:
-            bounds = np.where((needed > 0).any(axis=0), needed, bounds)
-            np.minimum(bounds, _FASTEST_RETURN, out=bounds)
-        return bounds
+        bounds, (lower, upper) = np.maximum(needed, self._slowest), needed > 0
+        np.copyto(bounds, needed, where=lower | upper)
+        return np.minimum(bounds, _FASTEST_RETURN, out=bounds)
 
     def acting(self, bounds: Vector, velocities: Vector, reach: float) -> NDArray[np.bool_]:
         """Return which rows act, shape (rows,): motors, friction of moving joints, and some limits.
@@ -119,17 +119,13 @@ class JointConstraints:
             velocities: After the step, shape (n,).
             reach: Margin above its bound at which a velocity makes a limit act.
         """
-        acts = np.ones(len(self.joints), np.bool_)
+        acts = self._every.copy()
         limits = acts[: bounds.size].reshape(bounds.shape)
         np.less(self._signs * velocities, bounds + reach, out=limits)
         limits |= bounds > 0
         if len(self._rubs):  # a joint that rests without friction stays at rest, as in DART
             acts[bounds.size : bounds.size + len(self._rubs)] = velocities[self._rubs] != 0
         return acts
-
-    def violated(self, bounds: Vector, velocities: Vector, margin: float) -> bool:
-        """Return whether velocities (n,) are below their bounds by more than a margin."""
-        return bool((self._signs * velocities - bounds).min(initial=0.0) < -margin)
 
     def aims(self, bounds: Vector) -> Vector:
         """Return the target velocity of each row, shape (rows,)."""
@@ -153,25 +149,26 @@ def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vect
         least: Smallest impulses, shape (n,), may be -inf.
         most: Largest impulses, likewise.
     """
-    matrix = response.copy()
-    matrix.flat[:: len(change) + 1] *= 1 + _REGULARIZATION
+    n, matrix = len(change), regularized(response)
     alone = change / matrix.diagonal()
-    if len(change) == 1:
-        return np.clip(alone, least, most)
+    if n == 1:
+        return np.minimum(np.maximum(alone, least), most)
+    # Lists, as operations on short arrays take longer.
+    bounds = list(zip(least.tolist(), most.tolist(), strict=True))
     # -1: at its least, 1: at its most, 0: between; initially as if the rows were independent.
-    side = (alone > most).astype(np.int8) - (alone < least)
-    best, blocks = len(change) + 1, 3
-    impulses = np.zeros(len(change))
-    for _ in range(50 * (len(change) + 1)):
-        free = side == 0
-        impulses = np.where(side < 0, least, np.where(side > 0, most, 0.0))
-        if free.any():
-            rest = (change - matrix @ impulses)[free]
-            impulses[free] = eigenpy.PartialPivLU(matrix[free][:, free]).solve(rest).ravel()
-        under, over = free & (impulses < least), free & (impulses > most)
-        freed = side * (matrix @ impulses - change) > 0
-        wrong = np.flatnonzero(under | over | freed)
-        if not len(wrong):
+    sides = [_side(*each) for each in zip(alone.tolist(), bounds, strict=True)]
+    best, blocks = n + 1, 3
+    for _ in range(50 * (n + 1)):
+        impulses = _pivoted(matrix, change, sides, bounds)
+        excess = (matrix.dot(impulses) - change).tolist()
+        right = [
+            (0 if side * over > 0 else side) if side else _side(impulse, each)
+            for side, over, impulse, each in zip(
+                sides, excess, impulses.tolist(), bounds, strict=True
+            )
+        ]
+        wrong = [place for place, side in enumerate(right) if side != sides[place]]
+        if not wrong:
             break
         if len(wrong) < best:
             best, blocks = len(wrong), 3
@@ -179,5 +176,25 @@ def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vect
             blocks -= 1
         else:
             wrong = wrong[-1:]
-        side[wrong] = np.where(freed[wrong], 0, np.where(under[wrong], -1, 1))
-    return np.clip(impulses, least, most)
+        for place in wrong:
+            sides[place] = right[place]
+    return np.minimum(np.maximum(impulses, least), most)
+
+
+def _side(impulse: float, bounds: tuple[float, float]) -> int:
+    """Return -1 for an impulse below its bounds, 1 for one above them, otherwise 0."""
+    return (impulse > bounds[1]) - (impulse < bounds[0])
+
+
+def _pivoted(
+    matrix: Vector, change: Vector, sides: list[int], bounds: list[tuple[float, float]]
+) -> Vector:
+    """Return the impulses (n,) for which rows on a side are at their bounds, and others change."""
+    system, wanted = matrix.copy(), change.copy()
+    held = [(place, bounds[place][side > 0]) for place, side in enumerate(sides) if side]
+    for place, bound in held:
+        system[place], wanted[place] = unit(len(change))[place], bound
+    impulses: Vector = eigenpy.PartialPivLU(system).solve(wanted)
+    for place, bound in held:  # exactly
+        impulses[place] = bound
+    return impulses

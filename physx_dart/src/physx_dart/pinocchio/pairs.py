@@ -22,9 +22,9 @@ from physx_core.simulation import Stairs
 from physx_core.typing import Vector
 from physx_dart.models.parts import Parts
 from physx_dart.models.shapes import CollisionShape
-from physx_dart.pinocchio.contacts import CROSS, MARGIN, ContactPoints, joint_poses, supports_of
+from physx_dart.pinocchio.contacts import MARGIN, ContactPoints, poses_of, supports_of
 from physx_dart.pinocchio.robot import PinocchioRobot
-from physx_dart.pinocchio.surfaces import axes_of
+from physx_dart.pinocchio.surfaces import axes_of, moments_of
 
 _TOLERANCE = 1e-4
 """Distance, in m, from the plane of a patch within which a point belongs to it."""
@@ -74,9 +74,9 @@ class PairFinder:
             advice = 'Use Robot(collisions="boxes") or "capsules", or a box as an object.'
             raise FeatureNotSupportedError("pinocchio", "mesh_contacts", features, advice)
         self._solids = solids
-        self._poses = [joint_poses(robot.data) for robot in robots]
+        self._poses = [poses_of(robot.data) for robot in robots]
         self._supports = [supports_of(robot.model_in_motion) for robot in robots]
-        ends = [1, *(1 + np.cumsum([len(turns) for turns, _ in self._poses])).tolist()]
+        ends = [1, *(1 + np.cumsum([len(poses) for poses in self._poses])).tolist()]
         self._rows = [slice(*pair) for pair in itertools.pairwise(ends)]
         widths = np.cumsum([0, *(robot.nv for robot in robots)]).tolist()
         self.columns = [slice(*pair) for pair in itertools.pairwise(widths)]
@@ -181,11 +181,11 @@ class PairFinder:
     def _move(self, velocities: Sequence[Vector]) -> None:
         """Update poses and twists of all joints."""
         self._motions: list[Vector] = []
-        for robot, velocity, (turns, places), supports, rows in zip(
+        for robot, velocity, poses, supports, rows in zip(
             self._robots, velocities, self._poses, self._supports, self._rows, strict=True
         ):
             motions = robot.place_joints()
-            self._turns[rows], self._places[rows] = turns, places
+            self._turns[rows], self._places[rows] = poses[:, :3].transpose(0, 2, 1), poses[:, 3]
             self._twists[rows] = (supports * velocity) @ motions.T
             self._motions.append(motions)
 
@@ -214,7 +214,7 @@ class PairFinder:
         points = np.array([each[1] for each in found])
         axes = axes_of(np.array([each[2] for each in found]))
         gaps = np.array([each[3] for each in found])
-        frames = np.concatenate([axes, axes @ (points @ CROSS).reshape(-1, 3, 3)], axis=2)
+        frames = np.concatenate([axes, moments_of(points, axes)], axis=2)
         jacobian = np.zeros((3 * len(pairs), self.columns[-1].stop))
         sides = (self._first[pairs], 1.0), (self._second[pairs], -1.0)
         for motions, supports, rows, columns in zip(
@@ -235,8 +235,6 @@ class PairFinder:
         places = (self._pairs[pair] for pair in pairs)
         touching = [(self._solids[i], self._solids[j]) for i, j in places]
         contacts = ContactPoints(
-            np.array([a.link for a, _ in touching], np.intp),
-            pairs,
             pairs,
             points[close],
             axes[close],

@@ -60,7 +60,7 @@ class PinocchioRobot(RobotEngine):
         self._pushes = pinocchio.StdVec_Force()
         self._pushes.extend(pinocchio.Force.Zero() for _ in range(self.model_in_motion.njoints))
         self._more: tuple[Any, ...] = ()  # the wrenches, if there are any
-        self._joints = JointConstraints(self.model.joints, dt)
+        self._joints = JointConstraints(self.model.joints, dt, self.base)
         self._contacts = ContactFinder(
             mover, statics, self.model_in_motion, self.data, self.frames, features
         )
@@ -81,7 +81,7 @@ class PinocchioRobot(RobotEngine):
         self._springs = bool(resists.stiffness.any())
         self._smooth = bool(resists.damping.any() or resists.stiffness.any())
         self._constraints: Constraints | None = None
-        self._warmth = Warmth(len(self._contacts), len(self._joints.joints))
+        self._warmth = Warmth(len(self._contacts), len(self._joints.columns))
         # Pinocchio computes the upper half of the inverse mass matrix.
         self._upper = np.triu(np.ones((self.nv, self.nv)), 1) + 0.5 * np.eye(self.nv)
 
@@ -193,18 +193,17 @@ class PinocchioRobot(RobotEngine):
         self._constraints = Constraints(
             self._joints,
             self._warmth,
-            functools.partial(self._inverse, q),
+            self._inverse,
             touching,
             q[self.nq - self.nv + base :],
             v[base:],
-            base=base,
             touched=touched or touching is not None,
         )
         return self._constraints
 
-    def _inverse(self, q: Vector) -> Vector:
+    def _inverse(self) -> Vector:
         """Return the inverse of the mass matrix, shape (nv, nv)."""
-        upper = pinocchio.computeMinverse(self._model, self._data, q) * self._upper
+        upper = self._upper * pinocchio.computeMinverse(self._model, self._data, self._positions)
         return upper + upper.T
 
     def forget(self) -> None:
@@ -237,8 +236,8 @@ class PinocchioRobot(RobotEngine):
         part = self._constraints
         if part is None or part.touching is None:
             return np.zeros(0, CONTACT)
-        body_a, body_b = first + part.touching.links, statics + part.touching.statics
-        return part.touching.records(body_a, body_b, part.impulses, self._period)
+        links, touched = self._contacts.bodies(part.touching.numbers)
+        return part.touching.records(first + links, statics + touched, part.impulses, self._period)
 
     def hold(self, commands: Vector) -> None:
         """Hold commands, shape (joints,), that are within their limits."""

@@ -81,12 +81,13 @@ class ImpulseSolver:
             most: Largest impulses, likewise.
             guess: Impulses to begin with, shape (3 k + m,).
         """
-        if not math.isfinite(free.sum() + response.sum()):
+        # An entry of the response that is not finite makes the diagonal so, too.
+        if not math.isfinite(sum(free.tolist()) + sum(response.diagonal().tolist())):
             raise SimulationError("The state is no longer finite. Use a smaller period.")
         problem = ContactProblem(response, free, friction, least, most)
         best, least_error, good = guess, math.inf, problem.accuracy
         for begin in self._beginnings(problem, guess):
-            if math.isfinite(begin.sum()):
+            if math.isfinite(begin.dot(begin)):
                 found, error = problem.newton(begin, _NEWTON_STEPS)
                 if error < least_error:
                     best, least_error = found, error

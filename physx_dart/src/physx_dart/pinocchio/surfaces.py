@@ -12,6 +12,11 @@ from physx_core.simulation import Ground, HeightField, Stairs
 from physx_core.typing import Vector
 from physx_dart.models.parts import Static
 
+_CROSS = np.zeros((3, 9))
+_CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = -1.0, 1.0, -1.0, 1.0, -1.0, 1.0
+"""Maps a vector to its cross-product matrix, flattened by columns: times a row, it is the cross
+product of the vector and the row."""
+
 
 class Surface(ABC):
     """A surface."""
@@ -24,6 +29,10 @@ class Surface(ABC):
             Distances in m, shape (n,); two tangents and the outward normal as rows,
             shape (n, 3, 3), or (1, 3, 3) if they are the same everywhere.
         """
+
+    def moments(self, points: Vector, axes: Vector) -> Vector:
+        """Return the cross products of points (n, 3) with the axes there, shape (n, 3, 3)."""
+        return moments_of(points, axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +47,18 @@ class Plane(Surface):
         """Two tangents and the normal, as rows, shape (1, 3, 3)."""
         return axes_of(self.normal[None])
 
+    @cached_property
+    def _moments(self) -> Vector:
+        """Maps a point to its cross products with the axes, flattened by rows, shape (3, 9)."""
+        return moments_of(np.eye(3), self.axes).reshape(3, 9)
+
     def distances(self, points: Vector) -> tuple[Vector, Vector]:
         """Return distances and axes."""
-        return points @ self.normal - self.height, self.axes
+        return points.dot(self.normal) - self.height, self.axes
+
+    def moments(self, points: Vector, axes: Vector) -> Vector:
+        """Return the cross products with the axes of the plane."""
+        return points.dot(self._moments).reshape(-1, 3, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,3 +108,8 @@ def axes_of(normals: Vector) -> Vector:
     first = np.where(steep, [z, nothing, -x], [y, -x, nothing]).T
     first /= np.sqrt(np.einsum("ij,ij->i", first, first))[:, None]
     return np.stack([first, np.cross(normals, first), normals], axis=1)
+
+
+def moments_of(points: Vector, axes: Vector) -> Vector:
+    """Return the cross products of points (n, 3) with the rows of axes (n or 1, 3, 3)."""
+    return axes @ (points @ _CROSS).reshape(-1, 3, 3)
