@@ -183,7 +183,9 @@ def installed_versions() -> dict[str, str]:
     """Return the versions of Python, the platform, the physx distributions, and their libraries."""
     versions = {"python": platform.python_version(), "platform": sys.platform}
     for distribution in distributions():
-        name = distribution.metadata["Name"] or ""
+        # From the folder's name, as importlib.metadata does it; reading all names takes long.
+        name = getattr(distribution, "_normalized_name", None) or distribution.metadata["Name"]
+        name = (name or "").replace("_", "-")
         if name.startswith("physx-") or name in ("numpy", "h5py", "torch", "dartpy", "pin"):
             versions[name] = distribution.version
     return dict(sorted(versions.items()))
