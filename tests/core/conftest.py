@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -214,3 +215,35 @@ def port():
     """A port where nobody listens."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         return listener.getsockname()[1]
+
+
+# Kills ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def run_killed(nothing_stays_behind):
+    """Return a function that runs a program to its end, but kills it after each of some times in s.
+
+    It takes the program, the folder, the times, and arguments; it returns how many were killed.
+    """
+    runners = {}
+
+    def run(program, folder, moments, *words):
+        if program not in runners:
+            command = [sys.executable, str(Path(__file__).parent / "programs" / "forks.py")]
+            runners[program] = subprocess.Popen(
+                [*command, program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            )
+            assert runners[program].stdout.readline() == "ready\n"
+        for kills, moment in enumerate([*moments, None]):
+            words_of_run = json.dumps([str(folder), moment, *words])
+            print(words_of_run, file=runners[program].stdin, flush=True)
+            status = int(runners[program].stdout.readline())
+            if status != -signal.SIGKILL:
+                assert not status
+                return kills
+        return None
+
+    yield run
+    for runner in runners.values():
+        runner.communicate()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 import zipfile
 from pathlib import Path
@@ -138,21 +136,6 @@ def test_active_runs_in_clients_and_from_the_command_line(tmp_path):
 # Resumed ------------------------------------------------------------------------------------------
 
 
-def killed(folder, name, moments, *words):
-    """Run the program to its end, but kill it after each of some times in s; count the kills."""
-    kills = 0
-    for moment in [*moments, None]:
-        process = subprocess.Popen([sys.executable, str(PROGRAM), name, *words], cwd=folder)
-        try:
-            assert process.wait(moment) == 0
-            break
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-            kills += 1
-    return kills
-
-
 def kept(folder, name):
     """Return all rows and sets, and the files of the last checkpoint."""
     with Dataset.open(folder / "sessions" / name / "dataset") as dataset:
@@ -167,11 +150,14 @@ def kept(folder, name):
     return found
 
 
-def survives(folder, seed, kills, words):
+def survives(run_killed, folder, seed, kills, words):
+    def killed(name, moments):
+        return run_killed(str(PROGRAM), folder, moments, name, *words)
+
     began = time.monotonic()
-    assert not killed(folder, "whole", [], *words)
+    killed("whole", [])
     whole, random = time.monotonic() - began, np.random.default_rng(seed)
-    count = killed(folder, "killed", (whole * random.uniform(0.15, 0.6, kills)).tolist(), *words)
+    count = killed("killed", (whole * random.uniform(0.15, 0.6, kills)).tolist())
     expected, found = kept(folder, "whole"), kept(folder, "killed")
     assert expected.keys() == found.keys()
     assert [name for name in expected if expected[name] != found[name]] == []
@@ -182,17 +168,15 @@ def survives(folder, seed, kills, words):
     "words", [("clients", "stream"), ("clients", "reservoir"), ("local", "reservoir")], ids=str
 )
 def test_a_training_whose_sampler_learns_is_killed_and_resumed_bit_for_bit(
-    tmp_path, words, nothing_stays_behind
+    tmp_path, words, run_killed
 ):
-    assert survives(tmp_path, 2, 3, words)
+    assert survives(run_killed, tmp_path, 2, 3, words)
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize("words", [("clients", "stream"), ("clients", "reservoir")], ids=str)
-def test_such_a_training_survives_being_killed_at_any_moments(
-    tmp_path, words, nothing_stays_behind
-):
-    assert survives(tmp_path, 0, 10, words)
+def test_such_a_training_survives_being_killed_at_any_moments(tmp_path, words, run_killed):
+    assert survives(run_killed, tmp_path, 0, 10, words)
 
 
 def test_after_failed_sets_resuming_is_refused_if_rejected_samples_are_recorded(tmp_path):

@@ -6,8 +6,6 @@ import itertools
 import os
 import random
 import signal
-import subprocess
-import sys
 import threading
 import time
 import zipfile
@@ -292,21 +290,6 @@ def test_an_interrupted_training_is_resumed_while_environments_generate(
     same(result(again, "stopped"), result(whole, "whole"))
 
 
-def killed(name, moments, *words):
-    """Run the program to its end, but kill it after each of some times in s; count the kills."""
-    kills = 0
-    for moment in [*moments, None]:
-        process = subprocess.Popen([sys.executable, str(PROGRAM), name, *words])
-        try:
-            assert process.wait(moment) == 0
-            break
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-            kills += 1
-    return kills
-
-
 def last_checkpoint(name):
     found = checkpoint.find(Path(f"sessions/{name}"), None, -1)
     with zipfile.ZipFile(found.path / "parameters.npz") as file:
@@ -315,14 +298,18 @@ def last_checkpoint(name):
     return weights, normalization, found.progress
 
 
-def survives(random, kills, words):
+def survives(run_killed, random, kills, words):
     """Check trainings that are killed at random moments, so often in all, against a whole one."""
+
+    def killed(name, moments):
+        return run_killed(str(PROGRAM), Path.cwd(), moments, name, *words)
+
     began = time.monotonic()
-    assert not killed("whole", [], *words)
+    killed("whole", [])
     whole = time.monotonic() - began
     for number in itertools.count():
         name = f"killed{number}"
-        kills -= killed(name, [whole * random.uniform(0.2, 1.1) for _ in range(5)], *words)
+        kills -= killed(name, [whole * random.uniform(0.2, 1.1) for _ in range(5)])
         same(stored(name), stored("whole"))
         assert last_checkpoint(name) == last_checkpoint("whole")
         if words[2] != "stream":
@@ -342,17 +329,17 @@ def survives(random, kills, words):
     ids=" ".join,
 )
 def test_a_training_that_is_killed_while_environments_generate_is_resumed_bit_for_bit(
-    words, nothing_stays_behind
+    words, run_killed
 ):
-    survives(random.Random(1), 2, words)
+    survives(run_killed, random.Random(1), 2, words)
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize(
     "words", [("clients", "once", "fifo"), ("clients", "always", "stream")], ids=" ".join
 )
-def test_a_training_survives_being_killed_at_twenty_moments(words, nothing_stays_behind):
-    survives(random.Random(2), 20, words)
+def test_a_training_survives_being_killed_at_twenty_moments(words, run_killed):
+    survives(run_killed, random.Random(2), 20, words)
 
 
 def test_the_command_resumes_with_the_environments_of_the_session(capfd, nothing_stays_behind):
