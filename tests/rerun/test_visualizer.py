@@ -98,7 +98,8 @@ def test_a_viewer_of_its_own_outlives_the_run(monkeypatch, opened):
         visualizer.close()
         client = ViewerClient.connect(f"rerun+http://{visualizer.viewer.address}/proxy")
         deadline = time.monotonic() + 60
-        while {view.name for view in client.get_state().views} != {"environment", "loss"}:
+        shown = {"environment", "loss per epoch (log10)"}
+        while {view.name for view in client.get_state().views} != shown:
             assert time.monotonic() < deadline, client.get_state()
             time.sleep(0.1)
         assert visualizer.file is None

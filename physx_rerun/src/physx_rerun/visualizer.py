@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import physx_rerun.viewer.messages  # isort: skip  # noqa: F401  (before Rerun is imported)
 
+import contextlib
 import re
 import shlex
 import time
@@ -11,18 +12,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 import rerun as rr
 
 from physx_core import Visualizer
 from physx_core.components import Event
 from physx_core.config import at_least, options
 from physx_core.errors import ConfigError, VisualizerError
+from physx_core.fields import Field
 from physx_core.typing import Array
-from physx_rerun.drawing import colors
 from physx_rerun.drawing.changes import Changes
-from physx_rerun.drawing.chunks import SIM_TIME, TIME, ChunkBuilder
+from physx_rerun.drawing.chunks import SIM_TIME, TIME, ChunkBuilder, Times
 from physx_rerun.drawing.clock import SimulatedClock
+from physx_rerun.drawing.dashboard import Dashboard
 from physx_rerun.drawing.drawing import Drawing
 from physx_rerun.drawing.windows import WindowLayout
 from physx_rerun.viewer.headless import render_picture
@@ -31,7 +32,6 @@ from physx_rerun.viewer.streams import RecordingStreams
 from physx_rerun.viewer.viewer import Viewer, has_display, is_listening, start_web_viewer
 
 MODES = ("save", "spawn", "connect", "web", "headless", "offscreen", "none")
-BINS = 30
 FLUSH_SECONDS = 0.2
 FLUSH_STEPS = 100
 FLUSH_BYTES = 8_000_000
@@ -89,7 +89,7 @@ class RerunVisualizer(Visualizer):
         self.file: Path | None = None
         self._announcements: list[str] = []
         self._outputs: list[str] = []
-        self._run_name = "run"
+        self._run_name, self._session_dir = "run", Path()
         self._addresses: list[str] = []
         self._recording: RecordingStreams | None = None
         self._is_open = False
@@ -99,7 +99,7 @@ class RerunVisualizer(Visualizer):
         self._drawings: dict[int, Drawing] = {}
         self._clocks: dict[int, SimulatedClock] = {}
         self._changes: dict[int, Changes] = {}
-        self._curves: set[str] = set()
+        self._dashboard = Dashboard(self._rows)
         self._positions: dict[str, int] = {}
 
     def _check_options(self) -> None:
@@ -133,6 +133,7 @@ class RerunVisualizer(Visualizer):
         if self.mode == "none":
             return
         self._run_name, self._layout = run_name, WindowLayout(instance_nb)
+        self._session_dir = Path(session_dir)
         self._layout.has_time_panel = self.mode != "offscreen"
         if self.mode == "connect":
             self._addresses = self._given_addresses()
@@ -234,35 +235,34 @@ class RerunVisualizer(Visualizer):
         """Add points to the curves of the training; see `Observer.scalars`."""
         if not self._is_open:
             return
-        self._positions[timeline] = step
-        times = {**self._positions, TIME: self._now()}
-        for name, value in values.items():
-            entity = _entity_of(name)
-            group, _, label = name.rpartition("/")
-            if name not in self._curves:
-                self._curves.add(name)
-                number = sum(known.rpartition("/")[0] == group for known in self._curves) - 1
-                line = rr.SeriesLines(names=[label], colors=colors.curves(1, number))
-                self._rows.add_static(entity, line)
-                self._layout.add_plot(group or name, entity, timeline, 1)
-            self._rows.add(entity, rr.Scalars, times, scalars=[float(value)])
+        self._dashboard.scalars(values, self._times(step, timeline))
         self._flush_if_due()
 
     def histograms(self, values: Mapping[str, Array], step: int, timeline: str) -> None:
         """Show the histogram of the finite numbers; see `Observer.histograms`."""
         if not self._is_open:
             return
-        self._positions[timeline] = step
-        times = {**self._positions, TIME: self._now()}
-        for name, array in values.items():
-            finite = array[np.isfinite(array)]
-            if not finite.size:
-                continue
-            counts, edges = np.histogram(finite, BINS)
-            group, _, label = name.partition("/")
-            self._layout.add_histogram(group, label, _entity_of(name))
-            middles = (edges[1:] + edges[:-1]) / 2
-            self._rows.add_archetype(_entity_of(name), rr.BarChart(counts, abscissa=middles), times)
+        self._dashboard.histograms(values, self._times(step, timeline))
+        self._flush_if_due()
+
+    def fields(self, fields: Sequence[Field]) -> None:
+        """Take the units of the training's samples; see `Observer.fields`."""
+        self._dashboard.fields(fields)
+
+    def predictions(
+        self, predicted: Mapping[str, Array], truth: Mapping[str, Array], step: int, timeline: str
+    ) -> None:
+        """Show predicted values over true ones; see `Observer.predictions`."""
+        if not self._is_open:
+            return
+        self._dashboard.predictions(predicted, truth, self._times(step, timeline))
+        self._flush_if_due()
+
+    def note(self, text: str) -> None:
+        """Add the text to the notes; see `Observer.note`."""
+        if not self._is_open:
+            return
+        self._dashboard.note(text, {**self._positions, TIME: self._now()})
         self._flush_if_due()
 
     def close(self) -> None:
@@ -302,6 +302,19 @@ class RerunVisualizer(Visualizer):
 
     # Flushing -------------------------------------------------------------------------------
 
+    def _describe(self) -> None:
+        """Put the session's configuration into the recording; other folders have none."""
+        path = self._session_dir / "config.toml"
+        if (self._session_dir / "info.txt").is_file() and path.is_file():
+            with contextlib.suppress(OSError, ValueError):
+                self._dashboard.describe(path.read_text("utf-8"))
+
+    def _times(self, step: int, timeline: str) -> Times:
+        """Return where to put what a training recorded: also where its other timelines are."""
+        self._positions[timeline] = step
+        self._layout.add_timeline(timeline)
+        return {**self._positions, TIME: self._now()}
+
     def _now(self) -> float:
         return time.monotonic() - self._begun
 
@@ -317,25 +330,22 @@ class RerunVisualizer(Visualizer):
         if self._recording is None:
             if not chunks:
                 return
+            self._describe()
+            chunks += self._rows.pop_chunks()
             self._recording = RecordingStreams(
-                f"physx {self._run_name} {self._layout.digest}",
+                f"physx {self._run_name} {self._layout.digest(self._dashboard.kinds)}",
                 self._run_name,
                 self.file,
                 self._addresses,
                 owns_viewer=self.viewer is not None or self._offscreen is not None,
             )
         self._recording.write(chunks)
-        if self._layout.changed:
-            self._recording.write_blueprint(self._layout.blueprint())
+        if self._layout.changed or self._dashboard.changed:
+            self._recording.write_blueprint(self._layout.blueprint(self._dashboard.cells()))
 
 
 def _is_address(text: str) -> bool:
     return re.fullmatch(r".+:\d{1,5}", text) is not None
-
-
-def _entity_of(name: str) -> str:
-    """Return the entity path of a number's name."""
-    return "/".join(["run", *map(rr.escape_entity_path_part, name.split("/"))])
 
 
 def _unused_path(folder: Path, name: str) -> Path:

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from physx_core.components.scene import Event
+    from physx_core.fields import Field
     from physx_core.typing import Array
 
 
@@ -63,6 +64,25 @@ class Observer:
 
         Args:
             values: Name to array, for example ``weights/layers.0.weight``.
+            step: Position on the timeline.
+            timeline: ``epoch``.
+        """
+
+    def fields(self, fields: Sequence[Field]) -> None:
+        """Receive the fields of a training's samples, with their units, before its first numbers.
+
+        Args:
+            fields: The fields.
+        """
+
+    def predictions(
+        self, predicted: Mapping[str, Array], truth: Mapping[str, Array], step: int, timeline: str
+    ) -> None:
+        """Compare predictions of some validation samples with the truth.
+
+        Args:
+            predicted: Field name to array of shape (samples, *field shape), in the field's unit.
+            truth: The same for what the network should have predicted.
             step: Position on the timeline.
             timeline: ``epoch``.
         """

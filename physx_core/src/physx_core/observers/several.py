@@ -9,6 +9,7 @@ from typing import Any
 
 from physx_core.components.scene import Event
 from physx_core.components.visualizer import Observer
+from physx_core.fields import Field
 from physx_core.typing import Array
 
 
@@ -58,6 +59,22 @@ class Observers(Observer):
     def histograms(self, values: Mapping[str, Array], step: int, timeline: str) -> None:
         """Pass on arrays."""
         self._call("histograms", values, step, timeline)
+
+    def fields(self, fields: Sequence[Field]) -> None:
+        """Pass on fields."""
+        self._call("fields", fields)
+
+    def predictions(
+        self, predicted: Mapping[str, Array], truth: Mapping[str, Array], step: int, timeline: str
+    ) -> None:
+        """Pass on predictions and the truth."""
+        self._call("predictions", predicted, truth, step, timeline)
+
+    @property
+    def want_predictions(self) -> bool:
+        """Whether an observer does anything with predictions."""
+        ignored = Observer.predictions
+        return any(type(each).predictions is not ignored for each in self._observers)
 
     def note(self, text: str) -> None:
         """Pass on a message."""

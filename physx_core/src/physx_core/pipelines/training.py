@@ -170,6 +170,7 @@ class Training(NewSessionPipeline):
     _epoch_batches: int | None = field(init=False, repr=False, default=None)
     _is_savable: bool = field(init=False, repr=False, default=False)
     _met_nan: bool = field(init=False, repr=False, default=False)
+    _told_fields: bool = field(init=False, repr=False, default=False)
     _blocks: int = field(init=False, repr=False, default=0)
     _generation: Generation | None = field(init=False, repr=False, default=None)
 
@@ -271,6 +272,9 @@ class Training(NewSessionPipeline):
         """Count the batch and record its losses."""
         self.batch_id += 1
         values = self._record.add(self.losses)
+        if not self._told_fields:
+            self.observers.fields(list(self.learner.fields.values()))
+            self._told_fields = True
         if self.data.produces and self.data.online is not None:
             self._blocks = self.data.online.number
             values |= self.data.online.recent_statistics()
@@ -322,6 +326,10 @@ class Training(NewSessionPipeline):
         losses = self.validate()
         values |= {f"{name}/validation": value for name, value in losses.items()}
         self.validation_loss = losses["loss"]
+        if self.observers.want_predictions:
+            samples = self.data.validation_samples(self.learner.batch_fields)
+            compared = self.learner.compare(samples)
+            self.observers.predictions(*compared, self.epoch_id, "epoch")
         if self.on_nan == "stop" and not math.isfinite(self.validation_loss):
             raise self._diverged(f"the validation loss is {self.validation_loss}", 0)
         return self.validation_loss

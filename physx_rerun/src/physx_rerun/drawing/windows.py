@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -45,7 +45,6 @@ class WindowLayout:
     _kinds: set[tuple[str, str]] = field(default_factory=set)
     _scenes: dict[int, dict[str, Box]] = field(default_factory=dict)
     _plots: dict[str, dict[str, int]] = field(default_factory=dict)
-    _histograms: dict[str, dict[str, str]] = field(default_factory=dict)
     _texts: dict[str, dict[int, str]] = field(default_factory=dict)
     _timelines: set[str] = field(default_factory=set)
     _titles: dict[int, str] = field(default_factory=dict)
@@ -82,11 +81,9 @@ class WindowLayout:
         self._kinds.add(("plot", name))
         self.changed = True
 
-    def add_histogram(self, group: str, label: str, entity: str) -> None:
-        """Register an entity with a histogram, as a tab of its group."""
-        self._histograms.setdefault(group, {})[label] = entity
-        self._kinds.add(("histogram", f"{group}/{label}"))
-        self.changed = True
+    def add_timeline(self, timeline: str) -> None:
+        """Register a timeline of something that is shown."""
+        self._timelines.add(timeline)
 
     def add_text(self, instance_id: int, name: str, entity: str) -> None:
         """Register a text of an instance."""
@@ -106,13 +103,15 @@ class WindowLayout:
         if name not in scene and len(points) and np.isfinite(points).all():
             scene[name] = (points.min(axis=0), points.max(axis=0))
 
-    @property
-    def digest(self) -> str:
-        """Text that is the same for equal sets of objects and numbers of instances.
+    def digest(self, kinds: Set[tuple[str, str]] = frozenset()) -> str:
+        """Return a text that is the same for equal sets of objects and numbers of instances.
 
         Rerun keeps a user's own layout by application; runs that show the same things share it.
+
+        Args:
+            kinds: Further things that are shown.
         """
-        text = repr((self.instance_nb, sorted(self._kinds)))
+        text = repr((self.instance_nb, sorted(self._kinds | kinds)))
         return hashlib.sha256(text.encode()).hexdigest()[:8]
 
     @property
@@ -123,16 +122,19 @@ class WindowLayout:
             return known if self._timelines <= {"step"} else TIME
         return "batch" if "batch" in self._timelines else next(iter(self._timelines), TIME)
 
-    def blueprint(self) -> rrb.Blueprint:
+    def blueprint(self, further: Sequence[rrb.View | Container] = ()) -> rrb.Blueprint:
         """Return the windows: the scenes, and beside or below them the plots and the texts.
 
         Two or three scenes stand in a row above the rest, so that they are easily compared.
+
+        Args:
+            further: More plots.
         """
         self.changed = False
         scenes = [self._scene_view(instance_id) for instance_id in sorted(self._scenes)]
         plots: list[rrb.View | Container] = [
             *(_plot_view(name, curves) for name, curves in self._plots.items()),
-            *(_histogram_views(name, bars) for name, bars in self._histograms.items()),
+            *further,
         ]
         texts = [self._text_views(name, entities) for name, entities in self._texts.items()]
         in_a_row = 1 < len(scenes) <= _ROW
@@ -218,11 +220,6 @@ def _plot_view(name: str, curves: Mapping[str, int]) -> rrb.TimeSeriesView:
     visible = sum(curves.values()) <= _LEGEND
     legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=visible)
     return rrb.TimeSeriesView(name=name, contents=list(curves), plot_legend=legend)
-
-
-def _histogram_views(group: str, entities: Mapping[str, str]) -> Container:
-    views = (rrb.BarChartView(origin=entity, name=label) for label, entity in entities.items())
-    return rrb.Tabs(*views, name=group)
 
 
 def _union(boxes: Sequence[Box]) -> Box:

@@ -294,6 +294,18 @@ class Learner:
         self.network.set_eval()
         return self.answer(batch)
 
+    def compare(self, batch: Batch) -> tuple[Batch, Batch]:
+        """Return the predictions for a batch, between two optimization steps, and their truth.
+
+        Only fields are returned of which the batch has the truth.
+        """
+        predicted = self.predict_in_training(batch)
+        network = self.network
+        names = dict(zip(network.pred_fields, network.opt_fields, strict=False))
+        truth = {name: batch[names[name]] for name in predicted if names.get(name) in batch}
+        known = [name for name, array in truth.items() if array.shape == predicted[name].shape]
+        return {name: predicted[name] for name in known}, {name: truth[name] for name in known}
+
     def predict(self, batch: Batch) -> Batch:
         """Return the prediction for a batch, both in physical units.
 

@@ -27,6 +27,8 @@ from physx_core.statistics import Normalization
 from physx_core.typing import Array, Batch, Index
 
 _IDENTITY = ("env_id", "episode")
+_SHOWN = 64
+"""Largest number of validation samples whose predictions are shown."""
 
 
 class TrainingData:
@@ -291,6 +293,13 @@ class TrainingData:
         part = self.parts.get("validation")
         batches = part.batches if part else partial(self.dataset.batches, "validation")
         return batches(1024, fields=names, dtype=self._data_type, reuse=True)
+
+    def validation_samples(self, names: Sequence[str]) -> Batch:
+        """Return some of the validation samples, always the same ones."""
+        first = next(self.validation_batches(names))
+        count = len(next(iter(first.values())))
+        chosen = np.linspace(0, count - 1, min(count, _SHOWN)).astype(np.intp)
+        return {name: values[chosen] for name, values in first.items()}
 
     @property
     def has_validation(self) -> bool:
