@@ -104,6 +104,10 @@ def test_an_episode_comes_back_exactly(backend):
     assert log.constants["seed"] == 0
     assert log.constants["backend"] == backend
     assert log.units["state.q.ball.z"] == "m"
+    slider, hinge = "state.v.robot.slider", "state.q.robot.hinge"
+    assert (log.units[slider], log.units[hinge]) == ("m/s", "rad")
+    assert log.units["sensor.Encoder.hinge.velocity"] == "rad/s"
+    assert log.units["motor.torque.slider"] == "N"
     with pytest.raises(ComponentNotFoundError, match='no robot or object "bal"'):
         log.trajectory("bal")
     with pytest.raises(LogError, match=r'no column "state.q.robot.hing"\. Did you mean'):

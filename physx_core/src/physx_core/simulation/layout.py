@@ -94,6 +94,7 @@ class Layout:
         parts: Place of each robot and moving object, by name.
         statics: Names of everything static: ``"ground"``, then the static objects.
         modes: Command mode of each joint, as in `JointSettings`.
+        units: Unit of each joint's position: rad, or m for a prismatic one.
     """
 
     joints: tuple[str, ...]
@@ -109,6 +110,7 @@ class Layout:
     parts: Mapping[str, Part] = field(default_factory=dict)
     statics: tuple[str, ...] = ()
     modes: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -160,6 +160,7 @@ def layout_of(parts: Parts) -> Layout:
         parts=places,
         statics=statics,
         modes=tuple(joint.settings.mode for joint in joints),
+        units=tuple(joint.unit for joint in joints),
     )
 
 

@@ -55,6 +55,7 @@ class Joint:
         damping: Viscous damping, in N m s/rad or N s/m.
         friction: Coulomb friction, in N m or N.
         settings: The world's settings of it.
+        unit: Unit of its position, rad or m.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Joint:
     damping: float
     friction: float
     settings: JointSettings
+    unit: str
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,7 @@ def _joint(joint: Element, all_settings: Mapping[str, JointSettings]) -> Joint:
         _number(joint, "dynamics", "damping") if damping is None else damping,
         _number(joint, "dynamics", "friction") if friction is None else friction,
         settings,
+        "m" if joint.get("type") == "prismatic" else "rad",
     )
 
 

@@ -25,6 +25,8 @@ _SENSED = {
     "force": "N",
 }
 """Units of measured quantities that do not depend on the type of a joint."""
+_EFFORTS = {"rad": "N m", "m": "N"}
+"""Unit of what drives a joint, by the unit of its position."""
 
 
 def register_simulator(telemetry: Telemetry, simulator: Simulator) -> None:
@@ -35,26 +37,37 @@ def register_simulator(telemetry: Telemetry, simulator: Simulator) -> None:
     """
     layout, state = simulator.layout, simulator.robot_state
     positions, velocities = state_names(layout)
-    units = [BASE_POSITION.get(name.rpartition(".")[2], "") for name in positions]
+    units = state_units(layout)
     always: dict[str, Any] = {"is_eval_only": False}
-    telemetry.register(POSITIONS, simulator.positions, positions, unit=units, **always)
-    units = [BASE_VELOCITY.get(name.rpartition(".")[2], "") for name in velocities]
-    telemetry.register(VELOCITIES, simulator.velocities, velocities, unit=units, **always)
+    telemetry.register(POSITIONS, simulator.positions, positions, unit=units[0], **always)
+    telemetry.register(VELOCITIES, simulator.velocities, velocities, unit=units[1], **always)
+    joints = dict(zip(layout.joints, layout.units, strict=False))
     for kind, values in simulator.measurements.get("measurements", {}).items():
         sensors = [sensor for sensor in simulator.sensors if kind_of(sensor) == kind]
-        units = [
-            _SENSED.get(quantity, "N m" if kind == "ForceTorque" else "")
+        sensed = [
+            _unit_of(quantity, kind, joints.get(getattr(sensor, "joint", ""), ""))
             for sensor in sensors
             for quantity, size in sensor.quantities.items()
             for _ in range(size)
         ]
         names = sensor_names(sensors)
-        telemetry.register(f"sensor.{kind}", values.T, names, unit=units, **always)
+        telemetry.register(f"sensor.{kind}", values.T, names, unit=sensed, **always)
     motors = [motor.joint for motor in simulator.motors]
     if "accelerations" in simulator.simulation.features:
-        telemetry.register("state.a", state.a, velocities[simulator.robot.velocities])
-    telemetry.register("motor.command", state.command, motors)
-    telemetry.register("motor.torque", state.torques, motors)
+        own = simulator.robot.velocities
+        accelerations = [f"{unit}²" if unit else "" for unit in units[1][own]]
+        telemetry.register("state.a", state.a, velocities[own], unit=accelerations)
+    efforts = [_EFFORTS.get(joints.get(joint, ""), "") for joint in motors]
+    telemetry.register("motor.command", state.command, motors, unit=efforts)
+    telemetry.register("motor.torque", state.torques, motors, unit=efforts)
+
+
+def _unit_of(quantity: str, kind: str, joint: str) -> str:
+    """Return the unit of what a kind of sensor measures, perhaps at a joint whose unit is given."""
+    if quantity == "torque":
+        return "N m" if kind == "ForceTorque" else _EFFORTS.get(joint, "")
+    known = {"position": joint, "velocity": f"{joint}/s" if joint else ""}
+    return _SENSED.get(quantity, known.get(quantity, ""))
 
 
 def state_names(layout: Layout) -> tuple[list[str], list[str]]:
@@ -65,6 +78,17 @@ def state_names(layout: Layout) -> tuple[list[str], list[str]]:
         base = (BASE_POSITION, BASE_VELOCITY) if part.floating else ({}, {})
         positions[part.positions] = [f"{part.name}.{each}" for each in (*base[0], *joints)]
         velocities[part.velocities] = [f"{part.name}.{each}" for each in (*base[1], *joints)]
+    return positions, velocities
+
+
+def state_units(layout: Layout) -> tuple[list[str], list[str]]:
+    """Return the units of the positions and velocities of a world."""
+    positions, velocities = [""] * layout.nq, [""] * layout.nv
+    for part in layout.parts.values():
+        base = (BASE_POSITION, BASE_VELOCITY) if part.floating else ({}, {})
+        units = (layout.units or ("",) * len(layout.joints))[part.joints]
+        positions[part.positions] = [*base[0].values(), *units]
+        velocities[part.velocities] = [*base[1].values(), *(unit and f"{unit}/s" for unit in units)]
     return positions, velocities
 
 
