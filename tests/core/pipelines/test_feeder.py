@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physx_core.pipelines.learning.feeder import Feeder
+from physx_core.pipelines.learning.batches.feeder import Feeder
 
 
 @dataclass

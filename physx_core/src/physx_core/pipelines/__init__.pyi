@@ -1,7 +1,7 @@
 """Pipelines: data generation, training, prediction, and replay."""
 
 from .data_generation import DataGeneration as DataGeneration
-from .learning.drawn_rows import read_drawn_rows as read_drawn_rows
+from .learning.batches.drawn_rows import read_drawn_rows as read_drawn_rows
 from .learning.learner import Learner as Learner
 from .learning.learner import load_learner as load_learner
 from .pipeline import Pipeline as Pipeline

@@ -22,7 +22,7 @@ from physx_core.pipelines.storage import (
     GENERATION,
     describe_environment,
     open_own,
-    record_rejected,
+    record_beside_rows,
     store_sets,
 )
 from physx_core.sources.source import Source
@@ -93,7 +93,7 @@ class DataGeneration(NewSessionPipeline):
         With ``record_wrong_samples`` the samples that `check_sample` rejected meanwhile are stored
         too, in the mode "wrong".
         """
-        with record_rejected(self.source, self.dataset):
+        with record_beside_rows(self.source, self.dataset):
             self.batch = self.source.batch(self.batch_size)
             store_sets(self.source, self.dataset)
             if self.batch_id == 0:

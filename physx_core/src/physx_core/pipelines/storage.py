@@ -215,7 +215,7 @@ def is_copy(directory: Path) -> bool:
 
 
 @contextlib.contextmanager
-def record_rejected(
+def record_beside_rows(
     source: Source, dataset: Dataset | None, earlier: Mapping[int, int] | None = None
 ) -> Iterator[None]:
     """Store what a source makes beside the rows of a batch.

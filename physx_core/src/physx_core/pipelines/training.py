@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import shlex
 import time
@@ -17,7 +16,6 @@ from physx_core import checkpoint
 from physx_core.checkpoint import Progress
 from physx_core.components.buffer import Buffer
 from physx_core.components.group import Group
-from physx_core.components.network import Network
 from physx_core.config import (
     DatasetConfig,
     EnvironmentConfig,
@@ -27,43 +25,24 @@ from physx_core.config import (
     to_plain,
 )
 from physx_core.dataset import Dataset
-from physx_core.errors import CheckpointError, ConfigError, DivergedError
+from physx_core.errors import ConfigError, DivergedError
 from physx_core.observers import statistics_observers
 from physx_core.pipelines.interrupt import Interrupt, Terminated, deferred_interrupt
-from physx_core.pipelines.learning.blocks import Block
 from physx_core.pipelines.learning.components import create
-from physx_core.pipelines.learning.drawn_rows import DrawnRows
-from physx_core.pipelines.learning.feeder import Feeder
 from physx_core.pipelines.learning.learner import Learner
-from physx_core.pipelines.learning.resuming import (
-    Generation,
-    can_resume,
-    find_start,
-    without_copied_dataset,
-)
+from physx_core.pipelines.learning.opening import DataOpening, join_group, open_dataset
+from physx_core.pipelines.learning.resuming import Start, can_resume, find_start
 from physx_core.pipelines.learning.training_data import TrainingData
 from physx_core.pipelines.learning.training_record import BestEpoch, TrainingRecord
-from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
+from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed
 from physx_core.pipelines.run_description import (
     describe_failed_sets,
     describe_samples,
     describe_training,
 )
-from physx_core.pipelines.storage import (
-    GENERATION,
-    check_sources,
-    copy_existing,
-    describe_environment,
-    open_existing,
-    open_own,
-    reject_environments,
-)
-from physx_core.plugins.networks import resolve_network
+from physx_core.pipelines.storage import GENERATION, check_sources, reject_environments
 from physx_core.session import Session
-from physx_core.sources.source import Source
 from physx_core.typing import Batch
-from physx_core.workers.instance import NOTHING, Skip
-from physx_core.workers.parameter_sets import ParameterSets
 
 _ADVICE = (
     "Lower the learning rate, normalize the data (DatasetConfig.normalize) or limit the gradients; "
@@ -172,7 +151,6 @@ class Training(NewSessionPipeline):
     _met_nan: bool = field(init=False, repr=False, default=False)
     _told_fields: bool = field(init=False, repr=False, default=False)
     _blocks: int = field(init=False, repr=False, default=0)
-    _generation: Generation | None = field(init=False, repr=False, default=None)
 
     def execute(self) -> None:
         """Train. However the training ends, the network trained so far is a checkpoint to resume.
@@ -384,10 +362,8 @@ class Training(NewSessionPipeline):
             self.best.state,
             self._record.state,
         )
-        online, source = self.data.online, self.data.source
-        states: list[Any] = []
-        if online is not None and source is not None and self.data.produces:
-            states = [online.state(self._blocks), source.sets.state(self._blocks)]
+        generated = self.data.generated
+        states = generated.states(self._blocks) if generated is not None else ()
         return self.learner.save(self.session.network_dir, progress, *states, best=best)
 
     def _leave_batch(self, interrupt: Interrupt) -> None:
@@ -425,8 +401,7 @@ class Training(NewSessionPipeline):
     @property
     def _is_resumable(self) -> bool:
         """Whether the training can be resumed from the last checkpoint."""
-        repeats = self._generation is not None and not self._generation.depends
-        return repeats or can_resume(self.environment_config, self.epoch_id)
+        return self.data.repeats or can_resume(self.environment_config, self.epoch_id)
 
     def _check_parameters(self) -> None:
         name = self.learner.network.find_not_finite() if self.on_nan == "stop" else ""
@@ -451,104 +426,55 @@ class Training(NewSessionPipeline):
     # Opening --------------------------------------------------------------------------------
 
     def _open(self, resources: contextlib.ExitStack) -> None:
-        config = self.dataset_config or DatasetConfig()
-        environment = self.environment_config
-        check_sources(config, environment)
-        self._network_class: Any = Network
-        self._prepare_network_class()
-        last = session = generation = None
+        start = Start(self.dataset_config or DatasetConfig(), self.environment_config)
+        check_sources(start.config, start.environment)
+        self.group, network_class = join_group(self.network_config)
+        self._leads = self.group.leads
+        if self.group.size > 1 and start.environment is not None and not self.resume:
+            reject_environments(start.environment)
         if self.resume:
             session = Session.existing(self.session_dir, self.session_name)
             name = self.network_config.network_name or checkpoint.NAME
-            last, environment, generation = find_start(session, name, environment)
-            config = without_copied_dataset(session, config)
-        self._start_from(last, generation)
+            start = find_start(session, name, start.environment, start.config)
+        self._begin_at(start)
         buffer = self._create_buffer()
-        self._network_class.set_seed(self._resumed.seed)
+        network_class.set_seed(self._resumed.seed)
         self.learner = Learner(self.network_config, trains=True, stops_at_nan=self.on_nan == "stop")
-        if config.existing_dir is not None:  # a missing dataset leaves no session behind
-            Dataset.open(config.existing_dir).close()
-        self.session = session or self._open_session()
-        dataset = resources.enter_context(self._open_dataset(config, environment))
+        if start.config.existing_dir is not None:  # a missing dataset leaves no session behind
+            Dataset.open(start.config.existing_dir).close()
+        self.session = start.session or self._open_session()
+        dataset = resources.enter_context(open_dataset(self.session, start, self.group))
         self._record_config(self._resumed.seed)
-        further = statistics_observers(self.statistics, self.statistics_kwargs, environment)
-        self._observe(resources, environment, further if self._leads else ())
-        source = feeder = None
-        if environment is not None and self._leads:
-            if environment.as_tcp_ip_client and not environment.load_samples:
-                feeder = Feeder[Block]()
-            skip = self._begin_generation(dataset, config.mode, environment, generation)
-            source = self._open_environments(resources, environment, dataset, feeder, buffer, skip)
-        self.data = TrainingData(
-            dataset,
-            source,
-            config,
-            batch_size=self.batch_size * self.group.size,
+        further = statistics_observers(self.statistics, self.statistics_kwargs, start.environment)
+        self._observe(resources, start.environment, further if self._leads else ())
+        opening = DataOpening(
+            start,
+            self.session,
+            self.group,
+            buffer,
+            self._resumed,
             batch_nb=self.batch_nb,
-            seed=self._resumed.seed,
-            environment=environment,
+            batch_fields=self.learner.batch_fields,
             data_type=self.network_config.data_type,
-            buffer=buffer,
-            drawn=self._open_drawn_rows(resources, buffer) if source is not None else None,
-            group=self.group,
-            first=0 if self._generation is None else self._generation.first,
-            feeder=feeder,
             ahead=type(self).batch_condition is Training.batch_condition
             and type(self).batch_produce is Training.batch_produce,
+            open_source=partial(self._open_source, resources),
+            predict=self._predict,
+            show=self.observers.events,
         )
-        resources.callback(self.data.close)
-        if last is not None and self._resumed.blocks:
-            state = partial(checkpoint.read_buffer, last)
-            self.data.resume(self._resumed.blocks, state, self.learner.batch_fields)
-            if source is not None and source.sets.learns:
-                self._resume_sampler(source.sets, last)
-        fields = self.data.fields
-        shapes = [fields[name].shape for name in self.learner.batch_fields if name in fields]
-        if not self.data.produces or None not in shapes:  # else bound with the first batch
-            known = self.data.normalization()
-            if last is not None and dataset.info.get(GENERATION) and config.existing_dir is None:
-                known = last.normalization  # to the last bit
-            self.learner.bind(fields, known)
-        self._load_parameters(last)
-        self.learner.join(self.group)
-        self.learner.network.set_train()
+        self.data = opening.open(resources, dataset)
+        self._prepare_learner(start)
 
-    def _prepare_network_class(self) -> None:
-        """Join the group of processes that the network's library trains with."""
-        config = self.network_config
-        if config.network is None:  # reported by the learner
-            return
-        component, _ = resolve_network(config.network, config.network_kwargs)
-        if hasattr(component, "join_group"):  # else a function that returns a network
-            self._network_class = component
-        self.group = self._network_class.join_group(config.device)
-        self._leads = self.group.leads
-        if self.group.size > 1 and self.environment_config is not None and not self.resume:
-            reject_environments(self.environment_config)
-
-    def _start_from(
-        self, last: checkpoint.Checkpoint | None, generation: Generation | None
-    ) -> None:
-        """Start at the first epoch, or where a checkpoint was written."""
-        seed = self.group.tell(choose_seed(self.seed) if generation is None else generation.seed)
+    def _begin_at(self, start: Start) -> None:
+        """Begin with the first batch, or where a checkpoint was written."""
+        former, last = start.generation, start.checkpoint
+        seed = self.group.tell(choose_seed(self.seed) if former is None else former.seed)
         self._resumed = last.progress if last else Progress(0, 0, 0, seed)
         self._saved = (self._resumed.epoch, self._resumed.batch)
         self._blocks = self._resumed.blocks
         self.checkpoint_path = last.path if last else None
         self._record = TrainingRecord(self._resumed.record)
         self.best = BestEpoch(self._resumed.best, self.min_improvement)
-
-    def _open_dataset(
-        self, config: DatasetConfig, environment: EnvironmentConfig | None
-    ) -> Dataset:
-        """Open the dataset; only the leading process writes to the one that rows are added to."""
-        if environment is None:
-            return open_existing(self.session, config)
-        if self._leads:
-            dataset = open_own(self.session, config)
-            copy_existing(dataset, config)
-        self.group.tell(None)
-        return dataset if self._leads else open_existing(self.session, config)
 
     def _create_buffer(self) -> Buffer:
         environment = self.environment_config
@@ -564,19 +490,41 @@ class Training(NewSessionPipeline):
         buffer.begin(self.batch_size * self.group.size, batch_nb, self._resumed.seed)
         return buffer
 
-    def _open_drawn_rows(self, resources: contextlib.ExitStack, buffer: Buffer) -> DrawnRows | None:
-        if not buffer.capacity:
-            return None
-        return resources.enter_context(
-            contextlib.closing(DrawnRows(self.session, buffer.batch_size, self._resumed.blocks))
-        )
-
     def _open_session(self) -> Session:
         made = None
         if self._leads:
             made = self._create_session()
         path = Path(self.group.tell(made and str(made.path)))
         return made or Session(path)
+
+    def _prepare_learner(self, start: Start) -> None:
+        """Bind the network to the data, and load its parameters."""
+        data, last = self.data, start.checkpoint
+        fields = data.fields
+        shapes = [fields[name].shape for name in self.learner.batch_fields if name in fields]
+        if not data.produces or None not in shapes:  # else bound with the first batch
+            known = data.normalization()
+            was_generated = start.config.existing_dir is None and data.dataset.info.get(GENERATION)
+            if last is not None and was_generated:
+                known = last.normalization  # to the last bit
+            self.learner.bind(fields, known)
+        self._load_parameters(last)
+        self.learner.join(self.group)
+        self.learner.network.set_train()
+
+    def _load_parameters(self, last: checkpoint.Checkpoint | None) -> None:
+        config = self.network_config
+        found = last
+        if last is not None:
+            self.learner.resume(last)
+        elif config.network_dir is not None:
+            place = Path(config.network_dir)
+            found = checkpoint.find(place, config.network_name, config.which_network)
+            self.learner.load_parameters(found)
+        if found is not None and found.notice and self._leads:
+            self.session.note(found.notice)
+
+    # Describing -----------------------------------------------------------------------------
 
     def _plan(self) -> Iterable[str]:
         if self.data.dataset.modes:
@@ -623,79 +571,9 @@ class Training(NewSessionPipeline):
     def _components(self) -> Mapping[str, str]:
         return describe_training(self.learner, self.environment_config, self.data.dataset)
 
-    def _resume_sampler(self, sets: ParameterSets, last: checkpoint.Checkpoint) -> None:
-        try:
-            sets.restore(self._resumed.blocks, checkpoint.read_sampler(last))
-        except ValueError as error:
-            raise CheckpointError(
-                "The training cannot be resumed: the state of the sampler in its checkpoint does "
-                f"not fit, as {error}. Resume with the same sampler and sampler_kwargs."
-            ) from error
-
-    def _load_parameters(self, last: checkpoint.Checkpoint | None) -> None:
-        config = self.network_config
-        found = last
-        if last is not None:
-            self.learner.resume(last)
-        elif config.network_dir is not None:
-            place = Path(config.network_dir)
-            found = checkpoint.find(place, config.network_name, config.which_network)
-            self.learner.load_parameters(found)
-        if found is not None and found.notice and self._leads:
-            self.session.note(found.notice)
-
-    def _open_environments(
-        self,
-        resources: contextlib.ExitStack,
-        config: EnvironmentConfig,
-        dataset: Dataset,
-        feeder: Feeder[Block] | None,
-        buffer: Buffer,
-        skip: Skip,
-    ) -> Source:
-        seed = self._seed_of(config)
-        dataset.update_info(**describe_environment(config, seed))
-        stored = dataset.num_samples("training")
-        if self._generation is not None:
-            stored = self._generation.offset
-        return self._open_source(
-            resources,
-            config,
-            derive_seed(seed, "training", stored),
-            predict=self._predict if feeder is None else feeder.calling(self._predict),
-            show=None if feeder is None else feeder.telling(self.observers.events),
-            run_ahead=0 if config.load_samples else None,
-            total=None if config.load_samples or not self.batch_nb else buffer.total,
-            skip=skip,
-        )
-
-    def _begin_generation(
-        self, dataset: Dataset, mode: str, config: EnvironmentConfig, former: Generation | None
-    ) -> Skip:
-        """Keep what the environments' rows depend on; return those that an earlier run has had."""
-        if config.load_samples:
-            return NOTHING
-        seed, size = self._resumed.seed, self.batch_size * self.group.size
-        now = Generation.begin(dataset, mode, seed, size, self.batch_nb)
-        self._generation, self._dataset = former or now, dataset
-        if former is not None:
-            return former.resume(dataset, config, now)
-        now.start(dataset, **describe_environment(config, self._seed_of(config)))
-        return NOTHING
-
-    def _seed_of(self, config: EnvironmentConfig) -> int:
-        return self._resumed.seed if config.seed is None else config.seed
-
-    def _note_dependence(self) -> None:
-        """Keep in the dataset that the environments' rows depend on the network that learns."""
-        if self._generation is not None and not self._generation.depends:
-            self._generation = dataclasses.replace(self._generation, depends=True)
-            self._generation.store(self._dataset)
-
     def _predict(self, batch: Batch) -> Batch:
         """Answer `Environment.get_prediction`; before the first batch with the step's shapes."""
         learner, data = self.learner, getattr(self, "data", None)
-        self._note_dependence()
         if not learner.fields and data is not None:
             known = [name for name, field in data.fields.items() if field.shape is not None]
             if all(name in known for name in learner.batch_fields):

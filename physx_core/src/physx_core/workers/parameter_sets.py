@@ -57,7 +57,7 @@ class ParameterSets:
     def __init__(
         self, config: EnvironmentConfig, seed: Sequence[int], skip: Skip = NOTHING
     ) -> None:
-        """Create the sampler.
+        """Create the sampler that is named.
 
         Args:
             config: Names the sampler, the number of instances, and how many sets may fail.
@@ -69,6 +69,8 @@ class ParameterSets:
                 "EnvironmentConfig.redraw draws new parameters, but load_samples replays stored "
                 "samples: leave redraw out."
             )
+        if config.sampler is None and config.sampler_kwargs:
+            raise ConfigError("EnvironmentConfig.sampler_kwargs is given without a sampler.")
         self.parameters: list[Parameter] = []
         self.failures: dict[int, str] = {}
         self.count = 0
@@ -77,7 +79,7 @@ class ParameterSets:
         self._skip = skip
         self._recorded = {number: row for row, number in enumerate(skip.sets.get("set", ()))}
         self._surplus = len(self._recorded)  # sets that are recorded already
-        self._sampler = _make_sampler(config)
+        self._sampler = None if config.sampler is None else _make_sampler(config, config.sampler)
         self._redraws = [0] * self.instance_nb
         self._waiting: list[dict[int, Mapping[str, Any]]] = [{} for _ in self._redraws]
         self._stored: dict[int, int] = {}  # number of an instance's present set to its place
@@ -122,6 +124,7 @@ class ParameterSets:
             )
         self.parameters = first
         if first:
+            self._sampler = self._sampler or _make_sampler(self._config, _DEFAULT)
             self._sampler.begin(first, self._seed)
         if self.learns:
             self._values = {int(number): self._read(row) for number, row in self._recorded.items()}
@@ -243,6 +246,7 @@ class ParameterSets:
 
     def _ask(self, number: int, row: int) -> dict[str, Any]:
         sampler = self._sampler
+        assert sampler is not None
         try:
             if not isinstance(sampler, LearningSampler):
                 return checked(self.parameters, sampler.ask(number))
@@ -374,12 +378,9 @@ def next_step(last_step: int, error: PhysxError) -> int:
     return max(last_step, getattr(error, "step", -1)) + 1
 
 
-def _make_sampler(config: EnvironmentConfig) -> Sampler:
-    reference = config.sampler or _DEFAULT
+def _make_sampler(config: EnvironmentConfig, reference: str | type[Any]) -> Sampler:
     make = resolve("sampler", reference)
     name = reference if isinstance(reference, str) else getattr(make, "__name__", repr(make))
-    if config.sampler is None and config.sampler_kwargs:
-        raise ConfigError("EnvironmentConfig.sampler_kwargs is given without a sampler.")
     if inspect.isabstract(make):
         raise ConfigError(f"The sampler {name} is not complete: it does not implement ask().")
     try:

@@ -138,22 +138,45 @@ class Generation:
         return Skip(rows, rejected, recorded, begun)
 
 
+@dataclass(frozen=True)
+class Start:
+    """Where a training starts.
+
+    Attributes:
+        config: Options of its dataset.
+        environment: Generates or replays samples; None: they are only read, from now on at least.
+        session: The session that it continues; None: it gets a new one.
+        checkpoint: What it resumes from; None: it begins with its first batch.
+        generation: Description of the samples that environments have generated; None if there are
+            none.
+    """
+
+    config: DatasetConfig
+    environment: EnvironmentConfig | None
+    session: Session | None = None
+    checkpoint: Checkpoint | None = None
+    generation: Generation | None = None
+
+    @property
+    def generates(self) -> bool:
+        """Whether environments generate samples."""
+        return self.environment is not None and not self.environment.load_samples
+
+
 def find_start(
-    session: Session, name: str, environment: EnvironmentConfig | None
-) -> tuple[Checkpoint | None, EnvironmentConfig | None, Generation | None]:
-    """Return what a training resumes from.
+    session: Session, name: str, environment: EnvironmentConfig | None, config: DatasetConfig
+) -> Start:
+    """Return where a training resumes.
 
     Args:
         session: The training's session.
         name: Name of the network.
         environment: The environment of the samples.
-
-    Returns:
-        The checkpoint, None if the training begins again; the environment, if samples are still to
-        be generated; and the description of those that are there, None if there are none.
+        config: Options of the dataset.
     """
     info: Mapping[str, Any] = {}
     is_empty = True
+    config = _without_copied_dataset(session, config)
     if environment is not None and not environment.load_samples:
         with contextlib.suppress(DatasetNotFoundError), Dataset.open(session.dataset_dir) as data:
             info, is_empty = data.info, not any(data.num_samples(mode) for mode in data.modes)
@@ -161,10 +184,10 @@ def find_start(
         is_new = not checkpoint.list_numbers(session.network_dir, name)
         if is_new and (generation is not None or is_empty):
             _check_repeatable(generation, session)
-            return None, environment, generation
+            return Start(config, environment, session, None, generation)
     found = checkpoint.find(session.network_dir, name, -1)
     if can_resume(environment, found.progress.epoch):
-        return found, None, None
+        return Start(config, None, session, found)
     generation = _parse(info.get(GENERATION))
     if generation is None:
         raise ConfigError(
@@ -172,7 +195,7 @@ def find_start(
             f"start over. {_advice(session.path)}"
         )
     _check_repeatable(generation, session)
-    return found, environment, generation
+    return Start(config, environment, session, found, generation)
 
 
 def _check_repeatable(generation: Generation | None, session: Session) -> None:
@@ -208,7 +231,7 @@ def can_resume(environment: EnvironmentConfig | None, epochs: int) -> bool:
     return epochs > 0 and not replays and not environment.always_produce
 
 
-def without_copied_dataset(session: Session, config: DatasetConfig) -> DatasetConfig:
+def _without_copied_dataset(session: Session, config: DatasetConfig) -> DatasetConfig:
     """Return the configuration without an existing dataset that the session has a copy of."""
     if config.existing_dir is None or not is_copy(session.dataset_dir):
         return config

@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 
-import numpy as np
-
-from physx_core.components.buffer import Buffer
-from physx_core.components.group import Group
-from physx_core.config import DatasetConfig, EnvironmentConfig
-from physx_core.dataset import Dataset, Subset
-from physx_core.dataset.store.definitions import compare_fields
-from physx_core.errors import ConfigError, DatasetError, UsageError, listed
-from physx_core.fields import RESERVED, Field
-from physx_core.pipelines.learning.blocks import Block, Blocks
-from physx_core.pipelines.learning.drawn_rows import DrawnRows
-from physx_core.pipelines.learning.feeder import Feeder
-from physx_core.pipelines.learning.online import OnlineBatches
-from physx_core.pipelines.learning.row_statistics import RowStatistics
-from physx_core.pipelines.learning.sharing import SharedBatches
-from physx_core.pipelines.storage import other_samples, record_rejected
-from physx_core.pipelines.stored_rows import StoredRows
+from physx_core.dataset import Dataset
+from physx_core.fields import Field
+from physx_core.pipelines.learning.batches.generated import GeneratedBatches
+from physx_core.pipelines.learning.batches.online import OnlineBatches
+from physx_core.pipelines.learning.batches.replayed import ReplayedBatches
+from physx_core.pipelines.learning.batches.stored import StoredBatches
 from physx_core.sources.source import Source
 from physx_core.statistics import Normalization
-from physx_core.typing import Array, Batch, Index
-
-_IDENTITY = ("env_id", "episode")
-_SHOWN = 64
-"""Largest number of validation samples whose predictions are shown."""
+from physx_core.typing import Array, Batch
 
 
 class TrainingData:
@@ -46,132 +30,30 @@ class TrainingData:
     from the results of the earlier one. Held-back samples and those of the mode "validation" are
     not replayed. The normalization is computed from the stored rows before the first epoch, and
     again before each epoch that follows a replay.
-
-    Attributes:
-        dataset: Dataset to read batches from, and to store generated ones in.
-        source: The environments; None if only the dataset is read.
-        batches_read: Number of batches read from the dataset.
-        online: The batches of rows that environments generate; None if they generate none.
-        parts: The samples to train on and those held back, ``training`` and ``validation``; empty
-            if none are held back.
     """
 
     def __init__(
         self,
-        dataset: Dataset,
-        source: Source | None,
-        config: DatasetConfig,
+        stored: StoredBatches,
+        made: GeneratedBatches | ReplayedBatches | None,
         *,
         batch_size: int,
         batch_nb: int | None,
-        seed: int,
-        environment: EnvironmentConfig | None,
-        data_type: str,
-        buffer: Buffer,
-        drawn: DrawnRows | None = None,
-        group: Group,
-        first: int = 0,
-        feeder: Feeder[Block] | None = None,
-        ahead: bool = True,
+        always: bool,
     ) -> None:
-        """Check that the samples are available, and hold some back if configured.
+        """Keep the arguments.
 
         Args:
-            dataset: The dataset.
-            source: The environments, or None.
-            config: Options of reading the dataset.
+            stored: The stored samples.
+            made: What environments make; None: there are none.
             batch_size: Samples in a batch.
             batch_nb: Batches in an epoch; None: one pass over the stored samples.
-            seed: Seed of the order of samples.
-            environment: Configuration of the source; None without one.
-            data_type: Floating type of the batches that are read.
-            buffer: Decides what batches hold while environments generate; it has begun.
-            drawn: Where to write which rows the buffer drew.
-            group: The processes that train together; only the leading one has the environments.
-            first: Number of samples that the mode had before the first generated batch.
-            feeder: Has a thread that has the environments generate batches ahead of the training;
-                None: they are generated when they are taken.
-            ahead: Whether all batches of an epoch will be taken, so that they may be generated
-                ahead.
+            always: Whether environments make the samples of all epochs, not only of the first.
         """
-        replay = environment is not None and environment.load_samples
-        generates = environment is not None and not replay
-        if generates and batch_nb is None:
-            raise ConfigError(
-                "Training.batch_nb is missing: it is the number of batches to generate in an epoch."
-            )
-        self.dataset, self.source = dataset, source
-        self.batches_read = 0
-        self._config = config
+        self._stored, self._made, self._always = stored, made, always
         self._batch_size, self._batch_nb = batch_size, batch_nb
-        self._seed = seed
-        self._ahead = ahead
-        self._always = environment is not None and (
-            not environment.only_first_epoch if replay else environment.always_produce
-        )
-        self._data_type = data_type
-        self._mode = config.mode
-        self._reader: Iterator[Batch] | None = None
-        self._has_source = self._uses_source = source is not None or generates
-        self._changed = False
-        if not self._has_source and not self.dataset.num_samples(self._mode):
-            raise DatasetError(
-                f'The dataset in {dataset.directory} has no samples of mode "{self._mode}" to '
-                f"train on. It has: {listed(dataset.modes)}."
-                f"{other_samples(dataset.directory, self._mode)}"
-            )
-        self.parts = self._split(replay)
-        self._stored: StoredRows | None = None
-        self.online: OnlineBatches | None = None
-        self._shared: SharedBatches | None = None
-        self._names: Sequence[str] = ()
-        if source is not None and replay:
-            self._stored = self._stored_rows(source)
-        elif source is not None:
-            blocks = Blocks(
-                source,
-                dataset,
-                self._mode,
-                normalize=config.normalize,
-                first=first,
-                statistics=RowStatistics(seed, buffer.total),
-                feeder=feeder,
-            )
-            self.online = OnlineBatches(blocks, buffer, data_type, drawn, first)
-            source.sets.follow(buffer.needed)
-            if source.sets.learns and group.size > 1:
-                raise ConfigError(
-                    "A sampler that learns from losses works in one process: leave torchrun out, "
-                    'or choose another sampler, for example "physx/sobol".'
-                )
-        if generates and group.size > 1:
-            self._shared = SharedBatches(group, self.online, source.fields if source else ())
-
-    def _split(self, replay: bool) -> dict[str, Subset]:
-        share = self._config.validation_split
-        if not share:
-            return {}
-        if self._has_source and not replay:
-            raise ConfigError(
-                "DatasetConfig.validation_split holds back stored samples, but environments "
-                'generate these. Generate the samples first, or others in the mode "validation".'
-            )
-        if self.dataset.num_samples("validation"):
-            return {}
-        shares = {"training": 1 - share, "validation": share}
-        return self.dataset.split(self._mode, shares, by=self._config.split_by)
-
-    def _stored_rows(self, source: Source) -> StoredRows:
-        """Return the rows to replay, after checking that they have the environments' fields."""
-        part = self.parts.get("training")
-        random = np.random.default_rng([self._seed, 1]) if self._config.shuffle else None
-        rows = StoredRows(self.dataset, self._mode, part.rows if part else None, random)
-        known, given = (
-            {name: field for name, field in fields.items() if name not in RESERVED}
-            for fields in (self.fields, {field.name: field for field in source.fields})
-        )
-        compare_fields(f'The environment cannot replay mode "{self._mode}", which', known, given)
-        return rows
+        self._generated = made if isinstance(made, GeneratedBatches) else None
+        self._current: GeneratedBatches | ReplayedBatches | StoredBatches = made or stored
 
     def begin_epoch(self, epoch_id: int, names: Sequence[str], done: int = 0) -> int:
         """Prepare an epoch and return its number of batches.
@@ -181,158 +63,103 @@ class TrainingData:
             names: Fields of the batches that are read from the dataset.
             done: Number of its batches that were learned from already.
         """
-        self._names = names
-        self._uses_source = self._has_source and (epoch_id == 0 or self._always)
-        if self._uses_source and self.online is not None and self._ahead:
-            self.online.expect(max(0, (self._batch_nb or 0) - done))
-        if not self._uses_source and self._reader is None:
-            if self._shared is not None:
-                self._shared.finish(self.dataset)
-            part = self.parts.get("training")
-            batches = part.batches if part else partial(self.dataset.batches, self._mode)
-            self._reader = batches(
-                self._batch_size,
-                shuffle=self._config.shuffle,
-                seed=self._seed,
-                epochs=None,
-                fields=names,
-                dtype=self._data_type,
-                reuse=True,
-            )
-        return self._batch_nb or -(-self._samples // self._batch_size)
+        made, stored = self._made, self._stored
+        if made is not None and epoch_id and not self._always and self._current is made:
+            made.finish()
+            self._current = stored
+        self._current.begin_epoch(names, max(0, (self._batch_nb or 0) - done))
+        return self._batch_nb or -(-stored.num_samples // self._batch_size)
 
     def next_batch(self) -> Batch:
         """Return the next batch in physical units; generated ones are stored already.
 
         In a group of processes each gets its share of a generated batch, whose `weight` is known.
         """
-        if self._uses_source and self._shared is not None:
-            return self._shared.next(self._names)
-        if self._uses_source and self.online is not None:
-            return self.online.next(self._drawn_fields(self._names))
-        if self._uses_source and self.source is not None and self._stored is not None:
-            with record_rejected(self.source, self.dataset):
-                return self._replay(self.source, self._stored)
-        if self._reader is None:
-            raise UsageError("next_batch() needs begin_epoch() before it.")
-        self.batches_read += 1
-        return next(self._reader)
-
-    def _replay(self, source: Source, stored: StoredRows) -> Batch:
-        """Have the environments replay the next stored samples, and store the results."""
-        index, rows = stored.take(self._batch_size)
-        batch = source.batch(len(index), rows)
-        made = {name: values for name, values in batch.items() if name not in RESERVED}
-        self.dataset.update(self._mode, index, made)
-        self._changed = True
-        return batch
-
-    def close(self) -> None:
-        """End what generates batches ahead, before the source is closed."""
-        if self.online is not None:
-            self.online.close()
-
-    def resume(self, batches: int, state: Callable[[], Index], names: Sequence[str]) -> None:
-        """Continue after batches that were drawn while environments generated.
-
-        Args:
-            batches: Their number.
-            state: Returns the state of the buffer then; called if it keeps rows.
-            names: Fields of the batches.
-
-        Raises:
-            CheckpointError: If it is not a state of this buffer.
-        """
-        if self.online is not None:
-            fields = self._drawn_fields(names)
-            self.online.resume(batches, state, self.dataset, self._mode, fields)
+        return self._current.next()
 
     def skip(self, batches: int) -> None:
         """Skip batches that a training read before it was interrupted."""
         for _ in range(batches):
             self.next_batch()
 
-    def _drawn_fields(self, names: Sequence[str]) -> Sequence[str]:
-        """Return the fields of batches that are drawn: a sampler that learns knows rows by two."""
-        return [*names, *_IDENTITY] if self.wants_row_losses else names
-
-    @property
-    def wants_row_losses(self) -> bool:
-        """Whether a sampler learns from the losses of the rows of the current epoch."""
-        return self.produces and self.source is not None and self.source.sets.learns
-
     def tell(self, batch: Batch, losses: Array) -> None:
-        """Have the sampler learn from the last batch.
+        """Have the sampler learn from the last batch: see `wants_row_losses`.
 
         Args:
             batch: The batch.
             losses: Loss of each row, shape (rows,).
         """
-        assert self.source is not None
-        episodes = np.asarray(batch["episode"], np.int64)
-        numbers = episodes * self.source.instance_nb + batch["env_id"] - 1
-        self.source.sets.tell(numbers, losses)
+        if self._generated is not None:
+            self._generated.tell(batch, losses)
 
     @property
-    def weight(self) -> float | None:
-        """Weight of the last batch if it is this process's share of one; None: it is a whole."""
-        return self._shared.weight if self._shared is not None and self._uses_source else None
+    def dataset(self) -> Dataset:
+        """Dataset to read batches from, and to store generated ones in."""
+        return self._stored.dataset
+
+    @property
+    def source(self) -> Source | None:
+        """The environments; None if only the dataset is read."""
+        return None if self._made is None else self._made.source
+
+    @property
+    def online(self) -> OnlineBatches | None:
+        """The batches of rows that environments generate; None if they generate none."""
+        return None if self._generated is None else self._generated.online
+
+    @property
+    def generated(self) -> GeneratedBatches | None:
+        """The batches of the current epoch if environments generate them; else None."""
+        return self._generated if self.produces else None
+
+    @property
+    def batches_read(self) -> int:
+        """Number of batches read from the dataset."""
+        return self._stored.count
 
     @property
     def produces(self) -> bool:
         """Whether environments generate new samples in the current epoch."""
-        return self._uses_source and self._stored is None
+        return self._generated is not None and self._current is self._generated
+
+    @property
+    def repeats(self) -> bool:
+        """Whether environments would generate the same samples again."""
+        return self._generated is not None and self._generated.repeats()
+
+    @property
+    def wants_row_losses(self) -> bool:
+        """Whether a sampler learns from the losses of the rows of the current epoch."""
+        return self.generated is not None and self.generated.learns
+
+    @property
+    def weight(self) -> float | None:
+        """Weight of the last batch if it is this process's share of one; None: it is a whole."""
+        return None if self.generated is None else self.generated.weight
 
     @property
     def has_changed(self) -> bool:
         """Whether stored samples were replaced since the last call of `normalization`."""
-        return self._changed
+        return self._stored.has_changed
 
     def validation_batches(self, names: Sequence[str]) -> Iterator[Batch]:
         """Return the validation batches, in the order of writing."""
-        part = self.parts.get("validation")
-        batches = part.batches if part else partial(self.dataset.batches, "validation")
-        return batches(1024, fields=names, dtype=self._data_type, reuse=True)
+        return self._stored.validation_batches(names)
 
     def validation_samples(self, names: Sequence[str]) -> Batch:
         """Return some of the validation samples, always the same ones."""
-        first = next(self.validation_batches(names))
-        count = len(next(iter(first.values())))
-        chosen = np.linspace(0, count - 1, min(count, _SHOWN)).astype(np.intp)
-        return {name: values[chosen] for name, values in first.items()}
+        return self._stored.validation_samples(names)
 
     @property
     def has_validation(self) -> bool:
         """Whether there are validation samples."""
-        return bool(self.parts) or self.dataset.num_samples("validation") > 0
+        return self._stored.has_validation
 
     @property
     def fields(self) -> Mapping[str, Field]:
         """The stored fields by name; those of the environments until something is stored."""
-        if self._shared is not None:
-            return self._shared.block.fields
-        if self.online is not None and self.online.block.fields:
-            return self.online.block.fields
-        if self.source is not None and not self.dataset.num_samples(self._mode):
-            return {field.name: field for field in self.source.fields}
-        return self.dataset.fields(self._mode)
+        return self._current.fields
 
     def normalization(self) -> dict[str, Normalization]:
         """Return the normalization by field; empty if nothing is to be normalized."""
-        self._changed = False
-        if self.produces and self._shared is not None:
-            return self._shared.block.normalization
-        if self.produces and self.online is not None and self.online.block.fields:
-            return self.online.block.normalization
-        if not self._config.normalize or not self.dataset.num_samples(self._mode):
-            return {}
-        if self.parts:
-            return self.parts["training"].normalization()
-        if self._config.recompute_normalization and not self.produces:
-            return self.dataset.recompute_normalization(self._mode)
-        return self.dataset.normalization_of(self._mode)
-
-    @property
-    def _samples(self) -> int:
-        part = self.parts.get("training")
-        return part.num_samples if part else self.dataset.num_samples(self._mode)
+        return self._current.normalization()

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from physx_core.dataset import Dataset
 from physx_core.dataset.store.manifest import has_statistics
 from physx_core.fields import Field
-from physx_core.pipelines.learning.feeder import Feeder
-from physx_core.pipelines.learning.row_statistics import RowStatistics
-from physx_core.pipelines.storage import record_rejected, store_sets
+from physx_core.pipelines.learning.batches.feeder import Feeder
+from physx_core.pipelines.learning.batches.row_statistics import RowStatistics
+from physx_core.pipelines.storage import record_beside_rows, store_sets
 from physx_core.rows import concatenate
 from physx_core.sources.source import Source
 from physx_core.statistics import Normalization, RunningStatistics
@@ -152,7 +152,7 @@ class Blocks:
 
     def _generate(self, count: int, *, is_whole: bool) -> Batch:
         earlier, self._earlier = self._earlier if is_whole else {}, {}
-        with record_rejected(self._source, self._dataset, earlier):
+        with record_beside_rows(self._source, self._dataset, earlier):
             rows = self._source.batch(count)
             store_sets(self._source, self._dataset)
             self._dataset.define_fields(self._mode, self._source.fields)

@@ -13,9 +13,9 @@ from physx_core.components.buffer import Buffer
 from physx_core.dataset import Dataset
 from physx_core.errors import CheckpointError
 from physx_core.fields import Field
-from physx_core.pipelines.learning.blocks import Block, Blocks
-from physx_core.pipelines.learning.drawn_rows import DrawnRows
-from physx_core.pipelines.learning.row_store import RowStore
+from physx_core.pipelines.learning.batches.blocks import Block, Blocks
+from physx_core.pipelines.learning.batches.drawn_rows import DrawnRows
+from physx_core.pipelines.learning.batches.row_store import RowStore
 from physx_core.typing import Batch, Index
 
 _INTERVAL = 1.0
@@ -168,10 +168,6 @@ class OnlineBatches:
             yield largest
             count -= largest
         yield count
-
-    def close(self) -> None:
-        """Have no more rows generated, before the environments are closed."""
-        self._blocks.close()
 
     def state(self, batches: int) -> Index | None:
         """Return the buffer's state for a checkpoint; None: it keeps nothing.

@@ -1,0 +1,173 @@
+"""GeneratedBatches: batches of samples that environments generate meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from physx_core import checkpoint
+from physx_core.components.group import Group
+from physx_core.errors import CheckpointError, ConfigError
+from physx_core.fields import Field
+from physx_core.pipelines.learning.batches.online import OnlineBatches
+from physx_core.pipelines.learning.batches.sharing import SharedBatches
+from physx_core.pipelines.learning.batches.stored import StoredBatches
+from physx_core.sources.source import Source
+from physx_core.statistics import Normalization
+from physx_core.typing import Array, Batch, Index
+
+_IDENTITY = ("env_id", "episode")
+
+
+class GeneratedBatches:
+    """Batches of samples that environments generate, stored before they are trained on.
+
+    In a group of processes only the leading one has the environments; each gets its share.
+
+    Attributes:
+        source: The environments; None but in the leading process.
+        online: Draws the batches; None but in the leading process.
+        repeats: Returns whether the environments would generate the same samples again.
+    """
+
+    def __init__(
+        self,
+        stored: StoredBatches,
+        source: Source | None,
+        online: OnlineBatches | None,
+        group: Group,
+        *,
+        ahead: bool,
+        repeats: Callable[[], bool],
+    ) -> None:
+        """Keep the arguments.
+
+        Args:
+            stored: The samples of earlier runs, and from now on those that are generated.
+            source: The environments, open; None but in the leading process.
+            online: Draws batches of what they generate; None but in the leading process.
+            group: The processes that train together.
+            ahead: Whether all batches of an epoch will be taken, so that they may be generated
+                ahead.
+            repeats: Returns whether the environments would generate the same samples again.
+        """
+        self.source, self.online = source, online
+        self._stored, self._ahead, self.repeats = stored, ahead, repeats
+        self._names: Sequence[str] = ()
+        self._shared: SharedBatches | None = None
+        if self.learns and group.size > 1:
+            raise ConfigError(
+                "A sampler that learns from losses works in one process: leave torchrun out, "
+                'or choose another sampler, for example "physx/sobol".'
+            )
+        if group.size > 1:
+            self._shared = SharedBatches(group, online, source.fields if source else ())
+
+    def begin_epoch(self, names: Sequence[str], batches: int) -> None:
+        """Prepare an epoch.
+
+        Args:
+            names: Fields of the batches of a buffer that keeps rows.
+            batches: Number of batches that will be taken.
+        """
+        self._names = names
+        if self.online is not None and self._ahead:
+            self.online.expect(batches)
+
+    def next(self) -> Batch:
+        """Return the next batch, or this process's share of it, in physical units.
+
+        Raises:
+            PhysxError: In the leading process, if an environment fails, or rows cannot be stored.
+        """
+        if self._shared is not None:
+            return self._shared.next(self._names)
+        assert self.online is not None
+        return self.online.next(self._drawn_fields(self._names))
+
+    def _drawn_fields(self, names: Sequence[str]) -> Sequence[str]:
+        """Return the fields of batches that are drawn: a sampler that learns knows rows by two."""
+        return [*names, *_IDENTITY] if self.learns else names
+
+    @property
+    def weight(self) -> float | None:
+        """Weight of the last batch if it is this process's share of one; None: it is a whole."""
+        return None if self._shared is None else self._shared.weight
+
+    @property
+    def learns(self) -> bool:
+        """Whether a sampler learns from the losses of the rows."""
+        return self.source is not None and self.source.sets.learns
+
+    def tell(self, batch: Batch, losses: Array) -> None:
+        """Have the sampler learn from the last batch.
+
+        Args:
+            batch: The batch.
+            losses: Loss of each row, shape (rows,).
+        """
+        assert self.source is not None
+        episodes = np.asarray(batch["episode"], np.int64)
+        numbers = episodes * self.source.instance_nb + batch["env_id"] - 1
+        self.source.sets.tell(numbers, losses)
+
+    @property
+    def fields(self) -> Mapping[str, Field]:
+        """The stored fields by name; those of the environments until something is stored."""
+        if self._shared is not None:
+            return self._shared.block.fields
+        if self.online is not None and self.online.block.fields:
+            return self.online.block.fields
+        if self.source is not None and not self._stored.has_samples:
+            return {field.name: field for field in self.source.fields}
+        return self._stored.fields
+
+    def normalization(self) -> dict[str, Normalization]:
+        """Return the normalization of all rows up to those of the last batch, by field."""
+        if self._shared is not None:
+            return self._shared.block.normalization
+        if self.online is not None and self.online.block.fields:
+            return self.online.block.normalization
+        return self._stored.normalization(recompute=False)
+
+    def states(self, batches: int) -> tuple[Index | None, Array | None]:
+        """Return the states of buffer and sampler for a checkpoint, each None if it has none.
+
+        Args:
+            batches: Number of batches that were learned from: all, or all but the last one.
+        """
+        if self.online is None or self.source is None:
+            return None, None
+        return self.online.state(batches), self.source.sets.state(batches)
+
+    def resume(self, found: checkpoint.Checkpoint, names: Sequence[str]) -> None:
+        """Continue where a checkpoint was written, after at least one batch.
+
+        Args:
+            found: The checkpoint.
+            names: Fields of the batches.
+
+        Raises:
+            CheckpointError: If its states do not fit buffer and sampler.
+        """
+        if self.online is None or self.source is None:
+            return
+        batches, sets = found.progress.blocks, self.source.sets
+        state, stored = partial(checkpoint.read_buffer, found), self._stored
+        self.online.resume(batches, state, stored.dataset, stored.mode, self._drawn_fields(names))
+        if not sets.learns:
+            return
+        try:
+            sets.restore(batches, checkpoint.read_sampler(found))
+        except ValueError as error:
+            raise CheckpointError(
+                "The training cannot be resumed: the state of the sampler in its checkpoint does "
+                f"not fit, as {error}. Resume with the same sampler and sampler_kwargs."
+            ) from error
+
+    def finish(self) -> None:
+        """End the last epoch: from now on the rows are read."""
+        if self._shared is not None:
+            self._shared.finish(self._stored.dataset)

@@ -1,0 +1,247 @@
+"""Opens parts of a training before its first batch."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from typing import Any
+
+from physx_core.checkpoint import Progress
+from physx_core.components.buffer import Buffer
+from physx_core.components.group import Group
+from physx_core.components.network import Network
+from physx_core.config import EnvironmentConfig, NetworkConfig
+from physx_core.dataset import Dataset
+from physx_core.errors import ConfigError
+from physx_core.pipelines.learning.batches.blocks import Block, Blocks
+from physx_core.pipelines.learning.batches.drawn_rows import DrawnRows
+from physx_core.pipelines.learning.batches.feeder import Feeder
+from physx_core.pipelines.learning.batches.generated import GeneratedBatches
+from physx_core.pipelines.learning.batches.online import OnlineBatches
+from physx_core.pipelines.learning.batches.replayed import ReplayedBatches
+from physx_core.pipelines.learning.batches.row_statistics import RowStatistics
+from physx_core.pipelines.learning.batches.stored import StoredBatches
+from physx_core.pipelines.learning.resuming import Generation, Start
+from physx_core.pipelines.learning.training_data import TrainingData
+from physx_core.pipelines.pipeline import derive_seed
+from physx_core.pipelines.services import Predict, Show
+from physx_core.pipelines.storage import (
+    copy_existing,
+    describe_environment,
+    open_existing,
+    open_own,
+)
+from physx_core.plugins.networks import resolve_network
+from physx_core.session import Session
+from physx_core.sources.source import Source
+from physx_core.typing import Batch
+from physx_core.workers.instance import NOTHING, Skip
+
+
+def join_group(config: NetworkConfig) -> tuple[Group, Any]:
+    """Join the group of processes that the network's library trains with.
+
+    Returns:
+        The group, and the class whose `Network.set_seed` seeds the library.
+    """
+    component: Any = Network
+    if config.network is not None:  # else the learner reports it
+        made, _ = resolve_network(config.network, config.network_kwargs)
+        if hasattr(made, "join_group"):  # else a function that returns a network
+            component = made
+    return component.join_group(config.device), component
+
+
+def open_dataset(session: Session, start: Start, group: Group) -> Dataset:
+    """Open the dataset; only the leading process writes to the one that rows are added to."""
+    config = start.config
+    if start.environment is None:
+        return open_existing(session, config)
+    if group.leads:
+        dataset = open_own(session, config)
+        copy_existing(dataset, config)
+    group.tell(None)
+    return dataset if group.leads else open_existing(session, config)
+
+
+@dataclass(eq=False)
+class DataOpening:
+    """Opens the data of a training, and the environments that make them.
+
+    Attributes:
+        start: Where the training starts.
+        session: Its session.
+        group: The processes that train together; only the leading one has environments.
+        buffer: Decides what batches hold while environments generate; it has begun.
+        progress: How far the training was when it ended before.
+        batch_nb: Batches in an epoch; None: one pass over the stored samples.
+        batch_fields: Names of the fields of a batch.
+        data_type: Floating type of batches that are read.
+        ahead: Whether all batches of an epoch will be taken, so that they may be generated ahead.
+        open_source: Opens environments: `Pipeline._open_source` without its first argument.
+        predict: The network's prediction for a batch; called in the training's thread.
+        show: Receives drawing events; called in the training's thread.
+    """
+
+    start: Start
+    session: Session
+    group: Group
+    buffer: Buffer
+    progress: Progress
+    _: KW_ONLY
+    batch_nb: int | None
+    batch_fields: Sequence[str]
+    data_type: str
+    ahead: bool
+    open_source: Callable[..., Source]
+    predict: Predict
+    show: Show
+    _generation: Generation | None = field(init=False, default=None)
+
+    def open(self, resources: contextlib.ExitStack, dataset: Dataset) -> TrainingData:
+        """Open the data.
+
+        Args:
+            resources: Closes at the end what is opened here.
+            dataset: The dataset, open; for writing in the leading process if environments make
+                samples.
+
+        Raises:
+            PhysxError: If there are no samples, or environments fail.
+        """
+        environment, size = self.start.environment, self.buffer.batch_size
+        stored = StoredBatches(
+            dataset,
+            self.start.config,
+            environment,
+            batch_size=size,
+            seed=self.progress.seed,
+            data_type=self.data_type,
+        )
+        made: GeneratedBatches | ReplayedBatches | None = None
+        always = False
+        if environment is not None and environment.load_samples:
+            made = self._open_replay(environment, stored)
+            always = not environment.only_first_epoch
+        elif environment is not None:
+            made = self._open_generation(resources, environment, stored)
+            always = environment.always_produce
+        return TrainingData(stored, made, batch_size=size, batch_nb=self.batch_nb, always=always)
+
+    def _open_replay(
+        self, environment: EnvironmentConfig, stored: StoredBatches
+    ) -> ReplayedBatches:
+        """Have environments replay the stored samples."""
+        offset = stored.dataset.num_samples("training")
+        source = self._open_environments(environment, stored.dataset, offset, run_ahead=0)
+        seed = self.progress.seed if self.start.config.shuffle else None
+        return ReplayedBatches(source, stored, batch_size=self.buffer.batch_size, seed=seed)
+
+    def _open_generation(
+        self,
+        resources: contextlib.ExitStack,
+        environment: EnvironmentConfig,
+        stored: StoredBatches,
+    ) -> GeneratedBatches:
+        """Have environments generate samples, in the leading process."""
+        if self.batch_nb is None:
+            raise ConfigError(
+                "Training.batch_nb is missing: it is the number of batches to generate in an epoch."
+            )
+        source = online = None
+        if self.group.leads:
+            source, online = self._open_online(resources, environment, stored)
+        made = GeneratedBatches(
+            stored, source, online, self.group, ahead=self.ahead, repeats=self._repeats
+        )
+        if self.start.checkpoint is not None and self.progress.blocks:
+            made.resume(self.start.checkpoint, self.batch_fields)
+        return made
+
+    def _open_online(
+        self,
+        resources: contextlib.ExitStack,
+        environment: EnvironmentConfig,
+        stored: StoredBatches,
+    ) -> tuple[Source, OnlineBatches]:
+        dataset, buffer = stored.dataset, self.buffer
+        feeder = Feeder[Block]() if environment.as_tcp_ip_client else None
+        generation, skip = self._begin_generation(dataset, environment)
+        source = self._open_environments(
+            environment, dataset, generation.offset, feeder, total=buffer.total, skip=skip
+        )
+        drawn = None
+        if buffer.capacity:
+            drawn = DrawnRows(self.session, buffer.batch_size, self.progress.blocks)
+            resources.callback(drawn.close)
+        blocks = Blocks(
+            source,
+            dataset,
+            stored.mode,
+            normalize=self.start.config.normalize,
+            first=generation.first,
+            statistics=RowStatistics(self.progress.seed, buffer.total),
+            feeder=feeder,
+        )
+        resources.callback(blocks.close)
+        source.sets.follow(buffer.needed)
+        return source, OnlineBatches(blocks, buffer, self.data_type, drawn, generation.first)
+
+    def _open_environments(
+        self,
+        environment: EnvironmentConfig,
+        dataset: Dataset,
+        offset: int,
+        feeder: Feeder[Block] | None = None,
+        **options: Any,
+    ) -> Source:
+        """Open environments.
+
+        Args:
+            environment: The environment.
+            dataset: Is told where its samples come from.
+            offset: Number of samples that others had made before.
+            feeder: Has a thread that takes their samples; None: the training's thread does.
+            options: Further arguments of `open_source`.
+        """
+        seed = self._seed_of(environment)
+        dataset.update_info(**describe_environment(environment, seed))
+
+        def predict(batch: Batch) -> Batch:
+            self._note_dependence(dataset)
+            return self.predict(batch)
+
+        return self.open_source(
+            environment,
+            derive_seed(seed, "training", offset),
+            predict=predict if feeder is None else feeder.calling(predict),
+            show=None if feeder is None else feeder.telling(self.show),
+            **options,
+        )
+
+    def _begin_generation(
+        self, dataset: Dataset, environment: EnvironmentConfig
+    ) -> tuple[Generation, Skip]:
+        """Keep what the environments' rows depend on; return those that an earlier run has had."""
+        seed, former, mode = self.progress.seed, self.start.generation, self.start.config.mode
+        now = Generation.begin(dataset, mode, seed, self.buffer.batch_size, self.batch_nb)
+        self._generation = former or now
+        if former is not None:
+            return former, former.resume(dataset, environment, now)
+        now.start(dataset, **describe_environment(environment, self._seed_of(environment)))
+        return now, NOTHING
+
+    def _seed_of(self, environment: EnvironmentConfig) -> int:
+        return self.progress.seed if environment.seed is None else environment.seed
+
+    def _note_dependence(self, dataset: Dataset) -> None:
+        """Keep in the dataset that the environments' rows depend on the network that learns."""
+        if self._generation is not None and not self._generation.depends:
+            self._generation = dataclasses.replace(self._generation, depends=True)
+            self._generation.store(dataset)
+
+    def _repeats(self) -> bool:
+        """Return whether environments would generate the same samples again."""
+        return self._generation is not None and not self._generation.depends
