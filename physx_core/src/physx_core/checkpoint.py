@@ -166,7 +166,7 @@ def save(
     name = config.network_name or NAME
     numbers = list_numbers(network_dir, name)
     path = network_dir / f"{name}_{BEST if best else max(numbers, default=-1) + 1}"
-    partial = network_dir / f".{path.name}.partial"
+    partial = _partial(path)
     description = _describe(config, network, fields, normalization, progress)
     try:
         check_session(network_dir)
@@ -279,6 +279,23 @@ def rehearse(place: Path, network: Network, optimization: Optimization) -> None:
                 )
 
 
+def remove(path: Path) -> None:
+    """Remove a checkpoint; if that is cut short, it is as one whose writing was.
+
+    Raises:
+        CheckpointError: If it cannot be removed.
+    """
+    hidden = _partial(path)
+    try:
+        files.rename(path, hidden)
+        files.remove_folder(hidden)
+    except OSError as error:
+        raise CheckpointError(
+            f"{path} cannot be removed: {error.strerror or error}. Remove it, and resume the "
+            "training."
+        ) from error
+
+
 def check_session(network_dir: Path) -> None:
     """Check that a session's folder, in which checkpoints are or will be stored, is still there.
 
@@ -327,6 +344,11 @@ def _settle(path: Path, *, finish: bool = True) -> None:
     elif finish:
         files.sync_folder(path.parent)
         files.remove_folder(former)
+
+
+def _partial(path: Path) -> Path:
+    """Return where a checkpoint is while it is written or removed."""
+    return path.parent / f".{path.name}.partial"
 
 
 def _former(path: Path) -> Path:
@@ -378,6 +400,16 @@ def list_numbers(network_dir: Path, name: str) -> list[int]:
         return []
     found = (pattern.fullmatch(p.name) for p in network_dir.iterdir())
     return sorted(int(match[1]) for match in found if match)
+
+
+def list_within_epochs(network_dir: Path, name: str) -> list[Path]:
+    """Return the folders of the checkpoints that were written within epochs, by number."""
+    found = []
+    for number in list_numbers(network_dir, name):
+        path = network_dir / f"{name}_{number}"
+        with contextlib.suppress(_UnreadableError):
+            found += [path] if _read(path, content=False).progress.batch else []
+    return found
 
 
 def list_all(network_dir: Path) -> list[Path]:

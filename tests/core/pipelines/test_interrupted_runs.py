@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from physx_core import (
     NetworkConfig,
     Training,
     checkpoint,
+    files,
 )
 from physx_core.cli import main
 from physx_core.errors import ConfigError, DivergedError, EnvironmentFailedError
@@ -43,6 +45,50 @@ def progress(session="training", number=0):
 
 def checkpoints(session="training"):
     return sorted(path.name for path in Path(f"sessions/{session}/network").glob("*"))
+
+
+# Within epochs ------------------------------------------------------------------------------------
+
+
+def test_of_the_checkpoints_within_epochs_the_last_two_stay(monkeypatch):
+    done = []
+    for name in ("rename", "sync_folder"):
+        operation = getattr(files, name)
+        monkeypatch.setattr(
+            files, name, lambda *paths, do=operation: (done.append(paths), do(*paths))[1]
+        )
+    network = dataclasses.replace(NETWORK, save_each_epoch=True)
+    Training(network, DATA, checkpoint_every=1, **OPTIONS).execute()
+    assert checkpoints() == [f"network_{n}" for n in (12, 13, 14, 4, 9)]
+    assert [progress(number=n) for n in (4, 9, 12, 13, 14)] == [
+        (1, 0), (2, 0), (2, 3), (2, 4), (3, 0)
+    ]  # fmt: skip
+    folder = Path("sessions/training/network")
+    hidden = folder / ".network_0.partial"
+    appears = done.index((folder / ".network_2.partial", folder / "network_2"))
+    vanishes = done.index((folder / "network_0", hidden))
+    assert (folder,) in done[appears:vanishes]  # the new one is on the disk by then
+
+
+def test_a_training_that_is_killed_while_it_removes_a_checkpoint_resumes(monkeypatch):
+    network = NetworkConfig(Linear, optimization=Descending)
+    Training(network, DATA, session_name="whole", checkpoint_every=1, **OPTIONS).execute()
+    rename = files.rename
+
+    def killed(path, target):
+        rename(path, target)
+        if path.name == "network_1":
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(files, "rename", killed)
+        Training(network, DATA, checkpoint_every=1, **OPTIONS).execute()
+    assert checkpoints() == [".network_1.partial", "network_2", "network_3"]
+    Training(network, DATA, checkpoint_every=1, resume=True, **OPTIONS).execute()
+    assert checkpoints() == checkpoints("whole")
+    last = [Path(f"sessions/{name}/network/network_12") for name in ("training", "whole")]
+    one, two = (np.load(path / "parameters.npz")["weights"] for path in last)
+    assert one.tobytes() == two.tobytes()
 
 
 # SIGTERM ------------------------------------------------------------------------------------------

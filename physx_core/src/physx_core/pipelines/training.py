@@ -48,6 +48,7 @@ _ADVICE = (
     "Lower the learning rate, normalize the data (DatasetConfig.normalize) or limit the gradients; "
     'on_nan="continue" ignores this.'
 )
+_KEPT_WITHIN_EPOCHS = 2
 _SESSION_INTERVAL = 1.0
 """Time in s between checks that the session's folder is still there."""
 
@@ -127,7 +128,8 @@ class Training(NewSessionPipeline):
     histograms_every: int = at_least(0, 0)
     """Number of epochs between histograms of weights and gradients; 0: none."""
     checkpoint_every: int = at_least(0, 0)
-    """Number of batches between checkpoints within epochs, counted over all epochs; 0: none."""
+    """Number of batches between checkpoints within epochs, counted over all epochs; 0: none. The
+    last two of them are kept."""
     resume: bool = field(default=False, metadata={"recorded": False})
     """Resume from the session's last checkpoint, up to `epoch_nb` epochs in total. While
     environments generate the samples, they generate those that are stored again, unless they depend
@@ -146,6 +148,7 @@ class Training(NewSessionPipeline):
     best: BestEpoch = field(init=False, repr=False)
     checkpoint_path: Path | None = field(init=False, repr=False, default=None)
     _checked: float = field(init=False, repr=False, default=0.0)
+    _within_epochs: list[Path] | None = field(init=False, repr=False, default=None)
     _epoch_batches: int | None = field(init=False, repr=False, default=None)
     _is_savable: bool = field(init=False, repr=False, default=False)
     _met_nan: bool = field(init=False, repr=False, default=False)
@@ -369,9 +372,26 @@ class Training(NewSessionPipeline):
     def _leave_batch(self, interrupt: Interrupt) -> None:
         """Write a checkpoint if one is due, and end within an epoch after a signal."""
         if self.checkpoint_every and self._number % self.checkpoint_every == 0:
-            self.save_checkpoint()
+            self._save_within_epoch()
         if self.group.any(bool(interrupt)) and self.batch_condition():
             self._end_early(interrupt)
+
+    def _save_within_epoch(self) -> None:
+        """Write a checkpoint, then remove earlier ones within epochs but for the last.
+
+        That one is for the case that the new one is damaged on the disk.
+        """
+        if not self._leads:
+            self.save_checkpoint()
+            return
+        if self._within_epochs is None:  # of earlier runs
+            name = self.network_config.network_name or checkpoint.NAME
+            self._within_epochs = checkpoint.list_within_epochs(self.session.network_dir, name)
+        path = self.save_checkpoint()
+        if path not in self._within_epochs:
+            self._within_epochs.append(path)
+        while len(self._within_epochs) > _KEPT_WITHIN_EPOCHS:
+            checkpoint.remove(self._within_epochs.pop(0))
 
     def _end_early(self, interrupt: Interrupt) -> None:
         self.save_checkpoint()
