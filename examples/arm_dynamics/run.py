@@ -173,7 +173,7 @@ def print_table(errors: dict[int, np.ndarray]) -> float:
 def draw(recording: Path, picture: Path, step: int) -> None:
     """Draw the recording without a screen, or say what is missing for it."""
     try:
-        render_picture(recording, picture, step=step)
+        render_picture(recording, picture, at=step)
         print(f"picture:   {picture}")
     except PhysxError as error:
         print(f"picture:   not drawn. {error}")

@@ -27,6 +27,8 @@ OFFICIAL = {
     (COMMANDS, "log"): "physx-gym",
     (COMMANDS, "serve"): "physx-remote",
     (PLUGINS, "rerun"): "physx-rerun",
+    (COMMANDS, "snapshot"): "physx-rerun",
+    (COMMANDS, "view"): "physx-rerun",
     (PLUGINS, "torch"): "physx-torch",
 }
 """Plugins and commands of the physx project, and the distributions that contain them."""

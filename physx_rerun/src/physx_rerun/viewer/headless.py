@@ -18,6 +18,7 @@ from physx_rerun.viewer.viewer import Viewer
 T = TypeVar("T")
 _TOP_BAR = 36  # height of the viewer's own menu bar in pixels, cut off
 _QUIET_SECONDS = 0.4  # without a change of state, after which everything is loaded
+_TIMELINES = ("step", "row", "epoch", "batch")  # in order of preference
 _PATIENCE = 5  # equal pictures in a row, after which missing assets are given up
 
 
@@ -25,8 +26,8 @@ def render_picture(
     rrd_path: str | Path,
     png_path: str | Path,
     size: tuple[int, int] = (1600, 900),
-    step: int | None = None,
-    timeline: str = "step",
+    at: float | None = None,
+    timeline: str | None = None,
     timeout: float = 120.0,
 ) -> Path:
     """Render a recording at one time as a picture.
@@ -35,15 +36,15 @@ def render_picture(
         rrd_path: The recording, a ``.rrd`` file.
         png_path: Picture to write.
         size: Width and height in pixels.
-        step: Position on the timeline, in ns on the timeline ``time``; None: its end.
-        timeline: Name of the timeline.
+        at: Position on the timeline, in s on ``sim_time`` and ``time``; None: its end.
+        timeline: Name of the timeline; None: ``step`` where there is one.
         timeout: Longest time to take, in s.
 
     Returns:
         The picture's path.
 
     Raises:
-        VisualizerError: If the recording is missing or has no such timeline, there is no graphics
+        VisualizerError: If the recording is missing or has no such time, there is no graphics
             driver, or the viewer fails or takes too long.
     """
     rrd_path, png_path = Path(rrd_path), Path(png_path)
@@ -55,7 +56,7 @@ def render_picture(
             viewer.wait_until_ready(timeout)
             camera = Camera(viewer, time.monotonic() + timeout)
             camera.wait_for_recording()
-            camera.go_to(timeline, step)
+            camera.go_to(*camera.find(timeline, at))
             picture = Image.open(io.BytesIO(camera.wait_for_picture()))
         except OSError as error:
             viewer.check(wait=2.0)
@@ -108,15 +109,29 @@ class Camera:
                 return
             time.sleep(0.1)
 
-    def go_to(self, timeline: str, step: int | None) -> None:
-        """Go to a position on a timeline, or to its end."""
+    def find(self, timeline: str | None, at: float | None) -> tuple[str, int]:
+        """Return a timeline and the viewer's number for a time on it, as in `render_picture`."""
         state = self._request(self._client.get_state)
         known = {line.name: line for line in state.recordings[0].timelines}
+        if timeline is None:
+            timeline = next((name for name in _TIMELINES if name in known), next(iter(known)))
         if timeline not in known:
             raise VisualizerError(
                 f'The recording has no timeline "{timeline}". Timelines: {", ".join(known)}.'
             )
-        position = known[timeline].end or 0 if step is None else step
+        line = known[timeline]
+        unit = 1 if line.time_type == "sequence" else 1_000_000_000  # the viewer counts ns
+        start, end = line.start or 0, line.end or 0
+        position = end if at is None else round(at * unit)
+        if not start <= position <= end:
+            raise VisualizerError(
+                f'The timeline "{timeline}" begins at {start / unit:g} and ends at '
+                f"{end / unit:g}: there is nothing at {at:g}."
+            )
+        return timeline, position
+
+    def go_to(self, timeline: str, position: int) -> None:
+        """Go to a position on a timeline."""
         self._request(
             lambda: self._client.set_time(timeline, sequence=position, play_state="paused")
         )

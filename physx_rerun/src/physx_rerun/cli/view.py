@@ -1,0 +1,66 @@
+"""``physx view``: open a recording or dataset in the Rerun viewer, or in a browser."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from physx_core.cli import show
+from physx_core.errors import VisualizerError
+from physx_rerun.recordings import recording_of
+from physx_rerun.viewer.viewer import Viewer, has_display, start_web_viewer
+
+
+@dataclass
+class View:
+    """Open a recording or dataset in the Rerun viewer, or in a browser.
+
+    physx view sessions/prediction
+
+    physx view sessions/data_generation/dataset --web
+
+    physx view run.rrd --web --port 9876 --page-port 9090
+    """
+
+    place: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE|SESSION")]
+    """A recording (.rrd), a session's folder (its newest recording, or else its dataset), a
+    dataset's folder, or one of its files."""
+    web: bool = False
+    """Serve a page for browsers on this machine, and print its address; Ctrl-C ends it."""
+    port: int = 0
+    """Port of the viewer; 0: any free one."""
+    page_port: int = 0
+    """Port of the page; 0: any free one."""
+
+
+def run(words: Sequence[str]) -> None:
+    """Show the recording until its window is closed, or until Ctrl-C."""
+    options = tyro.cli(View, args=words, prog="physx view")
+    with recording_of(options.place) as path:
+        viewer = _open(path.resolve(), options)
+        try:
+            with contextlib.suppress(KeyboardInterrupt):  # the usual way to end it
+                viewer.process.wait()
+        finally:
+            viewer.end()
+
+
+def _open(recording: Path, options: View) -> Viewer:
+    if options.web:
+        viewer = start_web_viewer(options.port, options.page_port, str(recording))
+        show(f"viewer: {viewer.page}  (Ctrl-C ends it)")
+        return viewer
+    if not has_display():
+        raise VisualizerError(
+            "There is no display to open a window on. Add --web to see it in a browser, or make a "
+            "picture: physx snapshot FILE|SESSION -o PICTURE.png"
+        )
+    viewer = Viewer(options.port, (str(recording),))
+    viewer.wait_until_ready()
+    viewer.check(wait=1.0)  # it listens before its window opens
+    return viewer

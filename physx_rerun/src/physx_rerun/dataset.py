@@ -1,0 +1,175 @@
+"""Draws the rows of a dataset: clouds of points, curves, and arrays."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from physx_core import Dataset, Field
+from physx_core.errors import printable
+from physx_core.typing import Array
+from physx_rerun.drawing import colors
+
+TIMELINE = "row"
+"""Timeline of the recording: the number of the row in its mode."""
+LIMIT_BYTES = 500_000_000
+"""Size of the rows after which the rest of a mode is left out."""
+_BLOCK_BYTES = 8_000_000
+_MOST_CURVES = 32
+_MOST_ARRAYS = 2000  # Rerun takes them one by one
+_MOST_INSTANCES = 4  # with windows of their own
+_RADIUS = rr.Radius.ui_points(3.0)
+_BOOKKEEPING = ("env_id", "episode", "step")
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A field of a mode that can be drawn.
+
+    Attributes:
+        mode: The mode.
+        field: The field.
+        shape: Its shape.
+    """
+
+    mode: str
+    field: Field
+    shape: tuple[int, ...]
+
+    def entity(self, instance: int) -> str:
+        """Return the path of its entity, for the rows of one instance."""
+        parts = (self.mode, f"env_{instance}", self.field.name)
+        return "/".join(map(rr.escape_entity_path_part, parts))
+
+    @property
+    def title(self) -> str:
+        """Name and unit."""
+        unit = f" [{self.field.unit}]" if self.field.unit else ""
+        return self.field.name + unit
+
+    @property
+    def is_curve(self) -> bool:
+        """Whether it is a few numbers."""
+        return len(self.shape) < 2 and math.prod(self.shape) <= _MOST_CURVES
+
+    def is_cloud(self, dimension: int) -> bool:
+        """Whether it is points of this dimension."""
+        return len(self.shape) == 2 and self.shape[1] == dimension
+
+    def write_look(self, stream: rr.RecordingStream, instance: int) -> None:
+        """Write what is the same in all rows."""
+        entity = self.entity(instance)
+        if self.is_curve:
+            count = math.prod(self.shape)
+            indices = [f" {index}" for index in range(count)] if self.shape else [""]
+            names = [f"{instance}: {self.field.name}{index}" for index in indices]
+            shades = colors.curves(count, (instance - 1) * count)
+            stream.log(entity, rr.SeriesLines(names=names, colors=shades), static=True)
+        elif self.is_cloud(3):
+            stream.log(entity, rr.Points3D.from_fields(radii=_RADIUS), static=True)
+
+    def write(self, stream: rr.RecordingStream, instance: int, rows: Array, values: Array) -> None:
+        """Write the values of some rows."""
+        entity, length = self.entity(instance), self.shape[0] if self.shape else 1
+        if self.is_curve:
+            columns = rr.Scalars.columns(scalars=values.ravel().astype(np.float64))
+        elif self.is_cloud(3):
+            columns = rr.Points3D.columns(positions=values.reshape(-1, 3).astype(np.float32))
+        elif self.is_cloud(2):
+            columns = rr.Points2D.columns(positions=values.reshape(-1, 2).astype(np.float32))
+        else:
+            for row, value in zip(rows[rows < _MOST_ARRAYS], values, strict=False):
+                stream.set_time(TIMELINE, sequence=int(row))
+                stream.log(entity, rr.Tensor(np.asarray(value, np.float32)))
+            return
+        index = rr.TimeColumn(TIMELINE, sequence=rows)
+        stream.send_columns(entity, [index], columns.partition([length] * len(rows)))
+
+
+def write_dataset(directory: Path, stream: rr.RecordingStream) -> None:
+    """Write the rows of a dataset to a recording, with a layout of windows.
+
+    The field ``points`` of the second instance in the mode ``training`` is the entity
+    ``training/env_2/points``. Its shape decides how it is drawn: (n, 3) and (n, 2) as points,
+    few numbers as curves, all else, in the first rows, as an array.
+
+    Args:
+        directory: The dataset's folder, or that of its session.
+        stream: The recording.
+
+    Raises:
+        PhysxError: If there is no dataset, or it cannot be read.
+    """
+    stream.set_log_time_enabled(False)
+    with Dataset.open(directory) as dataset:
+        tabs = []
+        for mode in filter(dataset.num_samples, dataset.modes):
+            columns = _columns(dataset, mode)
+            instances = _write_mode(dataset, mode, columns, stream)
+            tabs.append(rrb.Grid(*_views(columns, instances), name=mode))
+        if tabs:
+            stream.send_blueprint(rrb.Blueprint(rrb.Tabs(*tabs), collapse_panels=True))
+
+
+def _columns(dataset: Dataset, mode: str) -> list[_Column]:
+    return [
+        _Column(mode, field, field.shape)
+        for field in dataset.fields(mode).values()
+        if field.shape is not None
+        and np.dtype(field.dtype).kind in "biuf"
+        and field.name not in _BOOKKEEPING
+    ]
+
+
+def _write_mode(
+    dataset: Dataset, mode: str, columns: Sequence[_Column], stream: rr.RecordingStream
+) -> list[int]:
+    """Write the rows of a mode and return the numbers of the instances that they are from."""
+    view, count, known = dataset[mode], dataset.num_samples(mode), set[int]()
+    sizes = (math.prod(c.shape) * np.dtype(c.field.dtype).itemsize for c in columns)
+    row_bytes = max(1, sum(sizes))
+    shown = min(count, max(1, LIMIT_BYTES // row_bytes))
+    if shown < count:
+        text = f"physx: only the first {shown} of {count} rows of the mode {mode} are shown\n"
+        sys.stderr.write(printable(text))
+    block = max(1, _BLOCK_BYTES // row_bytes)
+    for first in range(0, shown, block):
+        last = min(first + block, shown)
+        rows = np.arange(first, last)
+        has_owners = "env_id" in dataset.fields(mode)
+        owners = np.asarray(view["env_id"][first:last]) if has_owners else np.ones_like(rows)
+        values = {column: np.asarray(view[column.field.name][first:last]) for column in columns}
+        for instance in map(int, np.unique(owners)):
+            mine = owners == instance
+            for column in columns:
+                if instance not in known:
+                    column.write_look(stream, instance)
+                column.write(stream, instance, rows[mine], values[column][mine])
+            known.add(instance)
+    return sorted(known)
+
+
+def _views(columns: Sequence[_Column], instances: Sequence[int]) -> Iterator[rrb.View]:
+    """Yield a window for each scene, plot and array of a mode."""
+    instances = instances[:_MOST_INSTANCES]
+    for instance in instances:
+        for dimension, view in ((3, rrb.Spatial3DView), (2, rrb.Spatial2DView)):
+            clouds = [column.entity(instance) for column in columns if column.is_cloud(dimension)]
+            if clouds:
+                origin = clouds[0].rpartition("/")[0]
+                yield view(origin=origin, contents=clouds, name=f"instance {instance}")
+    for column in columns:
+        if column.is_curve:
+            entities = [column.entity(instance) for instance in instances]
+            yield rrb.TimeSeriesView(contents=entities, name=column.title)
+        elif not column.is_cloud(3) and not column.is_cloud(2):
+            for instance in instances:
+                name = f"instance {instance}: {column.title}"
+                yield rrb.TensorView(origin=column.entity(instance), name=name)

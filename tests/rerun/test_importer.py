@@ -1,0 +1,114 @@
+"""Datasets as recordings, as Rerun gets them from the importer."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from physx_core import Dataset, Field
+from physx_rerun import dataset as drawing
+from physx_rerun.importer import FOREIGN
+from physx_rerun.viewer.viewer import find_executable, find_free_port
+
+PROGRAM = f"""#!{sys.executable}
+import sys
+from physx_rerun.importer import main
+sys.exit(main())
+"""
+ROWS = 12
+
+
+@pytest.fixture
+def data():
+    rng = np.random.default_rng(0)
+    owners = np.arange(ROWS, dtype=np.int32) % 2 + 1
+    return {
+        "cloud": rng.random((ROWS, 5, 3)),
+        "outline": rng.random((ROWS, 4, 2)),
+        "force": rng.random((ROWS, 3)),
+        "energy": rng.random(ROWS),
+        "contact": rng.random((ROWS, 2)) > 0.5,
+        "heat": rng.random((ROWS, 6, 7)),
+        "env_id": owners,
+    }
+
+
+@pytest.fixture
+def folder(tmp_path, data):
+    with Dataset.create(tmp_path / "dataset", session="run") as dataset:
+        fields = [Field(n, shape=v.shape[1:], dtype=v.dtype.str) for n, v in data.items()]
+        dataset.define_fields("training", fields)
+        dataset.append("training", data)
+        dataset.append("validation", {"x": np.zeros((2, 3))})
+    return tmp_path / "dataset"
+
+
+@pytest.fixture
+def importer(tmp_path):
+    """Return the path of the command, as an installed package has it."""
+    (tmp_path / "bin").mkdir()
+    path = tmp_path / "bin" / "rerun-importer-physx"
+    path.write_text(PROGRAM)
+    path.chmod(0o755)
+    return path
+
+
+def test_rerun_opens_a_dataset(folder, importer, data, tmp_path, read):
+    out, port = tmp_path / "out.rrd", str(find_free_port())
+    command = [find_executable(), folder / "run.h5", "--save", out, "--bind", "127.0.0.1"]
+    paths = {"PATH": f"{importer.parent}:{os.environ['PATH']}"}
+    subprocess.run([*command, "--port", port], env=os.environ | paths, check=True, timeout=60)
+    assert rr.chunk.RrdReader(out).blueprints()
+    for instance in (1, 2):
+        place, rows = f"/training/env_{instance}", list(range(instance - 1, ROWS, 2))
+        for name, component in (
+            ("cloud", "Points3D:positions"),
+            ("outline", "Points2D:positions"),
+            ("force", "Scalars:scalars"),
+            ("energy", "Scalars:scalars"),
+            ("contact", "Scalars:scalars"),
+        ):
+            found = read(out, f"{place}/{name}", component, "row")
+            found = [pair for pair in found if pair[0] is not None]
+            assert [row for row, _ in found] == rows
+            values = np.array([value for _, value in found]).reshape(data[name][rows].shape)
+            np.testing.assert_allclose(values, data[name][rows], rtol=1e-6)
+        tensors = read(out, f"{place}/heat", "Tensor:data", "row")
+        assert [row for row, _ in tensors] == rows
+    assert read(out, "/validation/env_1/x", "Scalars:scalars", "row") == [
+        (0, [0] * 3),
+        (1, [0] * 3),
+    ]
+
+
+def test_files_of_others_are_refused_without_importing_anything(importer, tmp_path):
+    (tmp_path / "other.h5").write_bytes(b"")
+    code = "import sys; from physx_rerun import importer; status = importer.main(); "
+    code += "print({'rerun', 'numpy', 'physx_core'} & sys.modules.keys()); sys.exit(status)"
+    for name in ("other.h5", "photo.png", "missing", "."):
+        command = [sys.executable, "-c", code, tmp_path / name, "--application-id", "a"]
+        ended = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert (ended.returncode, ended.stdout, ended.stderr) == (FOREIGN, "set()\n", "")
+
+
+def test_a_damaged_dataset_is_an_error(folder, importer):
+    (folder / "dataset.json").write_text("{")
+    ended = subprocess.run([importer, folder / "run.h5"], capture_output=True, check=False)
+    assert ended.returncode == 1
+    assert b"dataset.json" in ended.stderr and b"Traceback" not in ended.stderr
+
+
+def test_the_end_of_a_large_dataset_is_left_out(folder, tmp_path, read, monkeypatch, capfd):
+    monkeypatch.setattr(drawing, "LIMIT_BYTES", 3000)
+    stream = rr.RecordingStream("test")
+    stream.save(tmp_path / "out.rrd")
+    drawing.write_dataset(folder, stream)
+    stream.disconnect()
+    rows = read(tmp_path / "out.rrd", "/training/env_1/energy", "Scalars:scalars", "row")
+    shown = int(capfd.readouterr().err.partition("first ")[2].partition(" of 12")[0])
+    assert [row for row, _ in rows] == list(range(0, shown, 2)) and 0 < shown < ROWS
