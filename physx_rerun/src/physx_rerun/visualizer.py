@@ -203,6 +203,7 @@ class RerunVisualizer(Visualizer):
                 self._rows,
                 self._layout,
                 draws_shapes=instance_id <= self.max_instances,
+                pixels=max(self.picture_size) if self.mode == "offscreen" else None,
             )
         times = {"step": step, TIME: self._now()}
         seconds = self._clocks[instance_id].seconds

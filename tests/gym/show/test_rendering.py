@@ -282,9 +282,30 @@ def test_a_camera_stays_where_the_base_is_fixed():
     assert "follow" not in drawn(World([Robot("cartpole")]))["view"]
 
 
+def test_a_film_for_video_players(tmp_path):
+    av = pytest.importorskip("av")
+    path = tmp_path / "a.mp4"
+    shades = (0, 100, 200)
+    write_film((np.full((33, 48, 3), shade, np.uint8) for shade in shades), path, 12.5)
+    with av.open(str(path)) as film:
+        frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+        assert film.streams.video[0].average_rate == 12.5
+    assert [frame.shape for frame in frames] == [(32, 48, 3)] * 3
+    assert [frame.mean() for frame in frames] == pytest.approx(shades, abs=6)
+
+
 def test_films_in_other_formats_are_rejected(tmp_path):
-    with pytest.raises(ConfigError, match=r"\.gif, \.webp, \.png, not a\.mp4"):
-        write_film([np.zeros((4, 4, 3), np.uint8)], tmp_path / "a.mp4", 30)
+    with pytest.raises(ConfigError, match=r"\.gif, \.webp, \.png, not a\.avi"):
+        write_film([np.zeros((4, 4, 3), np.uint8)], tmp_path / "a.avi", 30)
+
+
+def test_an_error_while_a_film_is_rendered_is_raised(tmp_path):
+    def pictures():
+        yield np.zeros((4, 4, 3), np.uint8)
+        raise VisualizerError("no more")
+
+    with pytest.raises(VisualizerError, match="no more"):
+        write_film(pictures(), tmp_path / "a.gif", 30)
 
 
 class Fake(Visualizer):

@@ -45,7 +45,7 @@ class Evaluate:
     replay: str | None = None
     """Write a recording of the first episode for the viewer to this file (.rrd)."""
     film: str | None = None
-    """Write a film of the first episode to this file (.gif, .webp)."""
+    """Write a film of the first episode to this file (.mp4, .gif, .webp)."""
     trust: bool = False
     """Import whatever the checkpoint names, not only components of installed plugins."""
 

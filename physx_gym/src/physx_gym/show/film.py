@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import itertools
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +13,15 @@ from numpy.typing import NDArray
 
 from physx_core.errors import ConfigError, MissingLibraryError
 
-SUFFIXES = (".gif", ".webp", ".png")
+SUFFIXES = (".mp4", ".gif", ".webp", ".png")
+
+Picture = NDArray[np.uint8]
 
 
-def write_film(pictures: Iterable[NDArray[np.uint8]], path: Path, frame_rate: float) -> Path:
-    """Write pictures as a looping animation.
+def write_film(pictures: Iterable[Picture], path: Path, frame_rate: float) -> Path:
+    """Write pictures as a film; all but ``.mp4`` are looping animations.
+
+    Each picture is rendered while the one before it is written.
 
     Args:
         pictures: At least one, each of shape (height, width, 3).
@@ -24,18 +31,49 @@ def write_film(pictures: Iterable[NDArray[np.uint8]], path: Path, frame_rate: fl
     Returns:
         The path.
     """
-    if path.suffix.lower() not in SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
         raise ConfigError(
             f"The suffix of a film must be {', '.join(SUFFIXES)}, not {path.name}. For other "
             "formats pass the pictures of render() to a library such as imageio, or use "
             "gymnasium's RecordVideo."
         )
+    write = _write_mp4 if suffix == ".mp4" else _write_animation
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write(_ahead(iter(pictures)), path, frame_rate)
+    return path
+
+
+def _ahead(pictures: Iterator[Picture]) -> Iterator[Picture]:
+    """Yield pictures, each while a thread renders the next."""
+    with ThreadPoolExecutor(1) as thread:
+        coming = thread.submit(next, pictures, None)
+        while (picture := coming.result()) is not None:
+            coming = thread.submit(next, pictures, None)
+            yield picture
+
+
+def _write_animation(pictures: Iterator[Picture], path: Path, frame_rate: float) -> None:
     try:
         from PIL import Image
     except ImportError as error:
         raise MissingLibraryError("A film", "pillow", "film", "physx-gym") from error
     first, *rest = [Image.fromarray(picture) for picture in pictures]
-    path.parent.mkdir(parents=True, exist_ok=True)
     duration = round(1000 / frame_rate)
     first.save(path, save_all=True, append_images=rest, duration=duration, loop=0)
-    return path
+
+
+def _write_mp4(pictures: Iterator[Picture], path: Path, frame_rate: float) -> None:
+    try:
+        import av
+    except ImportError as error:
+        raise MissingLibraryError("A film as .mp4", "av", "film", "physx-gym") from error
+    first = next(pictures)
+    high, wide = (size - size % 2 for size in first.shape[:2])  # the format has no odd sizes
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("libx264", rate=Fraction(frame_rate).limit_denominator(1000))
+        stream.width, stream.height, stream.pix_fmt = wide, high, "yuv420p"
+        for picture in itertools.chain([first], pictures):
+            cut = np.ascontiguousarray(picture[:high, :wide])
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(cut, format="rgb24")))
+        file.mux(stream.encode())

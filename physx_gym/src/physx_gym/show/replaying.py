@@ -39,7 +39,7 @@ def replay(
         logs: Logs, their files, or values of `RobotEnv.log_data`; one or several.
         compare: More of them.
         path: Recording to write for the viewer, ``.rrd``.
-        record_video_path: Film to write: ``.gif``, ``.webp`` or ``.png``.
+        record_video_path: Film to write: ``.mp4``, ``.gif``, ``.webp`` or ``.png``.
         frame_rate: Frames per simulated second. The viewer plays 30 per second.
         backend: Reference of the engine that provides the robots; None: the log's.
         viewer: Options of the viewer, as in ``RobotEnv.viewer_kwargs``.

@@ -50,7 +50,13 @@ class Drawing:
     """Draws one environment instance under ``env_<instance_id>/``."""
 
     def __init__(
-        self, instance_id: int, rows: ChunkBuilder, layout: WindowLayout, *, draws_shapes: bool
+        self,
+        instance_id: int,
+        rows: ChunkBuilder,
+        layout: WindowLayout,
+        *,
+        draws_shapes: bool,
+        pixels: int | None = None,
     ) -> None:
         """Set the targets of the drawing.
 
@@ -59,7 +65,9 @@ class Drawing:
             rows: Collects the rows.
             layout: Lays out the windows.
             draws_shapes: Whether to draw shapes; otherwise only numbers and texts are recorded.
+            pixels: Size of the pictures that are rendered; None: a person looks at it.
         """
+        self._pixels = pixels
         self._id, self._rows, self._layout, self._draws_shapes = (
             instance_id,
             rows,
@@ -320,7 +328,7 @@ class Drawing:
         frames = [f"{self._origin}/{drawn.name}/{body}" for body in values["bodies"]]
         if drawn.is_new:
             values["shapes"], rest = draw_robot(
-                self._rows, drawn.entity, values, frames, self._world
+                self._rows, drawn.entity, values, frames, self._world, self._pixels
             )
             if changes.get("poses") is None:
                 changes["poses"] = rest

@@ -13,8 +13,10 @@ from physx_core.rotations import from_matrix_rows, rotate_rows
 from physx_core.typing import Array
 from physx_rerun.drawing import colors
 from physx_rerun.drawing.chunks import ChunkBuilder, Times
+from physx_rerun.drawing.triangles import SimpleMesh, simple_mesh
 from physx_rerun.drawing.urdf import MESH_TYPES, VisualShape, read
 
+_FINEST = 3.0  # pixels of the smallest detail of a robot that fills a picture
 _SILVER = (0.75, 0.78, 0.81, 1.0)
 
 DrawnShape = tuple[str, VisualShape]
@@ -22,16 +24,23 @@ DrawnShape = tuple[str, VisualShape]
 
 
 def draw_robot(
-    rows: ChunkBuilder, entity: str, values: dict[str, Any], frames: Sequence[str], world: str
+    rows: ChunkBuilder,
+    entity: str,
+    values: dict[str, Any],
+    frames: Sequence[str],
+    world: str,
+    pixels: int | None = None,
 ) -> tuple[list[DrawnShape], Array]:
     """Draw the visual shapes of a robot; warn of mesh files that do not exist.
 
     Args:
         rows: Collects the rows.
         entity: Path of the robot's entity.
-        values: Options of the robot.
+        values: Options of the robot; ``simple`` becomes the colors of simplified meshes by entity.
         frames: Names of the bodies' frames.
         world: Name of the frame of shapes without body.
+        pixels: Size of the pictures that it is drawn for; details of meshes that are smaller than
+            a few of them are left out. None: meshes are drawn as they are.
 
     Returns:
         The shapes drawn, and the bodies' poses with all joints at zero, shape (bodies, 7).
@@ -44,6 +53,9 @@ def draw_robot(
             stacklevel=2,
         )
     drawn = []
+    corners = corners_of(model.shapes, model.rest)
+    reach = float(np.linalg.norm(np.ptp(corners, axis=0)))
+    detail = None if pixels is None else _FINEST * reach / pixels
     for shape in model.shapes:
         path = f"{entity}/{rr.escape_entity_path_part(shape.name)}"
         frame = world if shape.body is None else frames[shape.body]
@@ -52,7 +64,10 @@ def draw_robot(
             quaternions=from_matrix_rows(shape.pose[np.newaxis, :3, :3]),
             scales=[shape.size] if shape.kind == "mesh" else None,
         )
-        rows.add_static(path, rr.CoordinateFrame(frame), pose, _geometry(shape))
+        simple = _simplified(shape, detail)
+        if simple is not None:
+            values.setdefault("simple", {})[path] = colors.pack_rgba(simple.colors)
+        rows.add_static(path, rr.CoordinateFrame(frame), pose, _geometry(shape, simple))
         drawn.append((path, shape))
     return drawn, model.rest
 
@@ -68,7 +83,10 @@ def tint_robot(rows: ChunkBuilder, values: dict[str, Any], times: Times) -> None
     color, alpha = values.get("color"), values.get("alpha")
     for path, shape in values["shapes"]:
         own = shape.color
+        file_colors = values.get("simple", {}).get(path)
         if color is None and alpha is None and own is None and shape.kind == "mesh":
+            if file_colors is not None:
+                rows.add(path, rr.Mesh3D, times, vertex_colors=file_colors)
             continue
         if color is not None:
             tint = colors.rgba(color, 1.0 if alpha is None else alpha)
@@ -76,6 +94,9 @@ def tint_robot(rows: ChunkBuilder, values: dict[str, Any], times: Times) -> None
             default = (1.0, 1.0, 1.0, 1.0) if shape.kind == "mesh" else _SILVER
             red, green, blue, opacity = own or default
             tint = colors.rgba((red, green, blue), opacity if alpha is None else alpha)
+        if file_colors is not None:  # which the tint replaces
+            rows.add(path, rr.Mesh3D, times, albedo_factor=tint, vertex_colors=file_colors[:0])
+            continue
         archetype, option = _LOOKS[shape.kind]
         rows.add(path, archetype, times, **{option: tint})
 
@@ -125,7 +146,21 @@ def _center(shape: VisualShape) -> Array:
     return (shape.pose @ np.array([0.0, 0.0, -shape.size[1] / 2, 1.0]))[:3]
 
 
-def _geometry(shape: VisualShape) -> Any:
+def _simplified(shape: VisualShape, detail: float | None) -> SimpleMesh | None:
+    """Return a mesh without details; None: it is drawn as it is."""
+    factor = max(map(abs, shape.size))
+    if shape.mesh is None or not detail or not factor:
+        return None
+    return simple_mesh(shape.mesh, detail / factor)
+
+
+def _geometry(shape: VisualShape, simple: SimpleMesh | None) -> Any:
+    if simple is not None:
+        return rr.Mesh3D(
+            vertex_positions=simple.positions,
+            vertex_normals=simple.normals,
+            triangle_indices=simple.cells,
+        )
     if shape.mesh is not None:
         media_type = MESH_TYPES[shape.mesh.suffix.lower()]
         return rr.Asset3D(path=shape.mesh, media_type=media_type)

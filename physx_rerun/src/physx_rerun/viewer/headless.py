@@ -136,19 +136,28 @@ class Camera:
             lambda: self._client.set_time(timeline, sequence=position, play_state="paused")
         )
 
-    def wait_for_position(self, timeline: str, position: int) -> None:
-        """Wait until the viewer has received all rows up to a position on a timeline."""
+    def wait_for_position(self, timeline: str, position: int) -> str | None:
+        """Wait until the viewer has received all rows up to a position on a timeline.
+
+        Returns:
+            The id of the first three-dimensional view, or None.
+        """
         while True:
             state = self._request(self._client.get_state)
             lines = [line for recording in state.recordings for line in recording.timelines]
             if any(line.name == timeline and (line.end or 0) >= position for line in lines):
-                return
+                views = (view.view_id for view in state.views if view.view_class == "3D")
+                return next(views, None)
             time.sleep(0.002)
 
-    def scene_view(self) -> str | None:
-        """Return the id of the first three-dimensional view, or None."""
-        views = self._request(self._client.get_state).views
-        return next((view.view_id for view in views if view.view_class == "3D"), None)
+    def pass_frames(self, count: int) -> None:
+        """Let a number of frames pass, without drawing them."""
+        for _ in range(count):
+            self._request(self._client.get_state)
+
+    def set_step(self, step: int) -> None:
+        """Go to a position on the timeline ``step``, which the recording is known to have."""
+        self._request(lambda: self._client.set_time("step", sequence=step, play_state="paused"))
 
     def screenshot(self, view_id: str | None = None) -> bytes:
         """Return a picture of the current state of one view, or of the window."""

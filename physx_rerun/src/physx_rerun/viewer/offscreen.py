@@ -14,7 +14,7 @@ from physx_core.typing import Array
 from physx_rerun.viewer.headless import Camera, start_viewer
 
 _MARGIN = (16, 80)  # pixels of the window around a view: frame and title, with some reserve
-_NOTES = 10  # pictures after which the viewer's notifications at its start are gone
+_NOTES = 30  # frames after which the viewer's notifications at its start are gone
 _PATIENCE = 60.0  # s per picture
 
 
@@ -58,15 +58,14 @@ class OffscreenViewer:
             is_first = self._camera is None
             camera = self._camera or Camera(self._viewer, deadline)
             camera.deadline = deadline
-            camera.wait_for_position(mark, number)
+            scene = camera.wait_for_position(mark, number)
             if is_first:
                 camera.wait_for_recording()
-            camera.go_to("step", step)
-            scene = camera.scene_view()
+                camera.pass_frames(_NOTES)
+                scene = camera.wait_for_position(mark, number)
             if scene is None:
                 raise VisualizerError("There is no scene to render: nothing was drawn.")
-            for _ in range(_NOTES if is_first else 0):
-                camera.screenshot(scene)
+            camera.set_step(step)
             drawn = camera.wait_for_picture(scene) if is_first else camera.screenshot(scene)
         except OSError as error:
             self._viewer.check(wait=2.0)
