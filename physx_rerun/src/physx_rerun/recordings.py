@@ -14,9 +14,8 @@ from physx_rerun.dataset import write_dataset
 from physx_rerun.importer import find_dataset
 
 
-@contextlib.contextmanager
-def recording_of(place: str | Path) -> Iterator[Path]:
-    """Provide the recording of something that was recorded or generated.
+def find(place: str | Path) -> Path:
+    """Return the file of a recording or the folder of a dataset.
 
     Args:
         place: A recording; a session's folder, of which the newest recording is taken, or else the
@@ -24,31 +23,41 @@ def recording_of(place: str | Path) -> Iterator[Path]:
 
     Raises:
         VisualizerError: If there is neither a recording nor a dataset.
-        PhysxError: If the dataset cannot be read.
     """
     path = Path(place)
+    if not path.exists():
+        raise VisualizerError(f"There is no recording, session or dataset {path}.")
     if path.suffix == ".rrd" and path.is_file():
-        yield path
-        return
+        return path
     recordings = sorted(path.glob("*.rrd"), key=lambda file: file.stat().st_mtime)
-    folder = find_dataset(path)
-    if recordings:
-        yield recordings[-1]
-    elif folder is not None:
-        with TemporaryFolder("rerun-") as temporary:
-            file = temporary.path / f"{path.resolve().stem}.rrd"
-            stream = rr.RecordingStream("physx dataset")
-            stream.save(file)
-            stream.send_recording_name(path.resolve().stem)
-            try:
-                write_dataset(folder, stream)
-            finally:
-                stream.disconnect()
-            yield file
-    elif path.exists():
+    found = recordings[-1] if recordings else find_dataset(path)
+    if found is None:
         raise VisualizerError(
             f"{path} is neither a recording (.rrd) nor a dataset, and holds none. Runs with "
             "--environment.visualizer rerun leave a recording in their session."
         )
-    else:
-        raise VisualizerError(f"There is no recording, session or dataset {path}.")
+    return found
+
+
+@contextlib.contextmanager
+def recording_of(place: str | Path) -> Iterator[Path]:
+    """Provide the file of a recording, a temporary one of a dataset; see `find`.
+
+    Raises:
+        PhysxError: If there is none, or the dataset cannot be read.
+    """
+    found = find(place)
+    if found.is_file():
+        yield found
+        return
+    with TemporaryFolder("rerun-") as temporary:
+        name = Path(place).resolve().stem
+        file = temporary.path / f"{name}.rrd"
+        stream = rr.RecordingStream("physx dataset")
+        stream.save(file)
+        stream.send_recording_name(name)
+        try:
+            write_dataset(found, stream)
+        finally:
+            stream.disconnect()
+        yield file
