@@ -13,14 +13,14 @@ class Heat(Environment):
     """The heat equation on the unit square with insulated edges, by explicit finite differences.
 
     An episode is a simulation of `FRAMES` samples: parameters and time, scaled to -1..1, and the
-    temperature of all cells. All spots have the same heat, so small ones are hot, sharp, and hard
-    to learn.
+    temperature of all cells. All spots have the same heat: narrow ones are hot and sharp, and where
+    heat spreads slowly they stay so. This small part of the parameters is the hard one to learn.
     """
 
     PARAMETERS = (
-        Parameter("x", 0.2, 0.8, unit="m"),
-        Parameter("y", 0.2, 0.8, unit="m"),
-        Parameter("width", 0.04, 0.4, unit="m"),
+        Parameter("x", 0.4, 0.6, unit="m"),
+        Parameter("y", 0.4, 0.6, unit="m"),
+        Parameter("width", 0.03, 0.4, unit="m"),
         Parameter("diffusivity", 0.05, 1.0, unit="m^2/s"),
     )
 

@@ -210,5 +210,5 @@ def test_heat_is_learned_while_it_is_simulated(root, run, tmp_path):
     picture = tmp_path / "online.png"
     words = "--small", "--sessions", str(tmp_path / "sessions"), "--picture", str(picture)
     text = run(root / "examples/online/run.py", *words).stdout
-    assert "physx/uniform: 64 simulations" in text and "physx/active: 64 simulations" in text
+    assert "physx/uniform: 32 simulations" in text and "physx/active: 32 simulations" in text
     assert picture.stat().st_size > 10_000

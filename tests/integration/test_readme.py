@@ -1,11 +1,11 @@
-"""The programs and commands of README.md and docs/migration.md run as printed."""
+"""The programs and commands of README.md and of pages that no package owns run as printed."""
 
 import re
 import shlex
 
 import pytest
 
-from physx_core import checkpoint
+from physx_core import Dataset, checkpoint
 
 pytest.importorskip("torch")
 
@@ -25,10 +25,8 @@ def test_the_pendulum_and_its_commands(block, run, tmp_path):
     (tmp_path / "pendulum.py").write_text(block("README.md", "import numpy as np\nfrom physx_core"))
     run("pendulum.py")
     assert (tmp_path / "sessions/pendulum/dataset/dataset.json").exists()
-    for command in block("README.md", "physx generate").replace("\\\n", " ").splitlines():
-        words = shlex.split(command, comments=True)
-        assert words[0] == "physx"
-        run("-m", "physx_core", *words[1:])
+    for words in commands(block("README.md", "physx generate")):
+        run("-m", "physx_core", *words)
     assert (tmp_path / "pendulum.parquet").exists()
 
 
@@ -74,6 +72,27 @@ def test_environments_of_gymnasium(block, run, tmp_path):
     check = "\nenv.reset(seed=0)\nmany.reset(seed=0)\nmany.close()\n"
     (tmp_path / "robots.py").write_text(f"if __name__ == '__main__':\n{_indent(code + check)}")
     run("robots.py")
+
+
+def test_learning_while_simulating(root, run, tmp_path):
+    text = (root / "docs/online.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.M | re.S)
+    program = "\n".join(code for language, code in blocks if language == "python")
+    (tmp_path / "spring.py").write_text(program)
+    assert "1000 samples of 50 simulations" in run("spring.py").stdout
+    with Dataset.open(tmp_path / "sessions/edges") as dataset:
+        assert set(dataset["parameters"]["stiffness"][:]) == {10.0, 40.0}
+    for words in commands("".join(code for language, code in blocks if not language)):
+        run("-m", "physx_core", *words)
+    assert (tmp_path / "sessions/springs/network").exists()
+
+
+def commands(code):
+    """Return the words after "physx" of each command of a block."""
+    lines = code.replace("\\\n", " ").splitlines()
+    found = [shlex.split(line, comments=True) for line in lines]
+    assert {words[0] for words in found} == {"physx"}
+    return [words[1:] for words in found]
 
 
 def _indent(code):

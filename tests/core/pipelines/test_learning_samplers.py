@@ -22,7 +22,7 @@ from physx_core.errors import ConfigError, UsageError
 from physx_core.toy import LeastSquares
 
 ENVS = Path(__file__).parents[1] / "programs" / "parameter_envs.py"
-PROGRAM = ENVS.with_name("active_run.py")
+PROGRAM = ENVS.with_name("online_run.py")
 SWING, HARD = f"{ENVS}:Swing", f"{ENVS}:Hard"
 
 
@@ -151,8 +151,10 @@ def kept(folder, name):
 
 
 def survives(run_killed, folder, seed, kills, words):
+    where, buffer = words
+
     def killed(name, moments):
-        return run_killed(str(PROGRAM), folder, moments, name, *words)
+        return run_killed(str(PROGRAM), folder, moments, name, where, "once", buffer, "active")
 
     began = time.monotonic()
     killed("whole", [])

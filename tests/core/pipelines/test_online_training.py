@@ -302,7 +302,7 @@ def survives(run_killed, random, kills, words):
     """Check trainings that are killed at random moments, so often in all, against a whole one."""
 
     def killed(name, moments):
-        return run_killed(str(PROGRAM), Path.cwd(), moments, name, *words)
+        return run_killed(str(PROGRAM), Path.cwd(), moments, name, *words, "sobol")
 
     began = time.monotonic()
     killed("whole", [])

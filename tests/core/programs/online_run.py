@@ -1,7 +1,7 @@
 """A training whose environments generate while it learns, to be killed and resumed.
 
 Arguments: name of the session, "clients" or "local", whether environments generate in every epoch
-("always") or "once", and the buffer. It resumes the session if there is one.
+("always") or "once", the buffer, and the sampler. It resumes the session if there is one.
 """
 
 from __future__ import annotations
@@ -23,10 +23,14 @@ class Descending(LeastSquares):
         self._network.weights = self._network.weights - 0.02 * self._rows.T @ error
 
 
-def training(name, over_tcp, always, online):
+SAMPLERS = {"sobol": {}, "active": {"delay": 1, "memory": 30}}
+
+
+def training(name, over_tcp, always, online, sampler):
     environment = EnvironmentConfig(
         APPRENTICE,
-        sampler="physx/sobol",
+        sampler=f"physx/{sampler}",
+        sampler_kwargs=SAMPLERS[sampler],
         env_kwargs={"delay": 0.004, "refuse": 5},
         as_tcp_ip_client=over_tcp,
         always_produce=always,
@@ -54,5 +58,5 @@ def training(name, over_tcp, always, online):
 
 
 if __name__ == "__main__":
-    name, where, how_often, buffer = sys.argv[1:]
-    training(name, where == "clients", how_often == "always", buffer).execute()
+    name, where, how_often, buffer, sampler = sys.argv[1:]
+    training(name, where == "clients", how_often == "always", buffer, sampler).execute()

@@ -63,7 +63,8 @@ class Feeder(Generic[T]):
     made before it were taken, and the training is done with them.
 
     Attributes:
-        waited: Time in s for which nothing was made because there was no room for it.
+        waited: Time in s for which nothing was made because there was no room for it; an item of
+            count 0 is not missed.
     """
 
     def __init__(self) -> None:
@@ -188,8 +189,8 @@ class Feeder(Generic[T]):
                     self._wait_until(lambda: self._counts)
                     began = time.monotonic()
                     self._wait_until(self._has_room)
-                    self.waited += time.monotonic() - began
                     count = self._counts.popleft()
+                    self.waited += time.monotonic() - began if count else 0.0
                 item = self._make(count)
                 with self._changed:
                     self._items += 1
