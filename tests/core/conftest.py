@@ -224,7 +224,8 @@ def port():
 def run_killed(nothing_stays_behind):
     """Return a function that runs a program to its end, but kills it after each of some times in s.
 
-    It takes the program, the folder, the times, and arguments; it returns how many were killed.
+    It takes the program, the folder, the times, and arguments; it returns how many were killed, and
+    how long the last one ran, in s.
     """
     runners = {}
 
@@ -237,11 +238,12 @@ def run_killed(nothing_stays_behind):
             assert runners[program].stdout.readline() == "ready\n"
         for kills, moment in enumerate([*moments, None]):
             words_of_run = json.dumps([str(folder), moment, *words])
+            began = time.monotonic()
             print(words_of_run, file=runners[program].stdin, flush=True)
             status = int(runners[program].stdout.readline())
             if status != -signal.SIGKILL:
                 assert not status
-                return kills
+                return kills, time.monotonic() - began
         return None
 
     yield run
