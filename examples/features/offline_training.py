@@ -1,11 +1,14 @@
 """A network learns from an existing dataset; no environment runs.
 
-    python examples/features/offline_training.py
+    python examples/features/offline_training.py [--rerun]
 
-Prints the loss at the end, and that the dataset's own session is only read.
+Prints the loss at the end, and that the dataset's own session is only read. With --rerun, the
+session gets a file for the Rerun viewer, with curves, histograms and predictions.
 """
 
 from __future__ import annotations
+
+import sys
 
 from cloud import NETWORK
 from single_environment import generate
@@ -22,6 +25,8 @@ def train(epochs: int, session_name: str) -> Training:
         epoch_nb=epochs,
         batch_size=32,
         seed=0,
+        statistics=["rerun"] if "--rerun" in sys.argv else [],
+        histograms_every=1,
     )
     training.execute()
     return training

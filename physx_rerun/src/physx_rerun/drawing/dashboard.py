@@ -21,6 +21,7 @@ _BINS = 30
 _LEGEND = 8  # largest number of names in a plot's legend
 _POINTS = 2000  # largest number of predicted values that are shown of a field
 _FIELDS, _PREDICTIONS = "fields", "predictions"
+_RUN = "run"
 _LOSSES, _RATE = ("loss per epoch", "loss per batch"), "learning rate"
 _QUANTILES = {"q05": "5 %", "q95": "95 %"}
 _ONLINE = {
@@ -170,7 +171,7 @@ class Dashboard:
     def note(self, text: str, times: Times) -> None:
         """Add a line to the notes."""
         self._rows.add_archetype("run/notes", rr.TextLog(text), times)
-        self._add_tab("run", rrb.TextLogView(origin="run/notes", name="notes"), "notes")
+        self._add_tab(_RUN, rrb.TextLogView(origin="run/notes", name="notes"), "notes")
 
     def describe(self, configuration: str) -> None:
         """Show the configuration of the run, a text in TOML, and make it the run's properties."""
@@ -180,7 +181,7 @@ class Dashboard:
         properties: dict[str, Any] = dict(_flatten(tomllib.loads(configuration)))
         self._rows.add_static("__properties/configuration", rr.AnyValues(**properties))
         view = rrb.TextDocumentView(origin="run/configuration", name="configuration")
-        self._add_tab("run", view, "configuration")
+        self._add_tab(_RUN, view, "configuration")
 
     # The windows ----------------------------------------------------------------------------
 
@@ -194,8 +195,10 @@ class Dashboard:
             if title not in first:
                 groups.setdefault(title.partition(": ")[0], []).append(self._view(title))
         for group, tabs in self._tabs.items():
-            if group != _PREDICTIONS and self._known:
+            if group not in (_PREDICTIONS, _RUN):
                 groups.setdefault(group, []).extend(tabs.values())
+        if self._known:
+            groups.setdefault(_RATE, []).extend(self._tabs.get(_RUN, {}).values())
         return [v[0] if len(v) == 1 else rrb.Tabs(*v) for v in groups.values() if v]
 
     def _view(self, title: str) -> rrb.View:

@@ -297,14 +297,13 @@ class Learner:
     def compare(self, batch: Batch) -> tuple[Batch, Batch]:
         """Return the predictions for a batch, between two optimization steps, and their truth.
 
-        Only fields are returned of which the batch has the truth.
+        Both are by the names of the true fields; what has no truth of its shape is left out.
         """
-        predicted = self.predict_in_training(batch)
-        network = self.network
-        names = dict(zip(network.pred_fields, network.opt_fields, strict=False))
-        truth = {name: batch[names[name]] for name in predicted if names.get(name) in batch}
-        known = [name for name, array in truth.items() if array.shape == predicted[name].shape]
-        return {name: predicted[name] for name in known}, {name: truth[name] for name in known}
+        network, answer = self.network, self.predict_in_training(batch)
+        pairs = zip(network.opt_fields, network.pred_fields, strict=False)
+        predicted = {true: answer[name] for true, name in pairs if true in batch}
+        same = [name for name, array in predicted.items() if array.shape == batch[name].shape]
+        return {name: predicted[name] for name in same}, {name: batch[name] for name in same}
 
     def predict(self, batch: Batch) -> Batch:
         """Return the prediction for a batch, both in physical units.
