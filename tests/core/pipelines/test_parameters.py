@@ -10,6 +10,7 @@ import pytest
 from physx_core import (
     DataGeneration,
     Dataset,
+    DatasetConfig,
     EnvironmentConfig,
     NetworkConfig,
     Parameter,
@@ -20,6 +21,7 @@ from physx_core.cli import main
 from physx_core.components import Environment, Sampler
 from physx_core.errors import (
     ConfigError,
+    DatasetError,
     EnvironmentFailedError,
     FieldsMismatchError,
     UnknownOptionError,
@@ -31,12 +33,18 @@ SWING = f"{ENVS}:Swing"
 
 
 def generate(folder, *, clients=True, batch_nb=4, batch_size=10, kwargs=None, **options):
+    of_run = {name: options.pop(name) for name in ("mode", "new_session") if name in options}
     settings = {"num_clients": 2, "seed": 3, "as_tcp_ip_client": clients, **options}
     config = EnvironmentConfig(
         settings.pop("environment", SWING), env_kwargs=kwargs or {}, **settings
     )
     run = DataGeneration(
-        config, session_dir=str(folder), batch_nb=batch_nb, batch_size=batch_size, quiet=True
+        config,
+        session_dir=str(folder),
+        batch_nb=batch_nb,
+        batch_size=batch_size,
+        quiet=True,
+        **of_run,
     )
     run.execute()
     return run
@@ -291,3 +299,54 @@ def test_options_that_do_not_exist_or_fit_are_errors(tmp_path):
             NetworkConfig("toy/linear"), None, config, session_dir=str(tmp_path),
             session_name=run.session.name, new_session=False, epoch_nb=1, batch_size=2, quiet=True,
         ).execute()  # fmt: skip
+
+
+AGAIN = f"{ENVS}:Again"
+
+
+def replay(folder, existing, *, clients=False, environment=AGAIN, instances=2, **options):
+    config = EnvironmentConfig(
+        environment, num_clients=instances, seed=8, as_tcp_ip_client=clients, load_samples=True,
+        only_first_epoch=False,
+    )  # fmt: skip
+    network = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "noise"})
+    run = Training(
+        network, DatasetConfig(existing_dir=existing, **options), config, batch_size=7, epoch_nb=2,
+        session_dir=str(folder), session_name="replayed", seed=5, quiet=True,
+    )  # fmt: skip
+    run.execute()
+    return run
+
+
+@pytest.mark.parametrize("clients", [False, True])
+def test_a_stored_row_is_replayed_with_the_parameters_that_it_was_made_with(tmp_path, clients):
+    """Also if its run was not the only one, simulations failed, and others replay it."""
+    options = {"clients": False, "redraw": 50, "kwargs": {"fails_above": 35.0}}
+    with pytest.raises(EnvironmentFailedError):  # has sets, but no rows
+        generate(tmp_path, clients=False, kwargs={"fails_above": 0.0}, batch_nb=1)
+    for seed, mode in ((1, "training"), (2, "validation"), (3, "training")):
+        made = generate(tmp_path, mode=mode, seed=seed, new_session=False, **options)
+    sets = content(made, "parameters")
+    run = replay(tmp_path, made.session.path, clients=clients, instances=3)
+    before, after = content(made), content(run)
+    assert before["x"].tobytes() == after["x"].tobytes()
+    assert (after["noise"] == before["noise"] + 2).all()
+    equal(sets, content(run, "parameters"))  # no new ones
+
+
+def test_predictions_replay_with_stored_parameters_too(tmp_path):
+    made = generate(tmp_path, clients=False)
+    run = replay(tmp_path, made.session.path)
+    config = EnvironmentConfig(AGAIN, seed=3, as_tcp_ip_client=False, load_samples=True)
+    Prediction(
+        NetworkConfig(), config, DatasetConfig(existing_dir=made.session.path), quiet=True,
+        session_dir=str(tmp_path), session_name=run.session.name, step_nb=30,
+    ).execute()  # fmt: skip
+
+
+def test_where_it_is_not_known_with_which_parameters_rows_were_made_a_replay_is_refused(tmp_path):
+    made = generate(tmp_path, clients=False, batch_nb=1)
+    with Dataset.open(made.session.path, writable=True) as dataset:
+        dataset.append("training", content(made))  # as another run, without its sets
+    with pytest.raises(DatasetError, match="are of 2 runs, but the parameters .* of 1, so"):
+        replay(tmp_path, made.session.path)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Protocol, TypeAlias
 import numpy as np
 
 from physx_core.components.parameter import Parameter, as_parameters, draw, random_of
+from physx_core.components.sampler import checked
 from physx_core.components.scene import Event, Factory, NullFactory
 from physx_core.errors import (
     ConfigError,
@@ -159,6 +160,7 @@ class Environment:
         self._defined_parameters: list[Parameter] = []
         self._choose_parameters: Choose | None = None
         self._has_begun_episodes = False
+        self._replayed: tuple[int, dict[str, Any]] | None = None  # place of a set, and its values
 
     # What a subclass implements -------------------------------------------------------------
 
@@ -182,6 +184,9 @@ class Environment:
         Called before the first step and by `new_episode`, if `define_parameters` was called. Just
         before it `rng` starts again, from a seed of this episode; so if this method sets the whole
         state, the episode depends on nothing that was before it.
+
+        In a replay of stored samples they are the values that the sample was made with; it is
+        called for each sample of another episode than that before, and `rng` goes on.
 
         Args:
             values: A number for each parameter of shape ``()``, else an array.
@@ -335,8 +340,38 @@ class Environment:
             self.episode_index = self.episode_index if episode is None else episode
             self._reset_with_parameters()
 
+    def replay_episode(self, place: int, values: Mapping[str, Any]) -> None:
+        """Prepare the episode of a stored row with its parameters; physx calls it before the step.
+
+        If the row before was of the same set, nothing is done.
+
+        Args:
+            place: Place of the set in the dataset's record.
+            values: The values of the parameters.
+
+        Raises:
+            ConfigError: If they are other parameters than those that are defined.
+        """
+        self._has_begun_episodes = True
+        if self._replayed is None or self._replayed[0] != place:
+            try:
+                self._replayed = place, checked(self._defined_parameters, values)
+            except ConfigError as error:
+                raise ConfigError(
+                    f"The stored samples cannot be replayed with the parameters that they were "
+                    f"made with: {error}"
+                ) from error
+            self._reset_with_parameters()
+
     def _reset_with_parameters(self) -> None:
-        """Have the parameters of the current episode chosen, and prepare it with them."""
+        """Have the parameters of the current episode chosen, and prepare it with them.
+
+        In a replay they are those of the stored row, and `rng` does not start again, as rows of an
+        episode may come one by one.
+        """
+        if self._replayed is not None:
+            self.reset_parameters(**self._replayed[1])
+            return
         number = self.episode_index * self.instance_nb + self.instance_id - 1
         if self._choose_parameters is not None:
             values = self._choose_parameters(self.episode_index)

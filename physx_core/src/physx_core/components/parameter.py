@@ -22,10 +22,12 @@ SET_FIELDS = (
     Field("set", (), "int64", role="additional"),
     Field("env_id", (), "int32", role="additional"),
     Field("episode", (), "int64", role="additional"),
+    Field("mode_index", (), "int8", role="additional"),
     Field("failed", (), "bool", role="additional"),
 )
 """Fields beside the parameters in the dataset's record of them: number of the set, instance and
-episode that it is for, and whether its simulation failed."""
+episode that it is for, the place of their rows' mode in `physx_core.config.MODES`, and whether its
+simulation failed."""
 
 _DISTRIBUTIONS = ("uniform", "log_uniform", "normal", "integer")
 _TAKEN = {*RESERVED, *(field.name for field in SET_FIELDS)}

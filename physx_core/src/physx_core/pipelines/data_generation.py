@@ -93,9 +93,9 @@ class DataGeneration(NewSessionPipeline):
         With ``record_wrong_samples`` the samples that `check_sample` rejected meanwhile are stored
         too, in the mode "wrong".
         """
-        with record_beside_rows(self.source, self.dataset):
+        with record_beside_rows(self.source, self.dataset, self._mode):
             self.batch = self.source.batch(self.batch_size)
-            store_sets(self.source, self.dataset)
+            store_sets(self.source, self.dataset, self._mode)
             if self.batch_id == 0:
                 self.dataset.define_fields(self._mode, self.source.fields)
                 described = describe_environment(self.environment_config, self._seed)

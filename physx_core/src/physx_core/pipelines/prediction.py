@@ -118,7 +118,7 @@ class Prediction(Pipeline):
     def predict(self) -> None:
         """Step the environments, predict, and apply the predictions to the environments."""
         count = self.source.instance_nb
-        with record_beside_rows(self.source, self.dataset):
+        with record_beside_rows(self.source, self.dataset, "prediction"):
             stored = None if self._stored is None else self._stored.take_cyclic(count)
             self.batch = self.source.batch(count, stored)
             self.prediction = self.learner.predict(self.batch)

@@ -216,7 +216,7 @@ def is_copy(directory: Path) -> bool:
 
 @contextlib.contextmanager
 def record_beside_rows(
-    source: Source, dataset: Dataset | None, earlier: Mapping[int, int] | None = None
+    source: Source, dataset: Dataset | None, mode: str, earlier: Mapping[int, int] | None = None
 ) -> Iterator[None]:
     """Store what a source makes beside the rows of a batch.
 
@@ -229,6 +229,7 @@ def record_beside_rows(
     Args:
         source: Generates the batch.
         dataset: Stores the samples; None: they are discarded.
+        mode: Mode of the batch.
         earlier: Instance to the step of its last row before the batch, if a run was killed before
             it stored what was rejected until then: that is stored first. None: nothing is left.
     """
@@ -239,10 +240,10 @@ def record_beside_rows(
             _store_rejected(source, dataset, earlier)
         source.sets.note_failed()
         with contextlib.suppress(PhysxError):  # the run's own error matters more
-            store_sets(source, dataset)
+            store_sets(source, dataset, mode)
         raise
     _store_rejected(source, dataset, earlier)
-    store_sets(source, dataset)
+    store_sets(source, dataset, mode)
 
 
 def _store_rejected(
@@ -260,12 +261,12 @@ def _store_rejected(
             dataset.append(WRONG, part, checked=True)
 
 
-def store_sets(source: Source, dataset: Dataset | None) -> None:
+def store_sets(source: Source, dataset: Dataset | None, mode: str) -> None:
     """Store the sets of parameters that begin in a source's last batch.
 
     Before its rows, so that rows have their parameters even if the process is killed.
     """
-    sets, failed = source.sets.pop()
+    sets, failed = source.sets.pop(mode)
     if dataset is None or not (sets or failed):
         return
     dataset.define_fields(SETS, source.sets.fields)

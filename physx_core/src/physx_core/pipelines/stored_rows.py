@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from physx_core.dataset import Dataset
 from physx_core.errors import DatasetError, listed
 from physx_core.pipelines.storage import other_samples
+from physx_core.pipelines.stored_sets import StoredSets, has_sets
 from physx_core.typing import Batch
 
 _AHEAD = 1 << 22
@@ -47,6 +48,7 @@ class StoredRows:
                 f"{other_samples(dataset.directory, mode)}"
             )
         self._view = dataset[mode]
+        self._sets = StoredSets(dataset, mode) if has_sets(dataset, mode) else None
         self._rows = np.arange(dataset.num_samples(mode)) if rows is None else rows
         self.count = len(self._rows)
         self._random = random
@@ -61,7 +63,8 @@ class StoredRows:
 
         Returns:
             Their indices in the mode, and the rows: field name to array of shape
-            (rows, *field shape).
+            (rows, *field shape), and the parameters that they were made with, if that is recorded:
+            see `Instance.step`.
         """
         if self._given == len(self._order):
             random = self._random
@@ -72,6 +75,8 @@ class StoredRows:
             self._start, self._stop = first, min(first + max(count, self._ahead), self.count)
             index = self._order[self._start : self._stop]
             self._block = {name: view[index] for name, view in self._view.items()}
+            if self._sets is not None:
+                self._block |= self._sets.of(index, self._block)
         self._given = last
         place = slice(first - self._start, last - self._start)
         return self._order[first:last], {name: rows[place] for name, rows in self._block.items()}

@@ -59,7 +59,8 @@ class Source(ABC):
             size: Number of rows; shape of each array: (size, *field shape).
             stored: Stored rows to replay, field name to array of shape (size, *field shape): the
                 instance that generates row i gets a copy of stored row i as `Environment.sample`,
-                a dictionary of arrays. None: nothing is replayed, and it is None.
+                a dictionary of arrays. None: nothing is replayed, and it is None. Parameters that
+                it was made with may be among them: see `Instance.step`.
 
         Raises:
             WrongSamplesError: If `check_sample` rejects too many consecutive samples.

@@ -32,6 +32,11 @@ from physx_core.plugins import resolve
 from physx_core.rows import RejectedSamples
 from physx_core.typing import Batch, Sample
 
+PARAMETER = "parameters/"
+"""Begins the name of an entry of a stored row with the value of a parameter that it was made with;
+no field has such a name."""
+SET = PARAMETER + "/"
+"""Name of the entry with the place of the set in the dataset's record; -1: it is not known."""
 _STEPPING = ("reset_parameters", "step", "check_sample", "apply_prediction", "close")
 
 
@@ -205,8 +210,10 @@ class Instance:
         """Simulate until `check_sample` accepts a sample; return it without further checks.
 
         Args:
-            stored: A stored row for the environment to replay, or None. It stays the same for all
-                sub-steps, and after a sample that is rejected.
+            stored: A stored row for the environment to replay, or None, with entries `PARAMETER`
+                and `SET` if it is known with which parameters it was made: the environment gets
+                these, if it defines any. It stays the same for all sub-steps, and after a sample
+                that is rejected.
 
         Raises:
             UsageError: If the environment never looks at the stored row.
@@ -215,8 +222,16 @@ class Instance:
             EnvironmentFailedError: If the environment raises.
         """
         environment = self._alive()
+        place, values = -1, {}
+        if stored is not None and SET in stored:
+            place = int(stored[SET])
+            values = {name: stored[name] for name in stored if name.startswith(PARAMETER)}
+            stored = {name: stored[name] for name in stored if name not in values}
         environment.sample = stored
-        if not environment._has_begun_episodes:
+        if place >= 0 and environment._defined_parameters:
+            values = {name.removeprefix(PARAMETER): values[name] for name in values if name != SET}
+            self._call("reset_parameters", environment.replay_episode, place, values)
+        elif not environment._has_begun_episodes:
             self._call("reset_parameters", environment.begin_episodes, self._first_episode)
         wrong = 0
         while True:

@@ -13,7 +13,7 @@ import numpy as np
 from physx_core.components.environment import options_of
 from physx_core.components.parameter import SET_FIELDS, Parameter
 from physx_core.components.sampler import LearningSampler, Sampler, checked
-from physx_core.config import EnvironmentConfig
+from physx_core.config import MODES, EnvironmentConfig
 from physx_core.errors import (
     ClientError,
     ConfigError,
@@ -336,14 +336,18 @@ class ParameterSets:
             for number in [known for known in waiting if known in self.failures]:
                 self._settle(number, waiting)
 
-    def pop(self) -> tuple[Batch, list[int]]:
+    def pop(self, mode: str) -> tuple[Batch, list[int]]:
         """Return and clear what was found last.
+
+        Args:
+            mode: Mode of the rows.
 
         Returns:
             The record of the sets that begin, field name to array; and the places, in the record of
             the whole run, of earlier sets that failed.
         """
-        begun, failed = self._begun, self._failed
+        begun = [{**one, "mode_index": MODES.index(mode)} for one in self._begun]
+        failed = self._failed
         self._begun, self._failed = [], []
         columns = {
             field.name: np.array([one[field.name] for one in begun], field.numpy_dtype)

@@ -28,8 +28,9 @@ class TrainingData:
     has the same fields, is checked like any sample, is trained on, and replaces the stored values
     in the dataset. The row keeps its ``env_id``, ``episode`` and ``step``. A later replay starts
     from the results of the earlier one. Held-back samples and those of the mode "validation" are
-    not replayed. The normalization is computed from the stored rows before the first epoch, and
-    again before each epoch that follows a replay.
+    not replayed. An environment with parameters gets those that the sample was made with, if the
+    dataset has a record of them. The normalization is computed from the stored rows before the
+    first epoch, and again before each epoch that follows a replay.
     """
 
     def __init__(

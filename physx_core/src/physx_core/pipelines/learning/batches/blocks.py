@@ -152,9 +152,9 @@ class Blocks:
 
     def _generate(self, count: int, *, is_whole: bool) -> Batch:
         earlier, self._earlier = self._earlier if is_whole else {}, {}
-        with record_beside_rows(self._source, self._dataset, earlier):
+        with record_beside_rows(self._source, self._dataset, self._mode, earlier):
             rows = self._source.batch(count)
-            store_sets(self._source, self._dataset)
+            store_sets(self._source, self._dataset, self._mode)
             self._dataset.define_fields(self._mode, self._source.fields)
             self._dataset.append(self._mode, rows, checked=True)
         return rows

@@ -54,7 +54,7 @@ class ReplayedBatches:
 
     def next(self) -> Batch:
         """Return what the environments make of the next samples, in physical units."""
-        with record_beside_rows(self.source, self._stored.dataset):
+        with record_beside_rows(self.source, self._stored.dataset, self._stored.mode):
             index, rows = self._rows.take(self._batch_size)
             batch = self.source.batch(len(index), rows)
             made = {name: values for name, values in batch.items() if name not in RESERVED}

@@ -1,0 +1,113 @@
+"""StoredSets: the sets of parameters that stored rows were made with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physx_core.components.parameter import SET_FIELDS
+from physx_core.config import MODES, SETS
+from physx_core.dataset import Dataset
+from physx_core.errors import DatasetError
+from physx_core.typing import Array, Batch, Index
+from physx_core.workers.instance import PARAMETER, SET
+
+_CHUNK = 1 << 20
+_FIRST = 1  # the instance that makes the first row of each run, and begins its first set
+
+
+class StoredSets:
+    """Finds the set of each row by its instance and episode, which begin anew with each run.
+
+    The runs that added rows to a mode, and those that added sets for it, are the same in the same
+    order; a run whose simulations all failed has sets, but no rows.
+    """
+
+    def __init__(self, dataset: Dataset, mode: str) -> None:
+        """Read the record of the sets.
+
+        Args:
+            dataset: Has the rows, and the record in the mode "parameters".
+            mode: The rows' mode.
+
+        Raises:
+            DatasetError: If the runs of rows and sets do not match.
+        """
+        view = dataset[SETS]
+        places = np.flatnonzero(view["mode_index"][:] == MODES.index(mode))
+        record = {name: view[name][:][places] for name in dataset.fields(SETS)}
+        env_id, episode = record["env_id"], record["episode"]
+        runs = _runs(np.flatnonzero(env_id == _FIRST), episode, len(places))
+        has_rows = np.zeros(runs.max(initial=-1) + 1, bool)
+        known = runs >= 0
+        np.logical_or.at(has_rows, runs[known], ~record["failed"][known])
+        known[known] = has_rows[runs[known]]
+        runs = np.where(known, np.cumsum(has_rows)[runs] - 1 if len(has_rows) else -1, -1)
+        self._starts = _first_rows(dataset, mode)
+        if len(self._starts) != has_rows.sum():
+            raise DatasetError(
+                f'The samples of mode "{mode}" in {dataset.directory} are of {len(self._starts)} '
+                f"runs, but the parameters that are recorded for them of {has_rows.sum()}, so it "
+                "is not known with which each was made. Generate them again."
+            )
+        self._values = {name: record[name] for name in record if name not in _OWN}
+        self._base = int(env_id.max(initial=0)) + 1, int(episode.max(initial=0)) + 1
+        keys = self._keys(runs, episode, env_id)
+        keys[~known] = -1
+        self._known, self._places = np.unique(keys, return_index=True)
+
+    def of(self, index: Index, rows: Batch) -> Batch:
+        """Return the parameters of some rows, by entries of a batch that `Instance.step` reads.
+
+        Args:
+            index: Their numbers in the mode.
+            rows: The rows.
+        """
+        runs = np.searchsorted(self._starts, index, "right") - 1
+        keys = self._keys(runs, rows["episode"], rows["env_id"])
+        keys[(rows["episode"] >= self._base[1]) | (rows["env_id"] >= self._base[0])] = -2
+        found = np.minimum(np.searchsorted(self._known, keys), len(self._known) - 1)
+        places = self._places[found]
+        values = {PARAMETER + name: values[places] for name, values in self._values.items()}
+        return {SET: np.where(self._known[found] == keys, places, -1), **values}
+
+    def _keys(self, runs: Index, episode: Array, env_id: Array) -> Index:
+        return (runs * self._base[1] + episode.astype(np.int64)) * self._base[0] + env_id
+
+
+_OWN = {field.name for field in SET_FIELDS}
+
+
+def has_sets(dataset: Dataset, mode: str) -> bool:
+    """Return whether a dataset records with which parameters the rows of a mode were made."""
+    if mode not in MODES or not dataset.num_samples(SETS):
+        return False
+    return bool((dataset[SETS]["mode_index"][:] == MODES.index(mode)).any())
+
+
+def _runs(first: Index, order: Array, count: int) -> Index:
+    """Return the run of each entry, from 0; -1 before the first one.
+
+    Args:
+        first: Places of the entries of the first instance.
+        order: A number of each entry that increases in each run for each instance.
+        count: Number of entries.
+    """
+    begins = np.zeros(count, bool)
+    begins[first[:1]] = True
+    begins[first[1:]] = np.diff(order[first]) <= 0
+    runs: Index = np.cumsum(begins) - 1
+    return runs
+
+
+def _first_rows(dataset: Dataset, mode: str) -> Index:
+    """Return the number of the first row of each run."""
+    view, total = dataset[mode], dataset.num_samples(mode)
+    starts: list[Index] = []
+    last = np.iinfo(np.int64).max
+    for start in range(0, total, _CHUNK):
+        part = slice(start, min(start + _CHUNK, total))
+        rows = np.flatnonzero(view["env_id"][part] == _FIRST)
+        steps = view["step"][part][rows].astype(np.int64)
+        starts.append(start + rows[np.diff(steps, prepend=last) <= 0])
+        last = steps[-1] if len(steps) else last
+    return np.concatenate(starts) if starts else np.zeros(0, np.intp)
