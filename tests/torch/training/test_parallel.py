@@ -24,7 +24,7 @@ pytest.importorskip("torch.distributed")
 SCRIPT = '''
 import os, signal, sys, numpy as np, torch
 from physx_core import (
-    DatasetConfig, Environment, EnvironmentConfig, Field, NetworkConfig, Training)
+    DatasetConfig, Environment, EnvironmentConfig, Field, NetworkConfig, Parameter, Training)
 from physx_core.errors import ConfigError
 from physx_torch import FC, TorchOptimization
 
@@ -74,6 +74,43 @@ class Makes(Environment):
         self.set_training_data(x=x, y=np.sin(x[:2]))
         self.set_additional_data(count=self.count)
         self.count += 1
+
+class Peak(Environment):
+    """A function of two parameters; each row is an episode."""
+
+    def create(self):
+        self.define_parameters([Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0)])
+
+    def init_database(self):
+        self.define_training_fields([Field("x", (3,)), Field("y", (2,))])
+
+    def reset_parameters(self, a, b):
+        self.at = np.array([a, b, 1.0])
+
+    def step(self):
+        if self.step_index:
+            self.new_episode()
+        self.set_training_data(x=self.at, y=10 * np.exp(-8 * np.sum((self.at[:2] - 0.8) ** 2) * np.ones(2)))
+
+def active(batch_size, name, over_tcp=True, kind=Training, **more):
+    peaks = EnvironmentConfig(Peak, num_clients=2, seed=1, as_tcp_ip_client=over_tcp,
+                              sampler="physx/active", sampler_kwargs={"uniform": 0.2})
+    return kind(network(), None, peaks, epoch_nb=1, batch_nb=20, batch_size=batch_size, seed=3,
+                session_name=name, online="physx/reservoir", online_kwargs=RESERVOIR, **more)
+
+class Stops(Training):
+    """Ctrl-C comes to one of the processes."""
+
+    def batch_begin(self):
+        if self.group.rank == 1 and self.batch_id == 11:
+            os.kill(os.getpid(), signal.SIGINT)
+
+def learning():
+    active(5, "active_two").execute()
+    try:
+        active(5, "stopped_two", over_tcp=False, kind=Stops).execute()
+    except KeyboardInterrupt:
+        active(5, "stopped_two", over_tcp=False, resume=True).execute()
 
 def generating(batch_size, name, epochs=2, over_tcp=True, *, always=False, online=None,
                kind=Training, resume=False, **made):
@@ -257,6 +294,20 @@ def test_two_processes_learn_from_environments_of_the_first_as_one_does():
     assert drawn[0].shape == (16, 10)
     failed = read(Path("sessions/fails/network/network_0")).progress
     assert (failed.epoch, failed.batch) == (0, 4)
+
+
+def test_a_sampler_learns_from_the_losses_of_two_processes_as_from_those_of_one():
+    alone()["active"](10, "active", over_tcp=False).execute()
+    status, text = ended(start("learning()"))
+    assert status == 0, text
+    with Dataset.open("sessions/active") as one:
+        expected = {name: one["parameters"][name][:] for name in ("set", "a", "b")}
+    assert np.mean((expected["a"] > 0.5) & (expected["b"] > 0.5)) > 0.4  # it has learned something
+    for name in ("active_two", "stopped_two"):
+        with Dataset.open(f"sessions/{name}") as two:
+            for parameter, values in expected.items():
+                assert np.abs(two["parameters"][parameter][:] - values).max() < 1e-6
+        assert agree("active", name, second=int(name == "stopped_two")), name
 
 
 def test_ctrl_c_at_the_launcher_keeps_a_checkpoint_that_can_be_resumed():

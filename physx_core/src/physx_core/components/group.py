@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from physx_core.typing import Batch
+import numpy as np
+
+from physx_core.typing import Array, Batch
 
 
 class Group:
@@ -38,6 +40,19 @@ class Group:
     def total(self, values: Sequence[float]) -> list[float]:
         """Return the sum of each number over all processes."""
         return list(values)
+
+    def gather(self, values: Array) -> Array:
+        """Return the numbers of all processes, in the order of their ranks.
+
+        Args:
+            values: This process's numbers, shape (n,); n may be another one in each process.
+        """
+        counts = [float(len(values) if rank == self.rank else 0) for rank in range(self.size)]
+        ends = np.cumsum(self.total(counts)).astype(int)
+        end = ends[self.rank]
+        whole = np.zeros(ends[-1])
+        whole[end - len(values) : end] = values
+        return np.array(self.total(whole.tolist()))
 
     def any(self, flag: bool) -> bool:
         """Return whether the flag is set in any process."""

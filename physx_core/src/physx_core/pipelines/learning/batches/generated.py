@@ -9,7 +9,7 @@ import numpy as np
 
 from physx_core import checkpoint
 from physx_core.components.group import Group
-from physx_core.errors import CheckpointError, ConfigError
+from physx_core.errors import CheckpointError
 from physx_core.fields import Field
 from physx_core.pipelines.learning.batches.online import OnlineBatches
 from physx_core.pipelines.learning.batches.sharing import SharedBatches
@@ -30,6 +30,7 @@ class GeneratedBatches:
         source: The environments; None but in the leading process.
         online: Draws the batches; None but in the leading process.
         repeats: Returns whether the environments would generate the same samples again.
+        learns: Whether a sampler learns from the losses of the rows.
     """
 
     def __init__(
@@ -54,14 +55,10 @@ class GeneratedBatches:
             repeats: Returns whether the environments would generate the same samples again.
         """
         self.source, self.online = source, online
-        self._stored, self._ahead, self.repeats = stored, ahead, repeats
+        self._stored, self._group, self._ahead, self.repeats = stored, group, ahead, repeats
         self._names: Sequence[str] = ()
         self._shared: SharedBatches | None = None
-        if self.learns and group.size > 1:
-            raise ConfigError(
-                "A sampler that learns from losses works in one process: leave torchrun out, "
-                'or choose another sampler, for example "physx/sobol".'
-            )
+        self.learns: bool = group.tell(source is not None and source.sets.learns)
         if group.size > 1:
             self._shared = SharedBatches(group, online, source.fields if source else ())
 
@@ -82,10 +79,11 @@ class GeneratedBatches:
         Raises:
             PhysxError: In the leading process, if an environment fails, or rows cannot be stored.
         """
+        names = self._drawn_fields(self._names)
         if self._shared is not None:
-            return self._shared.next(self._names)
+            return self._shared.next(names)
         assert self.online is not None
-        return self.online.next(self._drawn_fields(self._names))
+        return self.online.next(names)
 
     def _drawn_fields(self, names: Sequence[str]) -> Sequence[str]:
         """Return the fields of batches that are drawn: a sampler that learns knows rows by two."""
@@ -96,19 +94,18 @@ class GeneratedBatches:
         """Weight of the last batch if it is this process's share of one; None: it is a whole."""
         return None if self._shared is None else self._shared.weight
 
-    @property
-    def learns(self) -> bool:
-        """Whether a sampler learns from the losses of the rows."""
-        return self.source is not None and self.source.sets.learns
-
     def tell(self, batch: Batch, losses: Array) -> None:
         """Have the sampler learn from the last batch.
 
         Args:
-            batch: The batch.
-            losses: Loss of each row, shape (rows,).
+            batch: The batch, or this process's share of it.
+            losses: Loss of each of its rows, shape (rows,).
         """
-        assert self.source is not None
+        if self._shared is not None:
+            batch = self._shared.whole
+            losses = self._group.gather(losses if self._shared.weight else losses[:0])
+        if self.source is None:
+            return
         episodes = np.asarray(batch["episode"], np.int64)
         numbers = episodes * self.source.instance_nb + batch["env_id"] - 1
         self.source.sets.tell(numbers, losses)

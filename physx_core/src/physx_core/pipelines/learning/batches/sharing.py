@@ -21,6 +21,7 @@ class SharedBatches:
         block: Fields and normalization after the last block; it has no rows.
         number: Number of batches so far.
         weight: Weight of this process's share in the mean over the last batch.
+        whole: The last batch, in the leading process; valid until the next one.
     """
 
     def __init__(self, group: Group, online: OnlineBatches | None, fields: Iterable[Field]) -> None:
@@ -32,6 +33,7 @@ class SharedBatches:
             fields: The environments' fields; empty but in the leading process.
         """
         self.number, self.weight = 0, 1.0
+        self.whole: Batch = {}
         self._group, self._online = group, online
         told = group.tell([field.to_dict() for field in fields])
         self.block = _to_block({"fields": told, "normalization": {}})
@@ -46,11 +48,10 @@ class SharedBatches:
         Raises:
             PhysxError: In the leading process, if an environment fails, or rows cannot be stored.
         """
-        batch: Batch = {}
         changed = None
         if self._online is not None:
             batch = self._online.next(names)
-            batch = {name: batch[name] for name in names if name in batch}
+            self.whole = {name: batch[name] for name in names if name in batch}
             block = self._online.block
             if self._last is None or block.rows:
                 changed = _to_plain(block)
@@ -58,7 +59,7 @@ class SharedBatches:
         changed = self._group.tell(changed)
         if changed is not None:
             self.block = _to_block(changed)
-        share, self.weight = self._group.deal(batch)
+        share, self.weight = self._group.deal(self.whole)
         self.number += 1
         return share
 
