@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from physx_core import (
+    DataGeneration,
     Dataset,
     DatasetConfig,
     EnvironmentConfig,
@@ -24,7 +25,7 @@ from physx_core import (
     checkpoint,
 )
 from physx_core.cli import main
-from physx_core.errors import EnvironmentFailedError
+from physx_core.errors import ConfigError, EnvironmentFailedError
 from physx_core.pipelines import read_drawn_rows
 from physx_core.sources import client_source
 from physx_core.toy import Linear
@@ -288,6 +289,61 @@ def test_an_interrupted_training_is_resumed_while_environments_generate(
     again.execute()
     same(stop.seen + again.seen, whole.seen)
     same(result(again, "stopped"), result(whole, "whole"))
+
+
+def test_other_runs_may_add_to_the_session_of_a_training_whose_samples_are_all_there(
+    nothing_stays_behind,
+):
+    class Ahead(Stopped):
+        def batch_end(self):
+            deadline = time.monotonic() + 60
+            while self.data.dataset.num_samples("training") < 56 and time.monotonic() < deadline:
+                time.sleep(0.01)
+            super().batch_end()
+
+    def add(mode):
+        spring = pupil(False, instances=2, refuse=5, record_wrong_samples=True)
+        DataGeneration(
+            spring, session_name="stopped", new_session=False, batch_nb=2, batch_size=7, mode=mode,
+            quiet=True,
+        ).execute()  # fmt: skip
+
+    config = pupil(delay=0.01, refuse=3, record_wrong_samples=True)
+    whole = training(config, "whole", epoch_nb=1)
+    whole.execute()
+    stop = training(config, "stopped", cls=Ahead, epoch_nb=1)
+    with pytest.raises(KeyboardInterrupt):
+        stop.execute()
+    add("training")
+    add("validation")
+    again = training(config, "stopped", epoch_nb=1, resume=True, validation_every=0)
+    again.execute()
+    same(stop.seen + again.seen, whole.seen)
+    same(again.learner.network.weights, whole.learner.network.weights)
+    rows, expected = stored("stopped")["training"], stored("whole")["training"]
+    same({name: values[:56] for name, values in rows.items()}, expected)
+    assert len(rows["x"]) == 56 + 14
+
+
+@pytest.mark.parametrize("mode", ["training", "validation"])
+def test_a_training_whose_samples_are_not_all_there_resumes_if_no_others_follow_them(mode):
+    config = pupil(False)
+    whole = training(config, "whole", epoch_nb=1)
+    whole.execute()
+    stop = training(config, "stopped", cls=Stopped, epoch_nb=1)
+    with pytest.raises(KeyboardInterrupt):
+        stop.execute()
+    DataGeneration(
+        pupil(False, instances=2), session_name="stopped", new_session=False, batch_nb=2,
+        batch_size=7, mode=mode, quiet=True,
+    ).execute()  # fmt: skip
+    again = training(config, "stopped", epoch_nb=1, resume=True, validation_every=0)
+    if mode == "validation":
+        again.execute()
+        same(stop.seen + again.seen, whole.seen)
+    else:
+        with pytest.raises(ConfigError, match="35 of 56 are there, and other runs have added"):
+            again.execute()
 
 
 def last_checkpoint(name):

@@ -90,7 +90,8 @@ class Peak(Environment):
     def step(self):
         if self.step_index:
             self.new_episode()
-        self.set_training_data(x=self.at, y=10 * np.exp(-8 * np.sum((self.at[:2] - 0.8) ** 2) * np.ones(2)))
+        far = np.sum((self.at[:2] - 0.8) ** 2)
+        self.set_training_data(x=self.at, y=10 * np.exp(-8 * far * np.ones(2)))
 
 def active(batch_size, name, over_tcp=True, kind=Training, **more):
     peaks = EnvironmentConfig(Peak, num_clients=2, seed=1, as_tcp_ip_client=over_tcp,

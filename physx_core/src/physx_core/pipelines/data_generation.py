@@ -19,8 +19,8 @@ from physx_core.pipelines.run_description import (
     describe_samples,
 )
 from physx_core.pipelines.storage import (
-    GENERATION,
     describe_environment,
+    end_generation,
     open_own,
     record_beside_rows,
     store_sets,
@@ -93,13 +93,15 @@ class DataGeneration(NewSessionPipeline):
         With ``record_wrong_samples`` the samples that `check_sample` rejected meanwhile are stored
         too, in the mode "wrong".
         """
+        if self.batch_id == 0:
+            end_generation(self.dataset)
         with record_beside_rows(self.source, self.dataset, self._mode):
             self.batch = self.source.batch(self.batch_size)
             store_sets(self.source, self.dataset, self._mode)
             if self.batch_id == 0:
                 self.dataset.define_fields(self._mode, self.source.fields)
                 described = describe_environment(self.environment_config, self._seed)
-                self.dataset.update_info(**described, **{GENERATION: None})
+                self.dataset.update_info(**described)
             self.dataset.append(self._mode, self.batch, checked=True)
 
     def batch_count(self) -> None:

@@ -23,6 +23,7 @@ from physx_core.pipelines.run_description import (
 )
 from physx_core.pipelines.storage import (
     describe_environment,
+    end_generation,
     open_existing,
     open_own,
     record_beside_rows,
@@ -176,6 +177,7 @@ class Prediction(Pipeline):
         if self.record:
             self.dataset = resources.enter_context(open_own(self.session, config))
             self.dataset.update_info(prediction=describe_environment(environment, seed))
+            end_generation(self.dataset)
         self._record_config(seed)
         self._observe(resources, environment)
         self.source = self._open_source(

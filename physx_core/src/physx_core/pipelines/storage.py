@@ -278,6 +278,22 @@ def store_sets(source: Source, dataset: Dataset | None, mode: str) -> None:
         dataset.update(SETS, index, {"failed": [True] * len(index)})
 
 
+def end_generation(dataset: Dataset) -> None:
+    """Note where the rows of the last training end whose environments generated some.
+
+    Called before another run adds its own, so that the training can still be resumed if it needs no
+    more.
+
+    Args:
+        dataset: The dataset, open for writing.
+    """
+    last = dataset.info.get(GENERATION)
+    if isinstance(last, dict) and last.get("ended") is None:
+        counted = (str(last.get("mode")), WRONG, SETS)
+        ended = [dataset.num_samples(name) for name in counted]
+        dataset.update_info(**{GENERATION: {**last, "ended": ended}})
+
+
 def describe_environment(config: EnvironmentConfig, seed: int) -> dict[str, Any]:
     """Return the description of its samples' environment that a dataset keeps."""
     plain = to_plain(config)

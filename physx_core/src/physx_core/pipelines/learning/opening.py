@@ -225,12 +225,20 @@ class DataOpening:
         self, dataset: Dataset, environment: EnvironmentConfig
     ) -> tuple[Generation, Skip]:
         """Keep what the environments' rows depend on; return those that an earlier run has had."""
-        seed, former, mode = self.progress.seed, self.start.generation, self.start.config.mode
-        now = Generation.begin(dataset, mode, seed, self.buffer.batch_size, self.batch_nb)
+        described = describe_environment(environment, self._seed_of(environment))
+        now = Generation.begin(
+            dataset,
+            self.start.config.mode,
+            self.progress.seed,
+            self.buffer.batch_size,
+            self.batch_nb,
+            described,
+        )
+        former = self.start.generation
         self._generation = former or now
         if former is not None:
-            return former, former.resume(dataset, environment, now)
-        now.start(dataset, **describe_environment(environment, self._seed_of(environment)))
+            return former, former.resume(dataset, environment, now, self.buffer.total)
+        now.start(dataset)
         return now, NOTHING
 
     def _seed_of(self, environment: EnvironmentConfig) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -19,7 +19,6 @@ from physx_core.dataset.store.manifest import to_plain_info
 from physx_core.errors import ConfigError, DatasetNotFoundError
 from physx_core.pipelines.storage import (
     GENERATION,
-    describe_environment,
     is_copy,
     keep_parameters,
     restore_parameters,
@@ -54,8 +53,11 @@ class Generation:
         seed: Seed of the training.
         batch_size: Number of rows in a batch.
         batch_nb: Number of batches in an epoch.
+        environment: Description of the environment: see `describe_environment`.
         depends: Whether the rows depend on the network that learns, by its predictions for an
             environment: then they cannot be generated again.
+        ended: Numbers of rows, rejected samples and sets that the mode and the whole dataset had
+            when another run began to add its own; None: there is none. See `end_generation`.
     """
 
     mode: str
@@ -66,30 +68,38 @@ class Generation:
     seed: int
     batch_size: int
     batch_nb: int | None
+    environment: Mapping[str, Any]
     depends: bool = False
+    ended: Sequence[int] | None = None
 
     @classmethod
     def begin(
-        cls, dataset: Dataset, mode: str, seed: int, batch_size: int, batch_nb: int | None
+        cls,
+        dataset: Dataset,
+        mode: str,
+        seed: int,
+        batch_size: int,
+        batch_nb: int | None,
+        environment: Mapping[str, Any],
     ) -> Self:
         """Return the description of a training that begins now."""
         counted = (mode, WRONG, SETS, "training")
         first, wrong, sets, offset = (dataset.num_samples(name) for name in counted)
-        return cls(mode, first, wrong, sets, offset, seed, batch_size, batch_nb)
+        described = to_plain_info({name: environment.get(name) for name in _SAME})
+        return cls(mode, first, wrong, sets, offset, seed, batch_size, batch_nb, described)
 
-    def start(self, dataset: Dataset, **info: Any) -> None:
-        """Keep it in the dataset, with further information.
-
-        Parameters that environments have saved there are copied.
-        """
+    def start(self, dataset: Dataset) -> None:
+        """Keep it in the dataset, and copy the parameters that environments have saved there."""
         keep_parameters(dataset.directory)
-        self.store(dataset, **info)
+        self.store(dataset)
 
-    def store(self, dataset: Dataset, **info: Any) -> None:
-        """Keep it in the dataset, with further information."""
-        dataset.update_info(**info, **{GENERATION: dataclasses.asdict(self)})
+    def store(self, dataset: Dataset) -> None:
+        """Keep it in the dataset."""
+        dataset.update_info(**{GENERATION: dataclasses.asdict(self)})
 
-    def resume(self, dataset: Dataset, environment: EnvironmentConfig, now: Generation) -> Skip:
+    def resume(
+        self, dataset: Dataset, environment: EnvironmentConfig, now: Generation, needed: int
+    ) -> Skip:
         """Check that a training continues this one, and return the rows that it has had.
 
         The parameters that environments have saved are again those of when it began.
@@ -98,14 +108,14 @@ class Generation:
             dataset: Has the rows.
             environment: The environment.
             now: The description of the training if it began now.
+            needed: Number of rows that the training needs in all.
         """
-        given = to_plain_info(describe_environment(environment, environment.seed or 0))
-        if environment.seed is None:
-            given["seed"] = dataset.info.get("seed")
         before = {"batch_size": self.batch_size, "batch_nb": self.batch_nb, "mode": self.mode}
         after = {"batch_size": now.batch_size, "batch_nb": now.batch_nb, "mode": now.mode}
-        before |= {name: dataset.info.get(name) for name in _SAME}
-        after |= {name: given.get(name) for name in _SAME}
+        before |= {name: self.environment.get(name) for name in _SAME}
+        after |= {name: now.environment.get(name) for name in _SAME}
+        if environment.seed is None:
+            after["seed"] = before["seed"]
         for name, value in after.items():
             if value != before[name]:
                 raise ConfigError(
@@ -113,22 +123,30 @@ class Generation:
                     f"{name} was {before[name]!r} and is {value!r}, so other samples would follow. "
                     "Give the same, or start another training."
                 )
+        ends = now.first, now.first_wrong, now.first_set
+        if self.ended is not None and tuple(self.ended) != ends:
+            ends = (self.ended[0], self.ended[1], self.ended[2])
+            if ends[0] - self.first < needed:
+                raise ConfigError(
+                    f"The training cannot be resumed while environments generate its samples: "
+                    f"{ends[0] - self.first} of {needed} are there, and other runs have added "
+                    f"theirs, so that no more can follow. {_advice(dataset.directory.parent)}"
+                )
         restore_parameters(dataset.directory)
         rejected: tuple[int, ...] = ()
-        if dataset.num_samples(WRONG) > self.first_wrong:
-            numbers = dataset[WRONG]["env_id"][self.first_wrong :]
+        if ends[1] > self.first_wrong:
+            numbers = dataset[WRONG]["env_id"][self.first_wrong : ends[1]]
             found = np.bincount(numbers, minlength=environment.num_clients + 1)
             rejected = tuple(int(count) for count in found[1:])
-        rows = dataset.num_samples(self.mode) - self.first
-        sets = dataset.num_samples(SETS) - self.first_set
+        rows = ends[0] - self.first
         begun = {}
         if rows:
             view = dataset[self.mode]
-            begun = {name: view[name][self.first :] for name in ("env_id", "episode")}
+            begun = {name: view[name][self.first : ends[0]] for name in ("env_id", "episode")}
         recorded = {}
-        if sets:
-            view = dataset[SETS]
-            recorded = {name: view[name][self.first_set :] for name in dataset.fields(SETS)}
+        if ends[2] > self.first_set:
+            view, part = dataset[SETS], slice(self.first_set, ends[2])
+            recorded = {name: view[name][part] for name in dataset.fields(SETS)}
             if environment.record_wrong_samples and recorded["failed"].any():
                 raise ConfigError(
                     "The training cannot be resumed while environments generate its samples, as "
