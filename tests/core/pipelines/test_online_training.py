@@ -408,14 +408,22 @@ def test_the_command_resumes_with_the_environments_of_the_session(capfd, nothing
     same(stored("stopped"), stored("whole"))
 
 
-@pytest.mark.parametrize("how", ["raise", "nan"])
-@pytest.mark.parametrize("over_tcp", [False, True])
+@pytest.mark.parametrize(
+    ("over_tcp", "how", "least"),
+    [
+        (False, "raise", 4),
+        (False, "nan", 4),
+        (True, "raise", 4),
+        (True, "nan", 4),
+        (True, "kill", 2),
+    ],
+)
 def test_simulations_that_failed_before_fail_again_when_their_training_is_resumed(
-    over_tcp, how, nothing_stays_behind
+    over_tcp, how, least, nothing_stays_behind
 ):
     config = EnvironmentConfig(
         f"{PROGRAM.with_name('parameter_envs.py')}:Swing",
-        env_kwargs={"fails_above": 25.0, "how": how},
+        env_kwargs={"fails_above": 34.0 if how == "kill" else 25.0, "how": how},
         as_tcp_ip_client=over_tcp,
         num_clients=2,
         seed=4,
@@ -437,4 +445,4 @@ def test_simulations_that_failed_before_fail_again_when_their_training_is_resume
     again.execute()
     same(stop.seen + again.seen, whole.seen)
     same(stored("stopped"), stored("whole"))
-    assert stored("whole")["parameters"]["failed"].sum() > 3
+    assert stored("whole")["parameters"]["failed"].sum() >= least

@@ -47,7 +47,7 @@ class Skip(NamedTuple):
         rows: Number of rows of all instances together.
         rejected: Number of rejected samples of each instance; empty: none.
         sets: Record of the sets of parameters; empty: none.
-        begun: Fields ``env_id`` and ``episode`` of the rows; empty: not known.
+        begun: Fields ``env_id``, ``episode`` and ``step`` of the rows; empty: not known.
     """
 
     rows: int = 0
@@ -58,6 +58,18 @@ class Skip(NamedTuple):
     def rows_of(self, number: int, instance_nb: int) -> int:
         """Return how many of the rows an instance generated, counted from 1."""
         return (self.rows - number + instance_nb) // instance_nb
+
+    def last_of(self, number: int, episode: int) -> tuple[int, int]:
+        """Return how many rows an instance generated up to the end of an episode.
+
+        Returns:
+            The number of rows, and the step of the last of them, -1 if there is none.
+        """
+        begun = self.begun
+        if not begun:
+            return 0, -1
+        steps = begun["step"][(begun["env_id"] == number) & (begun["episode"] <= episode)]
+        return len(steps), int(steps[-1]) if len(steps) else -1
 
     def rejected_of(self, number: int) -> int:
         """Return how many samples of an instance were rejected."""

@@ -142,7 +142,8 @@ class Generation:
         begun = {}
         if rows:
             view = dataset[self.mode]
-            begun = {name: view[name][self.first : ends[0]] for name in ("env_id", "episode")}
+            names = ("env_id", "episode", "step")
+            begun = {name: view[name][self.first : ends[0]] for name in names}
         recorded = {}
         if ends[2] > self.first_set:
             view, part = dataset[SETS], slice(self.first_set, ends[2])

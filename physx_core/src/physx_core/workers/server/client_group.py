@@ -243,17 +243,14 @@ class ClientGroup:
         return passing and self._restarts[number] < self.config.restarts
 
     def _redraws_after(self, number: int, error: PhysxError | None) -> bool:
-        is_known = getattr(error, "step", -1) >= 0 and not self.config.record_wrong_samples
-        if error is None or (self._repeats(number) and not is_known):
+        is_known = getattr(error, "step", -1) >= 0 or isinstance(error, ClientError)
+        can_repeat = is_known and not self.config.record_wrong_samples
+        if error is None or (self._repeats(number) and not can_repeat):
             return False
         return self._sets.can_redraw(number, error)
 
     def _repeats(self, number: int) -> bool:
-        """Return whether a client failed at a row that an earlier run has had, or may have.
-
-        If it ends without a word, which of them it was making is not known, so no other can go on
-        there with other parameters.
-        """
+        """Return whether a client failed at a row that an earlier run has had, or may have."""
         peer = self.server.peers.get(number)
         had = self._skip.rows_of(number, self.config.num_clients)
         if peer is None or not had:
@@ -296,13 +293,21 @@ class ClientGroup:
 
         A client that ended without a word may have made rows that it did not send. So the same
         parameters are simulated once more, and each row is sent at once: where it ends then depends
-        on the parameters alone.
+        on the parameters alone. If an earlier run has had rows of the next ones, it is known.
         """
-        if isinstance(error, ClientError) and peer.slow_until <= peer.episode:
-            peer.slow_until = peer.episode + 1
-            return "The same parameters are simulated once more, to see where they fail."
-        text = self._sets.redraw(peer.instance_id, peer.episode, error)
-        peer.move_origin(next_step(peer.last_step, error))
+        last_step, row = peer.last_step, None
+        number, had = peer.instance_id, self._skip.rows_of(peer.instance_id, len(self._numbers))
+        if isinstance(error, ClientError):
+            rows, step = self._skip.last_of(number, peer.episode)
+            if rows < had and peer.received <= had:
+                last_step, row = step, rows
+            elif peer.slow_until <= peer.episode:
+                peer.slow_until = peer.episode + 1
+                return "The same parameters are simulated once more, to see where they fail."
+            else:
+                last_step = max(last_step, step)
+        text = self._sets.redraw(number, peer.episode, error)
+        peer.move_origin(next_step(last_step, error), row)
         return text
 
     def _describe_next(self, number: int, left: bool) -> str:

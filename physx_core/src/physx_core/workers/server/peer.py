@@ -128,13 +128,15 @@ class Peer(Connection):
         self.slow_until = former.slow_until
         self._next_order = None if self.journal is None else 0
 
-    def move_origin(self, step: int) -> None:
-        """Have a client that takes its place begin with the next episode, at the next row.
+    def move_origin(self, step: int, row: int | None = None) -> None:
+        """Have a client that takes its place begin with the next episode.
 
         Args:
             step: Number of its first step.
+            row: Its first row; None: the one after those that arrived, or that could not be made.
         """
-        row = self.received if self.failure is None else self.failed_row
+        if row is None:
+            row = self.received if self.failure is None else self.failed_row
         self.origin = Origin(row, self.rejected.count, self.shown, step, self.episode + 1)
         if self.journal is not None:
             self.journal.close()
