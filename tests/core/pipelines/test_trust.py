@@ -6,6 +6,7 @@ import subprocess
 import sys
 import zipfile
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from physx_core import (
     checkpoint,
     plugins,
 )
+from physx_core.checkpoint.description import END
 from physx_core.cli import main
 from physx_core.components import Network, Transformation
 from physx_core.errors import (
@@ -77,10 +79,10 @@ def session(network="toy/linear", **kwargs):
 
 def edit(text_of):
     """Let the description of the checkpoint be another one, with a valid checksum."""
-    path = checkpoint.find(checkpoint.Path("sessions/training"), "network", -1).path
+    path = checkpoint.find(Path("sessions/training"), "network", -1).path
     file = path / checkpoint.DESCRIPTION
     body = text_of(file.read_text().rpartition("\n[checksum]")[0]).encode()
-    file.write_bytes(body + checkpoint._END.format(zlib.crc32(body)).encode())
+    file.write_bytes(body + END.format(zlib.crc32(body)).encode())
 
 
 def name_in_dataset(folder, **info):

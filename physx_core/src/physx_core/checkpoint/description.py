@@ -1,0 +1,111 @@
+"""What a checkpoint consists of, and what its files and folders are called."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from zlib_ng.zlib_ng import crc32
+
+from physx_core import files
+from physx_core.fields import Field
+from physx_core.statistics import Normalization
+
+FORMAT_VERSION = 2
+"""Version of the description; version 1 has no checksums."""
+NAME = "network"
+"""Name of the checkpoints unless another one is given."""
+BEST = "best"
+DESCRIPTION = "checkpoint.toml"
+BUFFER = "buffer.bin"
+"""File with the state of the buffer that draws the batches: whole numbers of 8 bytes."""
+WHOLE = np.dtype("<i8")
+SAMPLER = "sampler.bin"
+"""File with the state of the sampler that learns from the training: numbers of 8 bytes."""
+REAL = np.dtype("<f8")
+KEPT = (
+    "network",
+    "network_kwargs",
+    "transformation",
+    "transformation_kwargs",
+    "data_type",
+)
+LARGEST = 2**28
+END = '\n[checksum]\ncrc32 = "{:08x}"\n'
+NUMBER = "(0|[1-9][0-9]*)"
+ADVICE = "Restore it from a copy, or use another checkpoint."
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Progress of a training when its checkpoint was written.
+
+    Attributes:
+        epoch: Number of finished epochs.
+        batch: Number of finished batches of the next epoch.
+        batches_read: Number of batches read from the dataset, in all epochs.
+        seed: Seed of the training.
+        blocks: Number of batches whose rows environments generated.
+        best: State of `BestEpoch`.
+        record: State of `TrainingRecord`.
+    """
+
+    epoch: int
+    batch: int
+    batches_read: int
+    seed: int
+    blocks: int = 0
+    best: dict[str, Any] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Description of a checkpoint.
+
+    Attributes:
+        path: The checkpoint's folder.
+        network: References and arguments of network and transformation, as in `NetworkConfig`.
+        fields: The network's input and target fields by name.
+        normalization: Their normalization by name; empty if nothing was normalized.
+        progress: Progress of the training.
+        crc: CRC-32 of the description.
+        notice: Which later checkpoints it stands in for, and why; empty if it is what was asked
+            for.
+    """
+
+    path: Path
+    network: dict[str, Any]
+    fields: dict[str, Field]
+    normalization: dict[str, Normalization]
+    progress: Progress
+    crc: int
+    notice: str = ""
+
+
+class UnreadableError(Exception):
+    """A checkpoint cannot be read, for the given reason, which is a sentence without its end."""
+
+    def __init__(self, reason: str, advice: str = ADVICE) -> None:
+        super().__init__(reason)
+        self.advice = advice
+
+
+def partial_path(path: Path) -> Path:
+    """Return where a checkpoint is while it is written or removed."""
+    return path.parent / f".{path.name}.partial"
+
+
+def former_path(path: Path) -> Path:
+    """Return where a checkpoint is while another one takes its name."""
+    return path.parent / f".{path.name}.former"
+
+
+def measure(path: Path) -> dict[str, Any]:
+    """Return the size and the checksum of a file, as they are described."""
+    nbytes = crc = 0
+    for block in files.read_blocks(path):
+        nbytes, crc = nbytes + len(block), crc32(block, crc)
+    return {"nbytes": nbytes, "crc32": f"{crc:08x}"}
