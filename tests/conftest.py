@@ -4,12 +4,17 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 import uuid
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+# Else each of the thousands of interpreters that tests start compiles all of physx again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # How long an example takes says nothing on a busy machine.
 settings.register_profile("physx", deadline=None, suppress_health_check=[HealthCheck.too_slow])

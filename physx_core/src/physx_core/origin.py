@@ -12,7 +12,6 @@ import re
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import urlsplit, urlunsplit
-from urllib.request import url2pathname
 
 _CORE = "physx-core"
 
@@ -74,6 +73,8 @@ def _place(where: dict[str, Any], distribution: str, named: str) -> str | None:
 
 
 def _local(url: str) -> Path:
+    from urllib.request import url2pathname  # it imports all of http and ssl
+
     return Path(url2pathname(urlsplit(url).path))
 
 

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from statistics import NormalDist
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
 from physx_core.errors import ConfigError
 from physx_core.fields import RESERVED, Field
 from physx_core.typing import Array
+
+if TYPE_CHECKING:
+    from statistics import NormalDist
 
 Distribution: TypeAlias = Literal["uniform", "log_uniform", "normal", "integer"]
 
@@ -32,7 +35,6 @@ simulation failed."""
 _DISTRIBUTIONS = ("uniform", "log_uniform", "normal", "integer")
 _TAKEN = {*RESERVED, *(field.name for field in SET_FIELDS)}
 _MOST_ELEMENTS = 2**16
-_STANDARD = NormalDist()
 _SMALLEST = 2.0**-53  # a normal distribution has no quantile of 0
 
 Point: TypeAlias = Array
@@ -168,10 +170,10 @@ class Parameter:
         mean, deviation = self.mean[element], self.deviation[element]
         low = None if self.low is None else self.low[element]
         high = None if self.high is None else self.high[element]
-        below = 0.0 if low is None else _STANDARD.cdf((low - mean) / deviation)
-        above = 1.0 if high is None else _STANDARD.cdf((high - mean) / deviation)
+        below = 0.0 if low is None else _standard().cdf((low - mean) / deviation)
+        above = 1.0 if high is None else _standard().cdf((high - mean) / deviation)
         inside = min(max(below + share * (above - below), _SMALLEST), 1 - _SMALLEST)
-        value: float = mean + deviation * _STANDARD.inv_cdf(inside)
+        value: float = mean + deviation * _standard().inv_cdf(inside)
         value = value if low is None else max(value, low)
         return value if high is None else min(value, high)
 
@@ -203,7 +205,7 @@ class Parameter:
         inside, below, above = (
             bound
             if number is None
-            else _STANDARD.cdf((number - self.mean[element]) / self.deviation[element])
+            else _standard().cdf((number - self.mean[element]) / self.deviation[element])
             for number, bound in (
                 (value, 0.5),
                 (None if self.low is None else self.low[element], 0.0),
@@ -295,3 +297,10 @@ def draw(
     """
     size = sum(parameter.size for parameter in parameters)
     return values_at(parameters, random_of(entropy, number, 1).random(size))
+
+
+@functools.cache
+def _standard() -> NormalDist:
+    from statistics import NormalDist  # it imports decimal and fractions
+
+    return NormalDist()

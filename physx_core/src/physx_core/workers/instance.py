@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import traceback
 import warnings
@@ -357,6 +356,8 @@ def _warn_of_misspelt_methods(cls: type[Environment]) -> None:
     optional = ("init_visualization", "check_sample", "apply_prediction", "reset_parameters")
     for method in optional:
         if getattr(cls, method) is getattr(Environment, method):
+            import difflib
+
             for name in difflib.get_close_matches(method, own, n=1, cutoff=0.85):
                 warnings.warn(
                     f"physx does not call {cls.__name__}.{name}(). Did you mean {method}()?",
