@@ -63,6 +63,13 @@ class Plain(Environment):
         pass
 
 
+class Unhurried(Plain):
+    """Leaves the processor to others most of the time."""
+
+    def act(self):
+        time.sleep(0.002)
+
+
 class Trouble(Plain):
     """Does something bad in one method of one instance, at one step."""
 

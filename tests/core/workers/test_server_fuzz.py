@@ -80,7 +80,7 @@ class WhileAttacked(DataGeneration):
 
 @pytest.mark.parametrize("frames", COUNTS)
 def test_frames_of_strangers_do_not_disturb_a_generation(rogue, port, frames, record_property):
-    config = EnvironmentConfig(f"{ENVS}:Plain", num_clients=2, port=port, seed=1, timeout=20.0)
+    config = EnvironmentConfig(f"{ENVS}:Unhurried", num_clients=2, port=port, seed=1, timeout=20.0)
     with WhileAttacked(config, batch_nb=1, batch_size=16) as pipeline:
         pipeline.attacked_by(rogue(port, 0, frames, seed=frames))
         pipeline.execute()
