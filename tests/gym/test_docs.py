@@ -14,6 +14,8 @@ import pytest
 from physx_core.config import read_toml
 from physx_gym import RobotEnv, read_log
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "gym.md"
 README = ROOT / "physx_gym" / "README.md"

@@ -13,6 +13,8 @@ from physx_core.errors import WrongSamplesError
 from physx_gym import Policy
 from physx_gym.cli import evaluate
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("torch")
 
 
@@ -137,7 +139,6 @@ def test_a_step_that_diverges_is_refused(beam, tmp_path, monkeypatch):
         DataGeneration(config, session_dir=str(tmp_path), batch_nb=1, batch_size=1).execute()
 
 
-@pytest.mark.slow
 def test_the_beam_is_learned_and_compared(root, run, tmp_path):
     pytest.importorskip("felupe", reason="needs felupe, which solves the beam")
     pytest.importorskip("rerun", reason="needs physx-rerun for the recording")
@@ -150,7 +151,6 @@ def test_the_beam_is_learned_and_compared(root, run, tmp_path):
 # Operators ------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("problem", "library", "network"),
     [

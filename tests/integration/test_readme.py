@@ -7,6 +7,8 @@ import pytest
 
 from physx_core import Dataset, checkpoint
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("torch")
 
 

@@ -372,6 +372,7 @@ def survives(run_killed, random, kills, words):
             return
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [
@@ -408,6 +409,7 @@ def test_the_command_resumes_with_the_environments_of_the_session(capfd, nothing
     same(stored("stopped"), stored("whole"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("over_tcp", "how", "least"),
     [

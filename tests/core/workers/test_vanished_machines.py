@@ -44,6 +44,7 @@ def test_the_system_probes_an_idle_connection_and_gives_it_up_in_time():
         prepare_connection(one)  # it is not TCP
 
 
+@pytest.mark.slow
 @pytest.mark.faults
 def test_a_peer_that_reads_nothing_for_a_while_is_alive():
     with connected() as (near, far):
@@ -62,6 +63,7 @@ def test_a_peer_that_reads_nothing_for_a_while_is_alive():
         assert poll_peer(poll, near, SOON)
 
 
+@pytest.mark.slow
 @pytest.mark.faults
 def test_a_client_that_is_unplugged_is_replaced_and_the_rows_are_the_same(
     local, clients, another_machine, monkeypatch, port, caplog

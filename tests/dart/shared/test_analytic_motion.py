@@ -43,6 +43,7 @@ def test_a_symmetric_body_precesses_at_its_rate(backend):
         np.testing.assert_allclose(simulation.velocities()[3:], expected, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 def test_a_tumbling_body_keeps_its_energy_for_ten_seconds(backend, integrator):
     """About the middle axis it turns over again and again."""

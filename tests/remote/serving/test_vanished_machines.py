@@ -90,6 +90,7 @@ def next_client(protocol, address):
             time.sleep(0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.faults
 def test_whoever_is_unplugged_keeps_no_place_and_no_client_waiting(serve, far, another_machine):
     each = [(p, what) for p in ("physx", "godot-gym") for what in ("idle", "busy", "waiting")]

@@ -19,6 +19,8 @@ from physx_core import Dataset
 from physx_core.checkpoint import read
 from physx_core.pipelines import read_drawn_rows
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("torch.distributed")
 
 SCRIPT = '''
