@@ -286,8 +286,9 @@ def test_statistics_summarize_the_rows_that_were_generated(online, capsys):
     main(["stats", str(path)])
     said = capsys.readouterr().out.splitlines()
     line = next(line for line in said if line.startswith("x/0"))
-    assert line.split()[1] == f"{of_x['fields/x/0/mean'][-1]:.4g}"
-    assert any(line.split() == ["field", "mean", "std", "q05", "median", "q95"] for line in said)
+    assert line.split()[1::5] == [f"{of_x['fields/x/0/mean'][-1]:.4g}", "m"]
+    head = ["field", "mean", "std", "q05", "median", "q95", "unit"]
+    assert any(line.split() == head for line in said)
 
 
 def test_statistics_say_how_the_buffer_and_both_sides_are_doing(capfd):

@@ -20,7 +20,7 @@ class Drawn(Environment):
         self.count = 0
 
     def init_database(self):
-        self.define_training_fields([Field("x", shape=(3,)), Field("y", shape=(2,))])
+        self.define_training_fields([Field("x", shape=(3,), unit="m"), Field("y", shape=(2,))])
         self.define_additional_fields(
             [Field("number", shape=(), dtype="int64"), Field("grid", shape=(20, 20))]
         )

@@ -15,7 +15,8 @@ from typing import Annotated
 import tyro
 
 from physx_core.cli.output import show, show_table, width
-from physx_core.errors import MissingLibraryError, SessionError
+from physx_core.dataset import Dataset
+from physx_core.errors import DatasetError, MissingLibraryError, SessionError
 from physx_core.observers import FIELDS, read_scalars
 from physx_core.processes import ChildProcess
 
@@ -59,18 +60,31 @@ def run(words: Sequence[str]) -> None:
     show_table((*head, ""), rows, numbers=numbers, curve="")
     if of_rows:
         show()
-        _show_rows(of_rows)
+        _show_rows(of_rows, _units(Path(options.session)))
 
 
-def _show_rows(numbers: Mapping[str, Mapping[int, float]]) -> None:
+def _units(session: Path) -> dict[str, str]:
+    """Return the units of the fields in the session's dataset; none if it cannot be read."""
+    try:
+        with Dataset.open(session) as dataset:
+            fields = [of for mode in dataset.modes for of in dataset.fields(mode).values()]
+    except DatasetError:
+        return {}
+    return {of.name: of.unit for of in fields}
+
+
+def _show_rows(numbers: Mapping[str, Mapping[int, float]], units: Mapping[str, str]) -> None:
     """Print the last statistics of the rows that environments generated, by field."""
     table: dict[str, dict[str, str]] = {}
     for name, steps in numbers.items():
         of, _, figure = name.removeprefix(_ROWS).rpartition("/")
         table.setdefault(of, {})[figure] = f"{list(steps.values())[-1]:.4g}"
     figures = list(dict.fromkeys(figure for values in table.values() for figure in values))
-    rows = [(of, *(values.get(name, "") for name in figures)) for of, values in table.items()]
-    show_table(("field", *figures), rows, numbers=figures)
+    rows = [
+        (of, *(values.get(name, "") for name in figures), units.get(of.partition("/")[0], ""))
+        for of, values in table.items()
+    ]
+    show_table(("field", *figures, "unit"), rows, numbers=figures)
 
 
 def _line(timeline: str, name: str, values: list[float]) -> tuple[str, ...]:
