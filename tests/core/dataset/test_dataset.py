@@ -174,7 +174,8 @@ def test_unknown_names_list_the_known_ones(dataset):
         dataset["training"]["positon"]
     assert "positon" not in dataset["training"] and len(dataset["training"]) == 1
     with pytest.raises(DatasetError, match="Modes: training"):
-        dataset.num_samples("validation")
+        dataset["validation"]
+    assert dataset.num_samples("validation") == 0
 
 
 # Normalization --------------------------------------------------------------------------------
