@@ -282,7 +282,7 @@ def test_the_command_replays_what_a_session_holds_and_draws_it():
     assert main([*words, *viewer]) == 0
     drawn = Path("sessions/replay/drawn.txt").read_text().splitlines()
     assert sorted(line for line in drawn if "view" not in line)[-6:] == [
-        f"{number} {step} mass spring" for number in (1, 2) for step in range(3)
+        f"{number} {step} mass spring time" for number in (1, 2) for step in range(3)
     ]
     assert main([*words, "toy/spring", *viewer, "--environment.num-clients", "1"]) == 0
     assert "num_clients = 1" in Path("sessions/replay_1/config.toml").read_text()
