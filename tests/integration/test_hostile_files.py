@@ -413,7 +413,7 @@ def npy(array, shape=None):
 
 
 def archive(place, members, compression=zipfile.ZIP_DEFLATED):
-    with zipfile.ZipFile(place.here / "file", "w", compression) as file:
+    with zipfile.ZipFile(place.here / "file", "w", compression, compresslevel=1) as file:
         for name, content in members.items():
             with file.open(name, "w", force_zip64=True) as member:
                 for part in [content] if isinstance(content, bytes) else content:
@@ -423,8 +423,7 @@ def archive(place, members, compression=zipfile.ZIP_DEFLATED):
 
 @hostile("npz", "max-bytes")
 def unpacks_to_four_gigabytes(place):
-    start = npy(np.empty(0), (2**29,))
-    return archive(place, {"x.npy": (start, *(bytes(2**24) for _ in range(2**8)))})
+    return archive(place, {"x.npy": (npy(np.empty(0), (2**29,)), *[bytes(2**24)] * 2**8)})
 
 
 @hostile("npz", "does not match its checksum")

@@ -66,7 +66,10 @@ def revealed(tmp_path_factory):
     file = folder / "program.py"
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
     done = subprocess.run(
-        [sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent", file],
+        [
+            *(sys.executable, "-m", "mypy", "--strict", "--follow-imports=silent"),
+            *("--cache-dir", ROOT / ".mypy_cache" / "faces", file),
+        ],
         cwd=folder,
         env={"MYPYPATH": ":".join(map(str, sources)), "PATH": ""},
         capture_output=True,
