@@ -15,9 +15,11 @@ from __future__ import annotations
 
 from physx_core.checkpoint.description import (
     BEST,
+    BUFFER,
     DESCRIPTION,
     FORMAT_VERSION,
     NAME,
+    SAMPLER,
     Checkpoint,
     Progress,
 )
@@ -35,9 +37,11 @@ from physx_core.checkpoint.writing import check_session, rehearse, remove, save
 
 __all__ = [
     "BEST",
+    "BUFFER",
     "DESCRIPTION",
     "FORMAT_VERSION",
     "NAME",
+    "SAMPLER",
     "Checkpoint",
     "Progress",
     "check_session",
