@@ -58,6 +58,8 @@ def test_a_picture_of_a_dataset(tmp_path, monkeypatch):
         dataset.append("training", {"cloud": np.random.default_rng(0).random((4, 9, 3))})
     snapshot.run(["data", "--at", "2", *SIZE])
     assert Image.open("data.png").size == (320, 200)
+    note = np.asarray(Image.open("data.png").convert("L"))[2:30, 100:310]
+    assert (note > 150).mean() < 0.05  # nothing of the viewer's own is shown over it
     assert {path.name for path in tmp_path.iterdir()} == {"data", "data.png"}
 
 

@@ -19,6 +19,7 @@ T = TypeVar("T")
 _TOP_BAR = 36  # height of the viewer's own menu bar in pixels, cut off
 _QUIET_SECONDS = 0.4  # without a change of state, after which everything is loaded
 _TIMELINES = ("step", "row", "epoch", "batch")  # in order of preference
+_NOTES = 30  # frames after which the viewer's notifications at its start are gone
 _PATIENCE = 5  # equal pictures in a row, after which missing assets are given up
 
 
@@ -97,7 +98,7 @@ class Camera:
                 time.sleep(0.1)
 
     def wait_for_recording(self) -> None:
-        """Wait until the viewer has loaded the recording and its views."""
+        """Wait until the viewer has loaded the recording and its views, and shows nothing else."""
         known, since = "", time.monotonic()
         while True:
             state = self._request(self._client.get_state)
@@ -106,8 +107,10 @@ class Camera:
                 known, since = now, time.monotonic()
             complete = state.recordings and state.recordings[0].timelines and state.views
             if complete and not state.loading and time.monotonic() - since > _QUIET_SECONDS:
-                return
+                break
             time.sleep(0.1)
+        for _ in range(_NOTES):  # a request lets a frame pass, without drawing it
+            self._request(self._client.get_state)
 
     def find(self, timeline: str | None, at: float | None) -> tuple[str, int]:
         """Return a timeline and the viewer's number for a time on it, as in `render_picture`."""
@@ -149,15 +152,6 @@ class Camera:
                 views = (view.view_id for view in state.views if view.view_class == "3D")
                 return next(views, None)
             time.sleep(0.002)
-
-    def pass_frames(self, count: int) -> None:
-        """Let a number of frames pass, without drawing them."""
-        for _ in range(count):
-            self._request(self._client.get_state)
-
-    def set_step(self, step: int) -> None:
-        """Go to a position on the timeline ``step``, which the recording is known to have."""
-        self._request(lambda: self._client.set_time("step", sequence=step, play_state="paused"))
 
     def screenshot(self, view_id: str | None = None) -> bytes:
         """Return a picture of the current state of one view, or of the window."""

@@ -14,7 +14,6 @@ from physx_core.typing import Array
 from physx_rerun.viewer.headless import Camera, start_viewer
 
 _MARGIN = (16, 80)  # pixels of the window around a view: frame and title, with some reserve
-_NOTES = 30  # frames after which the viewer's notifications at its start are gone
 _PATIENCE = 60.0  # s per picture
 
 
@@ -61,11 +60,10 @@ class OffscreenViewer:
             scene = camera.wait_for_position(mark, number)
             if is_first:
                 camera.wait_for_recording()
-                camera.pass_frames(_NOTES)
                 scene = camera.wait_for_position(mark, number)
             if scene is None:
                 raise VisualizerError("There is no scene to render: nothing was drawn.")
-            camera.set_step(step)
+            camera.go_to("step", step)
             drawn = camera.wait_for_picture(scene) if is_first else camera.screenshot(scene)
         except OSError as error:
             self._viewer.check(wait=2.0)

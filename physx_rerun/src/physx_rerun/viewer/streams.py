@@ -282,6 +282,7 @@ def _keys(item: _Item) -> Iterable[tuple[str, ...]]:
     if not isinstance(item, Chunk):
         return [("blueprint",)]
     columns = {str(column.component_descriptor()): column for column in item.columns}
-    frames = columns.get(_FRAME)
-    moved = {()} if frames is None else set(map(tuple, frames.as_arrow_array().to_pylist()))
-    return [(item.entity, *columns, *frame) for frame in moved]
+    if _FRAME not in columns:
+        return [(item.entity, *columns)]
+    moved = columns[_FRAME].as_arrow_array().flatten().unique().to_pylist()
+    return [(item.entity, *columns, frame) for frame in moved]
