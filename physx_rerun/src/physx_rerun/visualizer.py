@@ -163,11 +163,6 @@ class RerunVisualizer(Visualizer):
                 'mode "spawn" opens a window, but there is no display. Use mode "headless" for a '
                 'picture, or mode "save" and open the file elsewhere with: rerun FILE.rrd'
             )
-        if self.port and is_listening(f"127.0.0.1:{self.port}"):
-            raise VisualizerError(
-                f"Port {self.port} is taken. If that is a Rerun viewer, use mode "
-                f'"connect" with address="127.0.0.1:{self.port}"; otherwise leave port=0.'
-            )
         options = ("--memory-limit", self.memory_limit, "--expect-data-soon")
         self.viewer = Viewer(self.port, options, lives_on=True)
         self.viewer.wait_until_ready()

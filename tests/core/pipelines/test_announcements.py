@@ -124,10 +124,16 @@ def test_a_prediction_and_a_replay_say_what_they_left(said):
 
 
 class Filming(Visualizer):
-    """Leaves a film, and fails afterwards if asked."""
+    """Has a screen, leaves a film, and fails afterwards if asked."""
 
     def __init__(self, fails=False):
         self.fails = fails
+
+    def open(self, run_name, session_dir, instance_nb):
+        self.screen = f"screen: of {run_name}"
+
+    def announcements(self):
+        return [self.screen]
 
     def close(self):
         if self.fails:
@@ -138,7 +144,7 @@ class Filming(Visualizer):
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_visualizer_announces_its_files_even_if_it_failed(fails, said):
+def test_a_visualizer_announces_its_screen_and_its_files_even_if_it_failed(fails, said):
     config = EnvironmentConfig(
         "toy/spring",
         as_tcp_ip_client=False,
@@ -150,7 +156,9 @@ def test_a_visualizer_announces_its_files_even_if_it_failed(fails, said):
             generate(config)
     else:
         generate(config)
-    assert "film: there.gif" in said()
+    lines = said()
+    assert lines[:2] == ["session: sessions/spring", "screen: of spring"]
+    assert "film: there.gif" in lines
 
 
 def test_a_quiet_run_says_nothing(said):

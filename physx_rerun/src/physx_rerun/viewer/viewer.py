@@ -66,6 +66,17 @@ def find_free_port() -> int:
         return port
 
 
+def _choose_port(port: int) -> int:
+    if not port:
+        return find_free_port()
+    if is_listening(f"127.0.0.1:{port}"):
+        raise VisualizerError(
+            f"Port {port} is taken: choose another one, or 0 for any free one. If that is a Rerun "
+            f'viewer, mode "connect" with address="127.0.0.1:{port}" shows a run in it.'
+        )
+    return port
+
+
 class Viewer:
     """A viewer process.
 
@@ -92,8 +103,11 @@ class Viewer:
             options: Further command-line options.
             environment: Environment variables beside those of this process.
             lives_on: Whether the viewer outlives this process.
+
+        Raises:
+            VisualizerError: If the port is taken.
         """
-        port = port or find_free_port()
+        port = _choose_port(port)
         self.address = f"127.0.0.1:{port}"
         self.process = ChildProcess(
             [
@@ -142,9 +156,7 @@ def start_web_viewer(port: int, page_port: int, *options: str) -> Viewer:
         page_port: Port of the page; 0: any free one.
         options: Further command-line options, and recordings to show.
     """
-    page_port = page_port or find_free_port()
-    if is_listening(f"127.0.0.1:{page_port}"):
-        raise VisualizerError(f"Port {page_port} is taken: choose another one for the page.")
+    page_port = _choose_port(page_port)
     viewer = Viewer(port, ("--serve-web", "--web-viewer-port", str(page_port), *options))
     viewer.page = (
         f"http://127.0.0.1:{page_port}/?url={quote(f'rerun+http://{viewer.address}/proxy', '')}"
