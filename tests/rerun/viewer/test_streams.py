@@ -156,8 +156,8 @@ HANGING = """
     from physx_core.components.scene import Factory
     from physx_rerun.visualizer import RerunVisualizer
 
-    visualizer = RerunVisualizer(mode="connect", address=sys.argv[1])
-    visualizer.open("run", sys.argv[2], 1)
+    visualizer = RerunVisualizer(mode="connect", address=sys.argv[2:])
+    visualizer.open("run", sys.argv[1], 1)
     factory = Factory()
     factory.add_scalars("error", ["x"])
     print("ready", flush=True)
@@ -169,11 +169,15 @@ HANGING = """
 """
 
 
-def test_a_viewer_that_hangs_holds_up_neither_run_nor_exit(receiver, python, tmp_path):
+def test_a_viewer_that_hangs_holds_up_neither_run_nor_exit_nor_another_viewer(
+    receiver, python, tmp_path
+):
     viewer, _ = receiver
-    command = [python, "-c", textwrap.dedent(HANGING), viewer.address, str(tmp_path)]
+    port, other = find_free_port(), tmp_path / "other.rrd"
+    addresses = [viewer.address, f"127.0.0.1:{port}"]
+    command = [python, "-c", textwrap.dedent(HANGING), str(tmp_path), *addresses]
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-    with subprocess.Popen(command, **pipes) as run:
+    with receiving(port, other), subprocess.Popen(command, **pipes) as run:
         assert run.stdout.readline() == b"ready\n"
         viewer.process.send_signal(signal.SIGSTOP)
         try:
@@ -181,8 +185,9 @@ def test_a_viewer_that_hangs_holds_up_neither_run_nor_exit(receiver, python, tmp
         finally:
             run.kill()
             viewer.process.send_signal(signal.SIGCONT)
+        wait_for_steps(other, lambda steps: steps == list(range(1000)))
     assert run.returncode == 0, errors.decode()
-    assert b"does not respond" in errors
+    assert errors.count(b"does not respond") == 1 and b"not there" not in errors
     assert steps_of(tmp_path / "run.rrd") == list(range(1000))
 
 
