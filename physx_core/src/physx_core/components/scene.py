@@ -57,13 +57,15 @@ KINDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "sphere": (("radius",), (*_LOOK, *_POSE, "wireframe")),
     "capsule": (("radius", "length"), (*_LOOK, *_POSE, "wireframe")),
     "text": (("content",), (*_LOOK,)),
-    "scalars": (("labels",), ("values",)),
+    "scalars": (("labels",), ("values", "unit")),
     "robot": (("urdf", "bodies"), (*_LOOK, "package_dirs", "poses")),
     "view": (("title",), ("eye", "target", "follow")),
 }
 """Kinds of objects: required and optional options when adding one."""
 
-_FIXED = frozenset({"cells", "colormap", "labels", "urdf", "bodies", "package_dirs", "half_sizes"})
+_FIXED = frozenset(
+    {"cells", "colormap", "labels", "urdf", "bodies", "package_dirs", "half_sizes", "unit"}
+)
 """Options that cannot be changed after adding."""
 
 
@@ -161,7 +163,7 @@ class Factory:
         self._update("text", name, changes)
 
     def add_scalars(self, name: str, labels: Sequence[str], **values: Any) -> str:
-        """Add a plot over time with one curve for each label."""
+        """Add a plot over time with one curve for each label; ``unit`` is that of its values."""
         return self._add("scalars", name, labels=list(labels), **values)
 
     def update_scalars(self, name: str, values: ArrayLike) -> None:

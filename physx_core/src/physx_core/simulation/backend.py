@@ -65,6 +65,13 @@ class Backend(ABC):
         """Return the robots that a world may name instead of a file; none unless overridden."""
         return ()
 
+    def robot_path(self, name: str) -> Path | None:
+        """Return the model file of the robot of a name, None if there is none.
+
+        To be overridden where that is quicker than to describe all robots.
+        """
+        return next((info.path for info in self.robots() if info.name == name), None)
+
 
 class Simulation(Closeable):
     """A running world. A context manager; after `close` every call raises `SimulationError`.

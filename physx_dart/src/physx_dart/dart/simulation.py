@@ -8,6 +8,7 @@ position and velocity limits, servos, and Coulomb friction are constraints of it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import dartpy
@@ -21,7 +22,7 @@ from physx_core.typing import Records, Vector
 from physx_dart.dart.contacts import ContactReader
 from physx_dart.dart.loading import attach_shapes, static_skeleton
 from physx_dart.dart.skeleton import DartRobot
-from physx_dart.models import catalog
+from physx_dart.models import catalog, robot_files
 from physx_dart.models.parts import Parts, read_parts
 from physx_dart.models.shapes import CollisionShape
 from physx_dart.shared import rk4
@@ -67,6 +68,10 @@ class DartBackend(Backend):
     def robots(self) -> Sequence[RobotInfo]:
         """Return the robots of this package and of ``example-robot-data``."""
         return catalog.robots()
+
+    def robot_path(self, name: str) -> Path | None:
+        """Return the URDF file of the robot of a name, None if there is none."""
+        return robot_files.robot_path(name)
 
 
 class DartSimulation(RobotSimulation[DartRobot]):

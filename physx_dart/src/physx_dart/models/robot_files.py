@@ -27,18 +27,22 @@ def find_robot(urdf: str | Path) -> Path:
     path = Path(urdf).absolute()
     if isinstance(urdf, Path) or urdf.lower().endswith(".urdf") or path.is_file():
         return path
-    own = OWN_ROBOTS / f"{urdf}.urdf"
-    if own.is_file() and "/" not in urdf:
-        return own
-    family, _, name = urdf.partition("/")
-    known = _installed(family) if name else {}
-    if urdf not in known:
-        known = named_robots()
+    found = robot_path(urdf)
+    if found is None:
         raise ModelError(
             f'There is no URDF file {path}, and no robot has the name "{urdf}".'
-            f"{nearest(urdf, known)} The command  physx robots  lists their names."
+            f"{nearest(urdf, named_robots())} The command  physx robots  lists their names."
         )
-    return known[urdf]
+    return found
+
+
+def robot_path(name: str) -> Path | None:
+    """Return the URDF file of the robot of a name, None if there is none."""
+    own = OWN_ROBOTS / f"{name}.urdf"
+    if own.is_file() and "/" not in name:
+        return own
+    family, _, rest = name.partition("/")
+    return _installed(family).get(name) if rest else None
 
 
 def named_robots() -> dict[str, Path]:

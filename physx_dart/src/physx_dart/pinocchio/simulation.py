@@ -7,6 +7,7 @@ All calls of pinocchio are in `physx_dart.pinocchio`, `physx_dart.batch`, and
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from physx_core.errors import FeatureNotSupportedError
 from physx_core.simulation import FEATURES, Backend, RobotInfo, Simulation, World
 from physx_core.typing import Records
-from physx_dart.models import catalog
+from physx_dart.models import catalog, robot_files
 from physx_dart.models.parts import Parts, read_parts
 from physx_dart.pinocchio.coupling import Coupling
 from physx_dart.pinocchio.robot import PinocchioRobot
@@ -45,6 +46,10 @@ class PinocchioBackend(Backend):
     def robots(self) -> Sequence[RobotInfo]:
         """Return the robots of this package and of ``example-robot-data``."""
         return catalog.robots()
+
+    def robot_path(self, name: str) -> Path | None:
+        """Return the URDF file of the robot of a name, None if there is none."""
+        return robot_files.robot_path(name)
 
 
 class PinocchioSimulation(RobotSimulation[PinocchioRobot]):

@@ -21,11 +21,17 @@ class ShowLog:
     files: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
     """The log files."""
     columns: tuple[str, ...] = ()
-    """Only columns whose names begin with one of these."""
+    """Only columns whose names begin with one of these; of a replay those that it plots."""
     plot: str | None = None
     """Write a plot of the columns of all files to this file."""
     replay: str | None = None
     """Write a recording of all episodes, side by side, for the viewer to this file (.rrd)."""
+    ghosts: tuple[str, ...] = ()
+    """Further log files, whose motions the replay draws translucent over the first."""
+    trajectories: tuple[str, ...] = ()
+    """Names of bodies of the first log whose way the replay draws."""
+    contacts: bool = True
+    """Whether the replay draws the forces at contacts."""
     backend: str | None = None
     """Engine that provides the robots of the replay; by default that of each log, which may only
     name one of an installed plugin."""
@@ -43,7 +49,16 @@ def run(words: Sequence[str]) -> None:
     if options.replay is not None:
         from physx_gym.show.replaying import replay
 
-        show(f"recording: {replay(logs, path=options.replay, backend=options.backend)}")
+        path = replay(
+            logs,
+            path=options.replay,
+            backend=options.backend,
+            plots=options.columns or True,
+            contacts=options.contacts,
+            trajectories=options.trajectories,
+            ghosts=options.ghosts,
+        )
+        show(f"recording: {path}")
     if options.plot is None and options.replay is None:
         for log in logs:
             _print_table(log, options.columns)

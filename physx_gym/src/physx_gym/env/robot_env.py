@@ -282,6 +282,9 @@ class RobotEnv(PipelineEnv):
     def _draw(self, scene: Factory) -> None:
         """Draw what is not simulated, such as a goal, before the first frame.
 
+        Also called at the start of an episode that is recorded, and `_redraw` after its steps, so
+        that replays show it.
+
         Args:
             scene: Factory to draw with.
         """
@@ -451,12 +454,15 @@ class RobotEnv(PipelineEnv):
             "step_dt": self.step_dt,
             "control_dt": self.control_dt,
             "observe_dt": self.observe_dt,
+            "view": dict(self.view),
         }
         for layer in outermost.layers:
             constants |= layer._constants()
         name, path = type(self).__name__, self.reset_options.get("log_path")
         if everything:
-            info["log_path"] = self.recorder.begin(name, outermost.action, path, constants)
+            info["log_path"] = self.recorder.begin(
+                name, outermost.action, path, constants, self._draw
+            )
         else:
             self.recorder.begin_training(name, constants)
 
@@ -496,6 +502,8 @@ class RobotEnv(PipelineEnv):
                 reward = subclass_checks.check_number(outermost, reward)
             if reward != reward:
                 raise SimulationError(f"The reward of {type(outermost).__name__} is not a number.")
+            if loop.is_recorded:
+                self.recorder.end_step(reward, self._redraw)
         except BaseException:
             self.stop()
             raise
@@ -619,7 +627,7 @@ class RobotEnv(PipelineEnv):
         self.num_steps[...] = loop.steps = own["num_steps"]
         loop.is_ready, loop.reason = own["ready"]
         self.reset_options = dict(own["options"])
-        self.recorder.telemetry.rewind(self.stepper_state.t)
+        self.recorder.rewind(self.stepper_state.t)
         if own["quantities"] is not None or self._own_quantities is not None:
             self.quantities.restore(own["quantities"] or [])
         super()._restore_own(own)

@@ -47,10 +47,11 @@ class WorldDrawing:
         world: World,
         backend: Backend,
         layout: Layout,
-        title: str,
+        title: str | None,
         *,
         follow: bool = True,
         view: Mapping[str, Sequence[float]] | None = None,
+        look: Mapping[str, Any] | None = None,
     ) -> None:
         """Keep the world; `add` draws it.
 
@@ -59,10 +60,12 @@ class WorldDrawing:
             world: The world to draw.
             backend: Engine that provides the robots given by name.
             layout: Order of the bodies.
-            title: Title of the window.
+            title: Title of the window; None: that of another world drawn with the factory.
             follow: Whether the camera follows the first robot whose base floats.
             view: Place of the camera: see `Factory.set_view`; None: where it shows everything.
+            look: Color and alpha of everything that moves; None: its own.
         """
+        self._look = look or {}
         self._view = view or {}
         self._factory, self._world, self._layout, self._backend = factory, world, layout, backend
         floating = (robot.name for robot in world.robots if not robot.fixed_base)
@@ -77,7 +80,8 @@ class WorldDrawing:
         """
         if self._world.ground is not None:
             _add_ground(self._factory, self._world.ground)
-        self._factory.set_view(self._title, self._followed, **self._view)
+        if self._title is not None:
+            self._factory.set_view(self._title, self._followed, **self._view)
         for robot in self._world.robots:
             self._add_robot(robot, poses[self._layout.parts[robot.name].bodies])
         for each in self._world.objects:
@@ -110,26 +114,29 @@ class WorldDrawing:
         names = [body.removeprefix(f"{robot.name}/") for body in bodies]
         packages = {name: str(folder) for name, folder in robot.package_dirs.items()}
         urdf = str(self._model(robot.urdf))
-        self._factory.add_robot(robot.name, urdf, names, package_dirs=packages, poses=poses)
+        self._factory.add_robot(
+            robot.name, urdf, names, package_dirs=packages, poses=poses, **self._look
+        )
 
     def _model(self, urdf: str | Path) -> Path:
         """Return the file of a robot, which may be given by its name in the backend."""
         path = Path(urdf)
         if isinstance(urdf, Path) or urdf.lower().endswith(".urdf") or path.is_file():
             return path
-        named = (info.path for info in self._backend.robots() if info.name == urdf)
-        return next(named, path)
+        return self._backend.robot_path(urdf) or path
 
     def _add_object(self, each: WorldObject, pose: Vector) -> None:
-        factory, color = self._factory, _RESTING if each.static else _MOVING
+        factory = self._factory
+        color = _RESTING if each.static else _MOVING
+        tint = {"color": color} | dict(self._look)
         if isinstance(each, Mesh):
             urdf = str(self._as_robot(each))
-            factory.add_robot(each.name, urdf, ["mesh"], color=color, poses=pose[None])
+            factory.add_robot(each.name, urdf, ["mesh"], poses=pose[None], **tint)
         elif isinstance(each, Cylinder):
             points, cells = cylinder(each.radius, each.length)
-            factory.add_mesh(each.name, _transform(points, pose), cells, color=color)
+            factory.add_mesh(each.name, _transform(points, pose), cells, **tint)
         else:
-            look: dict[str, Any] = {"position": pose[:3], "orientation": pose[3:], "color": color}
+            look: dict[str, Any] = {"position": pose[:3], "orientation": pose[3:], **tint}
             if isinstance(each, Box):
                 factory.add_box(each.name, 0.5 * np.array(each.size), **look)
             elif isinstance(each, Sphere):

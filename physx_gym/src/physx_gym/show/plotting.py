@@ -52,7 +52,7 @@ def plot(
         MissingLibraryError: If Matplotlib is not installed.
     """
     chosen = as_logs(logs, compare)
-    groups = _groups(chosen, columns, enable_block_states)
+    groups = groups_of(chosen, columns, enable_block_states)
     if show is None:
         show = path is None and has_display()
     figure = _figure(len(groups), show)
@@ -70,7 +70,7 @@ def plot(
     return figure
 
 
-def _groups(
+def groups_of(
     logs: Sequence[Log], columns: str | Iterable[str] | None, enable_block_states: bool
 ) -> Groups:
     """Return the columns of each plot by its title."""
@@ -107,7 +107,7 @@ def _title(name: str) -> str:
     return ".".join(parts)
 
 
-def _label(name: str, title: str) -> str:
+def label_of(name: str, title: str) -> str:
     """Return the label of a curve: the name of its column without the title of the plot."""
     if title.startswith("sensor."):
         kind, _, quantity = title.rpartition(".")
@@ -150,7 +150,7 @@ def _draw(axes: Axes, title: str, names: Sequence[str], logs: Sequence[Log]) -> 
         units = {**units, **log.units}
         for place, name in enumerate(names):
             if name in log.variables:
-                label = _label(name, title) if number == 0 else None
+                label = label_of(name, title) if number == 0 else None
                 style = _STYLES[number % len(_STYLES)]
                 look: dict[str, Any] = {"color": f"C{place % 10}", "linestyle": style}
                 axes.plot(log.time, log.variables[name], linewidth=1.0, label=label, **look)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,21 @@ import numpy as np
 from physx_core import checks, plugins
 from physx_core.components import Factory, Visualizer
 from physx_core.errors import LogError, VisualizerError
-from physx_core.simulation import Backend
+from physx_core.simulation import Backend, World
+from physx_core.typing import Vector
 from physx_gym.show.drawing import WorldDrawing
 from physx_gym.show.film import write_film
+from physx_gym.show.plotting import Groups, groups_of
 from physx_gym.show.rendering import PICTURE_SIZE, Picture, open_viewer
+from physx_gym.show.replayed import Contacts, Line, Plots, Scene, row_at
+from physx_gym.tasks.trajectory import Trajectory
 from physx_gym.telemetry.episode_log import Log
 from physx_gym.telemetry.log_file import Source, as_logs
 
 _FRAMES, _FRAMES_PER_ROW = 10_000, 100
+_POINTS = 1000  # of a drawn way, about
+_LESS_TELLING = ("state.a", "motor.command")  # columns that are plotted only if they are wanted
+_GHOST = {"color": "skyblue", "alpha": 0.35}
 
 
 def replay(
@@ -29,11 +37,15 @@ def replay(
     record_video_path: str | Path | None = None,
     frame_rate: float = 30.0,
     backend: Any = None,
+    plots: bool | str | Iterable[str] = True,
+    contacts: bool = True,
+    trajectories: Sequence[str] = (),
+    ghosts: Source | Trajectory | Sequence[Source | Trajectory] = (),
     **viewer: Any,
 ) -> Path | None:
-    """Show episodes side by side, all from their start.
+    """Show episodes side by side, all from their start: the motion, and plots beside it.
 
-    Without a path they are shown in a viewer's window.
+    What `RobotEnv._draw` drew is drawn again. Without a path they are shown in a viewer's window.
 
     Args:
         logs: Logs, their files, or values of `RobotEnv.log_data`; one or several.
@@ -42,20 +54,37 @@ def replay(
         record_video_path: Film to write: ``.mp4``, ``.gif``, ``.webp`` or ``.png``.
         frame_rate: Frames per simulated second. The viewer plays 30 per second.
         backend: Reference of the engine that provides the robots; None: the log's.
+        plots: Whether to plot the columns of the logs, or prefixes of the names of those to plot;
+            a film has no plots.
+        contacts: Whether to draw the forces at contacts as arrows, on one scale in each log.
+        trajectories: Names of bodies of the first log whose way is drawn as a line.
+        ghosts: Logs, or trajectories in the world of the first log, that are drawn translucent over
+            it.
         viewer: Options of the viewer, as in ``RobotEnv.viewer_kwargs``.
 
     Returns:
         The written file; None if there is none.
 
     Raises:
-        LogError: If a log cannot be read, or contains no states.
+        LogError: If a log cannot be read, or contains no states, or there is nothing to plot.
+        SimulationError: If there is no body of a name in `trajectories`.
         PluginNotFoundError: If the viewer is not installed.
         VisualizerError: If the viewer cannot be opened, or cannot draw.
         ConfigError: If an option is invalid.
     """
     checks.positive("frame_rate", frame_rate)
     chosen = as_logs(logs, compare)
-    motions = [_Motion(number, log, backend) for number, log in enumerate(chosen, 1)]
+    plotted = plots is not False and record_video_path is None
+    groups = _groups(chosen, plots) if plotted else {}
+    motions = [
+        _Motion(number, log, backend, groups, contacts) for number, log in enumerate(chosen, 1)
+    ]
+    several = isinstance(ghosts, Sequence) and not isinstance(ghosts, str)
+    given: Any = ghosts if several else [ghosts]
+    for ghost in given:
+        is_log = not isinstance(ghost, Trajectory)
+        motions[0].add_ghost(as_logs(ghost)[0] if is_log else ghost, backend)
+    motions[0].add_lines(trajectories)
     count = max(motion.count_frames(frame_rate) for motion in motions)
     options: dict[str, Any] = {"max_instances": len(motions), **viewer}
     if record_video_path is not None:
@@ -78,6 +107,14 @@ def replay(
     return None if path is None else Path(path)
 
 
+def _groups(logs: Sequence[Log], plots: Any) -> Groups:
+    """Return the columns to plot: those wanted, by default the most telling ones."""
+    groups = groups_of(logs, None if plots is True else plots, enable_block_states=False)
+    if plots is not True:
+        return groups
+    return {title: names for title, names in groups.items() if not title.startswith(_LESS_TELLING)}
+
+
 def _frames(
     shown: Visualizer, motions: Sequence[_Motion], count: int, frame_rate: float
 ) -> Iterator[Visualizer]:
@@ -95,54 +132,125 @@ def _picture(shown: Visualizer) -> Picture:
     return picture
 
 
+class _Body:
+    """Everything of a world in motion, at the times of its states."""
+
+    def __init__(
+        self, label: str, states: Trajectory, world: World, engine: Backend, **drawn: Any
+    ) -> None:
+        """Build the world; `drawn` are options of `WorldDrawing`."""
+        self._positions = states.positions
+        self.times = states.times - states.times[0]
+        self.simulation = engine.build(world)
+        layout = self.simulation.layout
+        if layout.nq != states.positions.shape[1]:
+            raise LogError(
+                f'The log "{label}" has {states.positions.shape[1]} positions, but its world '
+                f"has {layout.nq}: the robot's file has changed since."
+            )
+        self._drawing = WorldDrawing(world=world, backend=engine, layout=layout, **drawn)
+        self._is_drawn = False
+
+    def poses(self, time: float, names: Sequence[str] | None = None) -> Vector:
+        """Return the poses of bodies at a time after the start, in s."""
+        return self.simulation.body_poses(names, self._positions[row_at(self.times, time)])
+
+    def draw(self, time: float) -> None:
+        """Draw it at a time."""
+        (self._drawing.move if self._is_drawn else self._drawing.add)(self.poses(time))
+        self._is_drawn = True
+
+    def close(self) -> None:
+        """Free its resources."""
+        self._drawing.close()
+        self.simulation.close()
+
+
 class _Motion:
     """The motion in a log, drawn frame by frame."""
 
-    def __init__(self, number: int, log: Log, backend: Any) -> None:
+    def __init__(self, number: int, log: Log, backend: Any, groups: Groups, contacts: bool) -> None:
         """Rebuild the world of the log."""
-        self._number, self._label = number, log.label
-        states = log.trajectory()
-        self._times, self._positions = states.times, states.positions
-        self._duration = float(self._times[-1] - self._times[0])
-        world, engine = log.world(), _backend(log, backend)
-        self._simulation = engine.build(world)
-        layout = self._simulation.layout
-        if layout.nq != self._positions.shape[1]:
-            raise LogError(
-                f'The log "{log.label}" has {self._positions.shape[1]} positions, but its world '
-                f"has {layout.nq}: the robot's file has changed since."
-            )
+        self._number, self._log = number, log
         self._factory = Factory()
-        title = f"{number}: {log.label}"
-        self._drawing = WorldDrawing(self._factory, world, engine, layout, title)
+        self._world, self._engine = log.world(), _backend(log, backend)
+        drawn = {"factory": self._factory, "title": f"{number}: {log.label}"}
+        view = log.constants.get("view") or None
+        states = log.trajectory()
+        self._body = _Body(log.label, states, self._world, self._engine, view=view, **drawn)
+        self._ghosts: list[_Body] = []
+        self._beside: list[Scene | Contacts | Line] = [Scene(self._factory, log)]
+        if contacts and len(log.contacts):
+            self._beside.append(Contacts(self._factory, log, self._reach()))
+        self._plots = Plots(self._factory, log, groups)
+
+    def _reach(self) -> float:
+        """Return the size of what moves, in m."""
+        return float(np.linalg.norm(np.ptp(self._body.poses(0.0)[:, :3], axis=0)))
+
+    def add_ghost(self, ghost: Log | Trajectory, backend: Any) -> None:
+        """Draw another motion translucently over this one."""
+        states = ghost.trajectory() if isinstance(ghost, Log) else ghost
+        world, engine, label = self._world, self._engine, "ghost"
+        if isinstance(ghost, Log):
+            world, engine, label = ghost.world(), _backend(ghost, backend), ghost.label
+        prefix = f"ghost{len(self._ghosts) + 1}_"
+        world = dataclasses.replace(
+            world,
+            ground=None,
+            robots=[dataclasses.replace(each, name=prefix + each.name) for each in world.robots],
+            objects=[
+                dataclasses.replace(each, name=prefix + each.name)
+                for each in world.objects
+                if not each.static
+            ],
+        )
+        drawn = {"factory": self._factory, "title": None, "look": _GHOST}
+        self._ghosts.append(_Body(label, states, world, engine, **drawn))
+
+    def add_lines(self, bodies: Sequence[str]) -> None:
+        """Draw the ways of bodies."""
+        names = [bodies] if isinstance(bodies, str) else list(bodies)
+        if not names:
+            return
+        times = self._body.times[:: max(1, len(self._body.times) // _POINTS)]
+        ways = np.stack([self._body.poses(time, names)[:, :3] for time in times], axis=1)
+        self._beside += [
+            Line(self._factory, name, way) for name, way in zip(names, ways, strict=True)
+        ]
 
     def count_frames(self, frame_rate: float) -> int:
         """Return how many frames show it, checking that a few rows do not claim to be an age."""
-        count = 1 + self._duration * frame_rate + 1e-9
-        most = max(_FRAMES, _FRAMES_PER_ROW * len(self._times))
+        rows, duration = len(self._body.times), float(self._body.times[-1])
+        count = 1 + duration * frame_rate + 1e-9
+        most = max(_FRAMES, _FRAMES_PER_ROW * rows)
         if not count <= most:
             raise LogError(
-                f'The log "{self._label}" has {len(self._times)} rows of {self._duration:.4g} s in '
+                f'The log "{self._log.label}" has {rows} rows of {duration:.4g} s in '
                 f"all, which would be more than {most} frames. Lower the frame_rate."
             )
         return int(count)
 
     def draw(self, shown: Visualizer, frame: int, time: float) -> None:
-        """Draw the state at a time after the start, in s."""
-        moment = self._times[0] + time + 1e-9
-        row = max(int(np.searchsorted(self._times, moment, "right")) - 1, 0)
-        poses = self._simulation.body_poses(None, self._positions[row])
+        """Draw the state at a time after the start, in s, and plot all rows up to it."""
         if frame == 0:
-            self._drawing.add(poses)
-        else:
-            self._drawing.move(poses)
+            self._factory.set_time(time)
+        self._body.draw(time)
+        for ghost in self._ghosts:
+            ghost.draw(time)
+        for each in self._beside:
+            each.draw(time)
+        drawn = self._factory.take_events()
+        for row_time in self._plots.rows_until(time):
+            self._factory.set_time(row_time)
+            shown.events(self._number, frame, self._factory.take_events())
         self._factory.set_time(time)
-        shown.events(self._number, frame, self._factory.take_events())
+        shown.events(self._number, frame, [*drawn, *self._factory.take_events()])
 
     def close(self) -> None:
         """Free its resources."""
-        self._drawing.close()
-        self._simulation.close()
+        for body in (self._body, *self._ghosts):
+            body.close()
 
 
 def _backend(log: Log, given: Any) -> Backend:

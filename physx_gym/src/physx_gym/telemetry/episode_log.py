@@ -2,7 +2,8 @@
 
 A file has one group for each type of numbers, ``float64`` and ``int64``, with the contiguous
 dataset ``values`` of shape (rows, columns), and the datasets ``names`` and ``units`` of its
-columns; the dataset ``constants`` is a JSON text. The first column is the time.
+columns; the dataset ``constants`` is a JSON text. The first column is the time. The dataset
+``contacts``, which may be missing, has the columns time, point (3) and force (3).
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Log:
 
     Attributes:
         constants: Description of the episode: the world, the layout of its state, options, seed,
-            units of columns.
+            units of columns, what was drawn, contacts.
         variables: The columns by name, each of shape (rows,); ``"time"`` is the first.
         path: The file of the log; None: none.
     """
@@ -58,6 +59,14 @@ class Log:
         """Units of the columns that have one."""
         units: Mapping[str, str] = self.constants.get("units", {})
         return units
+
+    @property
+    def contacts(self) -> NDArray[np.float64]:
+        """Contacts after each step, shape (contacts, 7).
+
+        In each row the time in s, the point in m, and the force in N, in the world frame.
+        """
+        return np.asarray(self.constants.get("contacts", np.zeros((0, 7))), np.float64)
 
     @property
     def label(self) -> str:
@@ -141,9 +150,12 @@ class Log:
         image = io.BytesIO()
         with h5py.File(image, "w") as file:
             file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
-            constants = {key: each for key, each in self.constants.items() if key != "units"}
+            apart = ("units", "contacts")
+            constants = {key: each for key, each in self.constants.items() if key not in apart}
             text = json.dumps(to_plain(constants)).encode()
             file.create_dataset("constants", data=np.frombuffer(text, np.uint8))
+            if len(self.contacts):
+                file.create_dataset("contacts", data=self.contacts)
             for dtype in ("float64", "int64"):
                 names = [key for key, each in self.variables.items() if each.dtype == dtype]
                 if not names:

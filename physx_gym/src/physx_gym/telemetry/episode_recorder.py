@@ -10,6 +10,7 @@ import numpy as np
 
 from physx_core.errors import ConfigError
 from physx_gym.simulator.simulator import Simulator
+from physx_gym.telemetry.episode_scene import Draw, EpisodeScene
 from physx_gym.telemetry.log_folder import LogFolder
 from physx_gym.telemetry.standard_columns import describe_simulator, register_simulator
 from physx_gym.telemetry.telemetry import Telemetry
@@ -28,6 +29,8 @@ class EpisodeRecorder:
         self.telemetry = Telemetry()
         self._simulator = simulator
         self._folder = LogFolder()
+        self._scene = EpisodeScene()
+        self._reward = np.zeros(())
         self._action: tuple[Any, Any] | None = None  # of another type, and its recorded copy
         self._in_detail = False
         self._described: dict[str, Any] = {}
@@ -43,7 +46,9 @@ class EpisodeRecorder:
         self._in_detail, self._action = False, None
         self.telemetry.begin(None, self._describe(name, constants), training=True)
 
-    def begin(self, name: str, action: Any, path: Any, constants: Mapping[str, Any]) -> str:
+    def begin(
+        self, name: str, action: Any, path: Any, constants: Mapping[str, Any], draw: Draw
+    ) -> str:
         """Start an episode of which everything is recorded, and written to a file at its end.
 
         Args:
@@ -51,6 +56,7 @@ class EpisodeRecorder:
             action: Buffer of the action; recorded if it is a single array of numbers.
             path: Path of the file; None: one in the temporary folder.
             constants: Description of the environment, beside that of its simulator.
+            draw: Draws what is not simulated.
 
         Returns:
             The path of the file.
@@ -60,6 +66,8 @@ class EpisodeRecorder:
         described = self._describe(name, constants)
         self._in_detail = True
         self._register_action(action)
+        self._register_reward()
+        self._scene.begin(draw)
         file = self._folder.new_path(name) if path is None else Path(path)
         self.telemetry.begin(file, described)
         return str(file)
@@ -86,6 +94,22 @@ class EpisodeRecorder:
             "action", recorded, joints if action.shape == (len(joints),) else None
         )
 
+    def _register_reward(self) -> None:
+        """Register the reward, which is that of the step before the row."""
+        self._reward[()] = 0.0
+        self.telemetry.register("step", self._reward, namespace="reward")
+
+    def end_step(self, reward: float, redraw: Draw) -> None:
+        """Record what a step led to: its reward, what is drawn, and contacts."""
+        self._reward[()] = reward
+        if self._in_detail and self.telemetry.is_recording:
+            self._scene.record(self._simulator.stepper_state.t, redraw, self._simulator.simulation)
+
+    def rewind(self, time: float) -> None:
+        """Discard what was recorded from a time, in s, on."""
+        self.telemetry.rewind(time)
+        self._scene.rewind(time)
+
     def record(self) -> None:
         """Record a row of the present values."""
         if self._in_detail:
@@ -98,7 +122,12 @@ class EpisodeRecorder:
         """Return what was recorded, the present state included; see `Telemetry.log_data`."""
         if self.telemetry.is_recording:
             self.record()
+            self._describe_scene()
         return self.telemetry.log_data
+
+    def _describe_scene(self) -> None:
+        if self._in_detail:
+            self.telemetry.describe(self._scene.describe())
 
     def end(self, *, keep: bool) -> None:
         """End the episode, if one is recorded.
@@ -110,6 +139,7 @@ class EpisodeRecorder:
             self.telemetry.discard()
         elif self.telemetry.is_recording:
             self.record()
+            self._describe_scene()
             self.telemetry.end()
 
     def close(self) -> None:

@@ -14,6 +14,7 @@ from physx_core.parsing import parse_json
 from physx_gym.telemetry.episode_log import FORMAT, TIME, VERSION, Column, Log
 
 _NAMES_WIDTH = 4096
+_CONTACT = 7  # columns of the contacts
 
 
 def read_log(path: str | Path) -> Log:
@@ -95,7 +96,12 @@ class _Reader:
             raise self._error("does not start with the column of the time")
         if len({len(each) for each in variables.values()}) != 1:
             raise self._error("has columns of different lengths")
-        return Log({**constants, "units": units}, variables, self._path)
+        apart: dict[str, Any] = {"units": units}
+        if "contacts" in self._file:
+            apart["contacts"] = self._values(self._file, "contacts", "float64", 2)
+            if apart["contacts"].shape[1] != _CONTACT:
+                raise self._error(f"has contacts of {apart['contacts'].shape[1]} numbers")
+        return Log({**constants, **apart}, variables, self._path)
 
     def _table(self, dtype: str, variables: dict[str, Column], units: dict[str, str]) -> None:
         """Read the columns of one type."""

@@ -143,6 +143,10 @@ class Telemetry:
             self._table = _Table(chosen, most)
         self.is_recording = bool(chosen)
 
+    def describe(self, constants: Mapping[str, Any]) -> None:
+        """Add to the description of the running episode: plain data."""
+        self._constants = {**self._constants, **constants}
+
     def record(self, time: float) -> None:
         """Record a row: copies of all variables as they are now.
 

@@ -313,7 +313,9 @@ class Drawing:
             names = [prefix + label for label in labels]
             self._rows.add_static(drawn.entity, rr.SeriesLines(names=names, colors=lines))
             if self._draws_shapes:
-                self._layout.add_plot(drawn.name, drawn.entity, "step", len(labels))
+                unit = drawn.values.get("unit")
+                title = f"{drawn.name} ({unit})" if unit else drawn.name
+                self._layout.add_plot(title, drawn.entity, "step", len(labels))
         values = changes.get("values")
         if values is None:
             return

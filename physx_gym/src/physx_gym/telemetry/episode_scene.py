@@ -1,0 +1,97 @@
+"""What an environment draws in an episode beside its world, and the contacts, step by step."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from physx_core.components import Factory
+from physx_core.simulation import Simulation
+from physx_core.typing import Vector
+
+_MOST_NUMBERS = 1_000_000  # of all changes: a log's description has to be readable
+_WITHOUT = ("view", "time")  # kinds of events that replays make themselves
+
+Draw = Callable[[Factory], None]
+
+
+class EpisodeScene:
+    """Records what is drawn at the start of an episode, what changes, and forces at contacts."""
+
+    def __init__(self) -> None:
+        self._factory = Factory()
+        self._added: list[dict[str, Any]] = []
+        self._changes: list[tuple[float, str, dict[str, Any]]] = []
+        self._known: dict[tuple[str, str], Any] = {}
+        self._numbers = 0
+        self._contacts: list[Vector] = []
+
+    def begin(self, draw: Draw) -> None:
+        """Start over with what is drawn first."""
+        EpisodeScene.__init__(self)
+        draw(self._factory)
+        for event in self._factory.take_events():
+            if event.kind not in _WITHOUT:
+                values = dict(event.values)
+                self._added.append({"kind": event.kind, "name": event.name, "values": values})
+        self._remember()
+
+    def record(self, time: float, redraw: Draw, simulation: Simulation) -> None:
+        """Record what changed in a step, and its contacts.
+
+        Args:
+            time: Since the start of the episode, in s.
+            redraw: Updates what was drawn.
+            simulation: The simulation after the step.
+        """
+        redraw(self._factory)
+        for event in self._factory.take_events():
+            changes = {
+                option: value
+                for option, value in event.values.items()
+                if not self._is_known(event.name, option, value)
+            }
+            size = sum(np.size(value) for value in changes.values())
+            if event.kind in _WITHOUT or not changes or self._numbers + size > _MOST_NUMBERS:
+                continue
+            self._numbers += size
+            self._known |= {(event.name, option): value for option, value in changes.items()}
+            self._changes.append((time, event.name, changes))
+        if "contacts" in simulation.features:
+            found = simulation.contacts()
+            if len(found):
+                times = np.full((len(found), 1), time)
+                self._contacts.append(np.hstack([times, found["point"], found["force"]]))
+
+    def _is_known(self, name: str, option: str, value: Any) -> bool:
+        key = name, option
+        return key in self._known and bool(np.array_equal(value, self._known[key]))
+
+    def rewind(self, time: float) -> None:
+        """Discard what was recorded after a time, in s."""
+        self._changes = [change for change in self._changes if change[0] <= time]
+        self._contacts = [block for block in self._contacts if block[0, 0] <= time]
+        self._remember()
+
+    def _remember(self) -> None:
+        """Note what every object is like at the end of what was recorded."""
+        first = ((each["name"], each["values"]) for each in self._added)
+        later = ((name, values) for _, name, values in self._changes)
+        self._known = {
+            (name, option): value
+            for name, values in itertools.chain(first, later)
+            for option, value in values.items()
+        }
+
+    def describe(self) -> Mapping[str, Any]:
+        """Return what a log says about it: ``scene`` and ``contacts``.
+
+        ``contacts`` has a row for each contact: time in s, point in m, force in N, both (3,) in the
+        world frame.
+        """
+        changes = [list(change) for change in self._changes]
+        contacts = np.concatenate([np.zeros((0, 7)), *self._contacts])
+        return {"scene": {"added": list(self._added), "changes": changes}, "contacts": contacts}
