@@ -63,6 +63,15 @@ def test_without_a_display_the_other_ways_are_named(session, monkeypatch):
         view.run([str(session)])
 
 
+def test_a_window_that_cannot_be_opened(session, monkeypatch):
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":987")
+    before = psutil.Process().children(recursive=True)
+    with pytest.raises(VisualizerError, match="viewer ended with status"):
+        view.run([str(session)])
+    assert psutil.Process().children(recursive=True) == before
+
+
 @pytest.mark.parametrize(
     ("name", "message"), [(".", "neither a recording"), ("none.rrd", "no recording, session or")]
 )
