@@ -362,11 +362,6 @@ def misspells_a_method_of_the_factory():
     with_step(lambda self: self.factory.add_point("cloud", np.zeros((1, 3))))
 
 
-@mistake(e.EnvironmentFailedError, "add_markers", "In its place: add_points()")
-def draws_what_there_is_no_more():
-    with_step(lambda self: self.factory.add_markers(positions=[0, 0, 0]))
-
-
 class Seen(Visualizer):
     """Shows nothing; the environment draws."""
 

@@ -335,9 +335,10 @@ class RerunVisualizer(Visualizer):
                 self._addresses,
                 owns_viewer=self.viewer is not None or self._offscreen is not None,
             )
-        self._recording.write(chunks)
         if self._layout.changed or self._dashboard.changed:
+            # Before the rows, so that a picture of these is of this layout.
             self._recording.write_blueprint(self._layout.blueprint(self._dashboard.cells()))
+        self._recording.write(chunks)
 
 
 def _is_address(text: str) -> bool:

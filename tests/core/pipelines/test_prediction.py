@@ -246,7 +246,8 @@ class Watch(Observer):
 
     def events(self, instance_id, step, events):
         with self.file.open("a") as stream:
-            stream.write(f"{instance_id} {step} {' '.join(event.name for event in events)}\n")
+            names = " ".join(name for event in events for name in event.names)
+            stream.write(f"{instance_id} {step} {names}\n")
 
 
 def test_replay_sends_each_sample_once_through_the_environment_that_made_it():

@@ -101,7 +101,7 @@ class Insider:
         return pack(Kind.ROWS, payload, count)
 
     def show(self):
-        events = [("add", "mesh", "a", {"positions": np.zeros((2, 3), "f4"), "color": "red"})]
+        events = [("add", "mesh", ("a",), {"positions": np.zeros((2, 3), "f4"), "color": "red"})]
         return plain(Kind.SHOW, events, self.rng.randrange(9))
 
     def ask(self):

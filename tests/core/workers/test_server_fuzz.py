@@ -126,7 +126,7 @@ class Tolerant:
         return {"loaded": self.loaded}
 
     def show(self, instance_id, step, events):
-        assert all(event.action in ("add", "update") for event in events)
+        assert all(event.action in ("add", "update", "remove") for event in events)
         self.shown += 1
 
 

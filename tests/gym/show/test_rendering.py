@@ -209,7 +209,7 @@ def drawn(world, turn=None):
         turn(simulation)
         drawing.move(simulation.body_poses())
     found = {}
-    for event in factory.take_events():
+    for event in (one for several in factory.take_events() for one in several.each()):
         found.setdefault(event.name, {}).update(event.values)
     drawing.close()
     simulation.close()
@@ -333,7 +333,7 @@ def test_an_environment_draws_its_goal(name, shown):
     for seed in (1, 2):
         env.reset(seed=seed)
         env.render()
-        drawn = np.atleast_2d(Fake.opened[-1].drawn["goal"][shown])
+        drawn = np.reshape(Fake.opened[-1].drawn["goal"][shown], (-1, 3))
         middle = 0.5 * (drawn.min(axis=0) + drawn.max(axis=0))
         np.testing.assert_allclose(middle[: len(env.goal)], env.goal, atol=1e-6)
     env.close()

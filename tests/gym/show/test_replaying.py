@@ -35,7 +35,7 @@ class Witness(Visualizer):
                 self.time = event.values["seconds"]
             elif event.action == "add":
                 Witness.added[event.name] = {"kind": event.kind, **event.values}
-        for event in events:
+        for event in (one for several in events for one in several.each()):
             if event.action == "update" and event.kind != "time":
                 Witness.updates[event.name].append((self.time, dict(event.values)))
 

@@ -153,7 +153,7 @@ def frames_of(path):
 
 HANGING = """
     import sys
-    from physx_core.components.scene import Factory
+    from physx_core.components import Factory
     from physx_rerun.visualizer import RerunVisualizer
 
     visualizer = RerunVisualizer(mode="connect", address=sys.argv[2:])
@@ -218,7 +218,7 @@ def test_rows_for_a_viewer_that_hangs_are_dropped_and_counted(receiver, monkeypa
 
 ENDLESS = """
     import itertools, sys, time
-    from physx_core.components.scene import Factory
+    from physx_core.components import Factory
     from physx_rerun.visualizer import RerunVisualizer
 
     visualizer = RerunVisualizer()

@@ -13,8 +13,12 @@ from .optimization import Optimization as Optimization
 from .parameter import Parameter as Parameter
 from .sampler import LearningSampler as LearningSampler
 from .sampler import Sampler as Sampler
-from .scene import Event as Event
-from .scene import Factory as Factory
+from .scene.colors import map_values as map_values
+from .scene.colors import parse_color as parse_color
+from .scene.event import Event as Event
+from .scene.factory import Factory as Factory
+from .scene.geometry import vertex_normals as vertex_normals
+from .scene.kinds import KINDS as KINDS
 from .transformation import Transformation as Transformation
 from .visualizer import Observer as Observer
 from .visualizer import Visualizer as Visualizer

@@ -10,7 +10,8 @@ import numpy as np
 
 from physx_core.components.parameter import Parameter, as_parameters, draw, random_of
 from physx_core.components.sampler import checked
-from physx_core.components.scene import Event, Factory, NullFactory
+from physx_core.components.scene.event import Event
+from physx_core.components.scene.factory import Factory, NullFactory
 from physx_core.errors import (
     ConfigError,
     MissingFieldError,
@@ -34,10 +35,6 @@ _OTHER_NAMES = {
     "define_additional_data": "define_additional_fields()",
     "get_database_handler": "set_training_data()",
     "update_line": "set_training_data()",
-    "add_markers": "add_points()",
-    "update_markers": "update_points()",
-    "add_symbols": "add_points() or add_arrows()",
-    "update_symbols": "update_points() or update_arrows()",
     "render": "Environment.update_visualization()",
 }
 """Attributes of other systems' environments and factories, and what is here in their place."""

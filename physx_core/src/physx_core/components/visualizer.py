@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from physx_core.components.scene import Event
+    from physx_core.components.scene.event import Event
     from physx_core.fields import Field
     from physx_core.typing import Array
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from physx_core.components.scene import Event
+from physx_core.components.scene.event import Event
 from physx_core.components.visualizer import Observer
 from physx_core.fields import Field
 from physx_core.typing import Array

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from physx_core import files
-from physx_core.components.scene import Event
+from physx_core.components.scene.event import Event
 from physx_core.errors import ConnectionRefusedByPeerError, DatasetError, UsageError
 from physx_core.net.values import decode, encode
 from physx_core.pipelines.storage import LARGEST_PARAMETERS, PARAMETERS

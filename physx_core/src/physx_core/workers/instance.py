@@ -17,7 +17,7 @@ from physx_core.components.environment import (
     options_of,
 )
 from physx_core.components.parameter import Parameter
-from physx_core.components.scene import Factory
+from physx_core.components.scene.factory import Factory
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
     EnvironmentFailedError,

@@ -97,7 +97,7 @@ class ArmReachEnv(GoalTask):
         self.goal[:], self._target[:] = memory["goal"], memory["target"]
 
     def _draw(self, scene: Factory) -> None:
-        scene.add_sphere("goal", self.CLOSE, position=self.goal, color="green")
+        scene.add_sphere("goal", self.CLOSE, position=self.goal, color="limegreen")
 
     def _redraw(self, scene: Factory) -> None:
         scene.update_sphere("goal", position=self.goal)

@@ -90,7 +90,7 @@ class PushBoxEnv(GoalTask):
         self.goal[:] = memory
 
     def _draw(self, scene: Factory) -> None:
-        scene.add_lines("goal", self._goal_circle(), color="green", size=0.008)
+        scene.add_lines("goal", self._goal_circle(), color="limegreen", size=0.008)
 
     def _redraw(self, scene: Factory) -> None:
         scene.update_lines("goal", positions=self._goal_circle())

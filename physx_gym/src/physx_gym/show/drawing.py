@@ -8,11 +8,9 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
 
 from physx_core.components import Factory
 from physx_core.processes import TemporaryFolder
-from physx_core.rotations import rotate_rows
 from physx_core.simulation import (
     Backend,
     Box,
@@ -30,9 +28,8 @@ from physx_core.simulation import (
 )
 from physx_core.typing import Vector
 
-_GROUND, _MOVING, _RESTING = "#6d7885", "orange", "#a3acb6"
+_GROUND, _MOVING, _RESTING = "#6d7885", "#ff7f0e", "#a3acb6"
 _THICKNESS, _REACH = 0.01, 100.0  # of a drawn plane, and half its width, in m
-_SIDES = 32  # of a drawn cylinder
 _ROBOT = """<robot name="mesh"><link name="mesh"><visual><geometry>
 <mesh filename={} scale="{scale} {scale} {scale}"/>
 </geometry></visual></link></robot>"""
@@ -132,9 +129,6 @@ class WorldDrawing:
         if isinstance(each, Mesh):
             urdf = str(self._as_robot(each))
             factory.add_robot(each.name, urdf, ["mesh"], poses=pose[None], **tint)
-        elif isinstance(each, Cylinder):
-            points, cells = cylinder(each.radius, each.length)
-            factory.add_mesh(each.name, _transform(points, pose), cells, **tint)
         else:
             look: dict[str, Any] = {"position": pose[:3], "orientation": pose[3:], **tint}
             if isinstance(each, Box):
@@ -143,6 +137,8 @@ class WorldDrawing:
                 factory.add_sphere(each.name, each.radius, **look)
             elif isinstance(each, Capsule):
                 factory.add_capsule(each.name, each.radius, each.length, **look)
+            elif isinstance(each, Cylinder):
+                factory.add_cylinder(each.name, each.radius, each.length, **look)
 
     def _as_robot(self, each: Mesh) -> Path:
         """Return a URDF file of a mesh, as viewers load mesh files in this form."""
@@ -158,9 +154,6 @@ class WorldDrawing:
         factory = self._factory
         if isinstance(each, Mesh):
             factory.update_robot(each.name, poses=pose[None])
-        elif isinstance(each, Cylinder):
-            corners = cylinder(each.radius, each.length)[0]
-            factory.update_mesh(each.name, positions=_transform(corners, pose))
         else:
             place = {"position": pose[:3], "orientation": pose[3:]}
             if isinstance(each, Box):
@@ -169,11 +162,15 @@ class WorldDrawing:
                 factory.update_sphere(each.name, **place)
             elif isinstance(each, Capsule):
                 factory.update_capsule(each.name, **place)
+            elif isinstance(each, Cylinder):
+                factory.update_cylinder(each.name, **place)
 
 
 def _add_ground(factory: Factory, ground: Ground | Stairs | HeightField) -> None:
     if isinstance(ground, HeightField):
-        factory.add_mesh("ground", *_field(ground), color=_GROUND)
+        corner = (*ground.corner(), 0.0)
+        given = {"position": corner, "color": _GROUND, "in_view": False}
+        factory.add_height_field("ground", ground.heights, ground.spacing, **given)
         return
     plane = ground if isinstance(ground, Ground) else Ground()
     if isinstance(ground, Stairs):
@@ -184,7 +181,7 @@ def _add_ground(factory: Factory, ground: Ground | Stairs | HeightField) -> None
     # Slightly below the ground, so that a viewer's own grid stays visible.
     place = normal * (plane.height - 0.5 * _THICKNESS - 1e-3)
     look: dict[str, Any] = {"position": place, "orientation": _upright(normal), "color": _GROUND}
-    factory.add_box("ground", (_REACH, _REACH, 0.5 * _THICKNESS), **look)
+    factory.add_box("ground", (_REACH, _REACH, 0.5 * _THICKNESS), in_view=False, **look)
 
 
 def _upright(normal: Vector) -> Vector:
@@ -193,38 +190,3 @@ def _upright(normal: Vector) -> Vector:
     turn = np.array([*axis, 1.0 + normal[2]])
     length = float(np.linalg.norm(turn))
     return turn / length if length > 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
-
-
-def _field(ground: HeightField) -> tuple[Vector, NDArray[np.int32]]:
-    """Return vertices and triangles of a height field."""
-    nx, ny = ground.heights.shape
-    begin, spacing = ground.corner(), ground.spacing
-    x, y = (begin[i] + spacing[i] * np.arange(n) for i, n in enumerate((nx, ny)))
-    points = np.stack([*np.meshgrid(x, y, indexing="ij"), ground.heights], axis=-1)
-    first = (np.arange(nx - 1)[:, None] * ny + np.arange(ny - 1)).ravel()
-    corners = np.stack([first, first + ny, first + ny + 1, first, first + ny + 1, first + 1], 1)
-    return points.reshape(-1, 3), corners.reshape(-1, 3).astype(np.int32)
-
-
-def cylinder(radius: float, length: float) -> tuple[Vector, NDArray[np.int32]]:
-    """Return vertices, shape (n, 3), and triangles, shape (m, 3), of a cylinder along z.
-
-    Sides and caps have vertices of their own, so that edges look sharp.
-    """
-    angles = np.arange(_SIDES) * (2 * np.pi / _SIDES)
-    circle = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    low, high = (np.column_stack([circle, np.full(_SIDES, z * length)]) for z in (-0.5, 0.5))
-    points = np.concatenate([low, high, low, high])
-    here = np.arange(_SIDES)
-    ahead = (here + 1) % _SIDES
-    fan = np.arange(1, _SIDES - 1)
-    wall = [(here, ahead, ahead + _SIDES), (here, ahead + _SIDES, here + _SIDES)]
-    caps = [(0 * fan, fan + 1, fan), (0 * fan + _SIDES, fan + _SIDES, fan + 1 + _SIDES)]
-    ends = [np.stack(cap, axis=1) + 2 * _SIDES for cap in caps]
-    cells = np.concatenate([*(np.stack(side, axis=1) for side in wall), *ends])
-    return points, cells.astype(np.int32)
-
-
-def _transform(points: Vector, pose: Vector) -> Vector:
-    """Return points, shape (n, 3), at a pose: x, y, z and quaternion x, y, z, w."""
-    return rotate_rows(pose[3:], points) + pose[:3]

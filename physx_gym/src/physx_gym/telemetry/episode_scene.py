@@ -48,13 +48,14 @@ class EpisodeScene:
             simulation: The simulation after the step.
         """
         redraw(self._factory)
-        for event in self._factory.take_events():
+        events = self._factory.take_events()
+        for event in (one for several in events for one in several.each()):
             changes = {
                 option: value
                 for option, value in event.values.items()
                 if not self._is_known(event.name, option, value)
             }
-            size = sum(np.size(value) for value in changes.values())
+            size = sum(map(_size, changes.values()))
             if event.kind in _WITHOUT or not changes or self._numbers + size > _MOST_NUMBERS:
                 continue
             self._numbers += size
@@ -95,3 +96,7 @@ class EpisodeScene:
         changes = [list(change) for change in self._changes]
         contacts = np.concatenate([np.zeros((0, 7)), *self._contacts])
         return {"scene": {"added": list(self._added), "changes": changes}, "contacts": contacts}
+
+
+def _size(value: Any) -> int:
+    return sum(map(np.size, value)) if isinstance(value, list) else np.size(value)

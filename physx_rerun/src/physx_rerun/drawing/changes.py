@@ -27,7 +27,7 @@ class Changes:
         self.step, can_wait = step, True
         for event in events:
             can_wait &= event.action == "update"
-            key = (event.action, event.kind, event.name, *sorted(event.values))
+            key = (event.action, event.kind, *event.names, "", *sorted(event.values))
             self._events.pop(key, None)  # the later one has its own place in the order
             self._events[key] = event
         return can_wait

@@ -6,7 +6,7 @@ costs a few µs and stores far less.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -46,6 +46,12 @@ class Chunk:
         """Whether it is valid at all times."""
         return not self.indexes
 
+    @classmethod
+    def of(cls, entity: str, indexes: list[rr.TimeColumn], columns: list[Any]) -> Chunk:
+        """Return the chunk of some columns."""
+        nbytes = sum(column.as_arrow_array().nbytes for column in columns)
+        return cls(entity, indexes, columns, nbytes)
+
     def send(self, stream: rr.RecordingStream) -> None:
         """Write the rows to a stream."""
         stream.send_columns(self.entity, self.indexes, self.columns)
@@ -53,9 +59,8 @@ class Chunk:
 
 @dataclass
 class _Block:
+    values: dict[str, list[Any]]
     times: list[Times] = field(default_factory=list)
-    counts: list[int] = field(default_factory=list)
-    values: dict[str, list[Any]] = field(default_factory=dict)
 
 
 class ChunkBuilder:
@@ -63,10 +68,12 @@ class ChunkBuilder:
 
     Attributes:
         nbytes: Size of the collected arrays in bytes.
+        sources: Functions that return and clear further chunks.
     """
 
     def __init__(self) -> None:
         self.nbytes = 0
+        self.sources: list[Callable[[], Iterable[Chunk]]] = []
         self._whole: list[Chunk] = []
         self._blocks: dict[tuple[Any, ...], _Block] = {}
 
@@ -81,9 +88,8 @@ class ChunkBuilder:
 
     def add_archetype(self, entity: str, archetype: Any, times: Times) -> None:
         """Add one row of an archetype that cannot be combined into columns, such as a tensor."""
-        block = _Block([times], [1])
-        indexes = [_index(timeline, block) for timeline in times]
-        self._whole.append(Chunk(entity, indexes, _components([archetype])))
+        columns = _components([archetype])
+        self._whole.append(Chunk.of(entity, indexes_of([times], [1]), columns))
 
     def add(self, entity: str, archetype: type[Any], times: Times, **values: Any) -> None:
         """Add one row.
@@ -94,28 +100,13 @@ class ChunkBuilder:
             times: Position of the row on the timelines.
             values: The archetype's fields: arrays or lists whose first axis is that of instances.
         """
-        self._put(entity, archetype, times, values, 1, "row")
-
-    def add_many(self, entity: str, archetype: type[Any], times: Times, **values: Any) -> None:
-        """Add several rows of the same time; the first axis of the values is that of rows."""
-        count = len(next(iter(values.values())))
-        self._put(entity, archetype, times, values, count, "rows")
-
-    def _put(
-        self,
-        entity: str,
-        archetype: type[Any],
-        times: Times,
-        values: Mapping[str, Any],
-        count: int,
-        form: str,
-    ) -> None:
-        key = (entity, archetype, form, tuple(values), tuple(times))
-        block = self._blocks.setdefault(key, _Block())
+        key = (entity, archetype, tuple(values), tuple(times))
+        block = self._blocks.get(key)
+        if block is None:
+            block = self._blocks[key] = _Block({name: [] for name in values})
         block.times.append(times)
-        block.counts.append(count)
         for name, value in values.items():
-            block.values.setdefault(name, []).append(value)
+            block.values[name].append(value)
             self.nbytes += value.nbytes if isinstance(value, np.ndarray) else 50 * len(value)
 
     def pop_chunks(self) -> list[Chunk]:
@@ -123,15 +114,16 @@ class ChunkBuilder:
         chunks, self._whole = self._whole, []
         blocks, self._blocks = self._blocks, {}
         self.nbytes = 0
-        for (entity, archetype, form, _, timelines), block in blocks.items():
-            indexes = [_index(name, block) for name in timelines]
+        for (entity, archetype, _, _), block in blocks.items():
             columns = [
                 column
                 for name, values in block.values.items()
-                for column in _columns(archetype, name, values, form)
+                for column in _columns(archetype, name, values)
             ]
-            nbytes = sum(column.as_arrow_array().nbytes for column in columns)
-            chunks.append(Chunk(entity, indexes, columns, nbytes))
+            indexes = indexes_of(block.times, [1] * len(block.times))
+            chunks.append(Chunk.of(entity, indexes, columns))
+        for source in self.sources:
+            chunks += source()
         return chunks
 
 
@@ -147,18 +139,33 @@ def _length(batch: Any) -> int:
     return len(batch.as_arrow_array())
 
 
-def _index(timeline: str, block: _Block) -> rr.TimeColumn:
-    positions = np.repeat([times[timeline] for times in block.times], block.counts)
-    if timeline in (TIME, SIM_TIME):
-        return rr.TimeColumn(timeline, duration=positions)
-    return rr.TimeColumn(timeline, sequence=positions.astype(np.int64))
+def indexes_of(times: Sequence[Times], counts: Sequence[int]) -> list[rr.TimeColumn]:
+    """Return a column for each timeline.
+
+    Args:
+        times: Positions on the timelines, one after another.
+        counts: Number of rows at each of them.
+    """
+    columns = []
+    for timeline in times[0]:
+        positions = np.repeat([each[timeline] for each in times], counts)
+        if timeline in (TIME, SIM_TIME):
+            columns.append(rr.TimeColumn(timeline, duration=positions))
+        else:
+            columns.append(rr.TimeColumn(timeline, sequence=positions.astype(np.int64)))
+    return columns
 
 
-def _columns(archetype: type[Any], name: str, values: list[Any], form: str) -> Any:
+def columns_of(archetype: type[Any], **values: Any) -> list[Any]:
+    """Return the columns of an archetype's fields; the first axis of the values is that of rows."""
+    return [column for name in values for column in archetype.columns(**{name: values[name]})]
+
+
+def _columns(archetype: type[Any], name: str, values: list[Any]) -> Any:
     joined: Array | list[Any]
     if isinstance(values[0], np.ndarray):
         joined = np.concatenate(values)
     else:
         joined = [item for value in values for item in value]
     columns = archetype.columns(**{name: joined})
-    return columns if form == "rows" else columns.partition([len(value) for value in values])
+    return columns.partition([len(value) for value in values])

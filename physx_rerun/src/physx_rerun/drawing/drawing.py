@@ -2,25 +2,47 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
-from physx_core.components import Event
+from physx_core.components import Event, vertex_normals
 from physx_core.errors import VisualizerError, listed
 from physx_core.typing import Array
-from physx_rerun.drawing import colors
-from physx_rerun.drawing.chunks import ChunkBuilder, Times
-from physx_rerun.drawing.robot import corners_of, draw_robot, tint_robot
+from physx_rerun.drawing import colors, surfaces
+from physx_rerun.drawing.bodies import Bodies
+from physx_rerun.drawing.chunks import Chunk, ChunkBuilder, Times
+from physx_rerun.drawing.framing import RIGHT
+from physx_rerun.drawing.robot import corners_of, draw_robot, place_shapes, tint_robot
 from physx_rerun.drawing.windows import WindowLayout
 
 DEFAULT_COLOR = "silver"
 _SCREEN_POINTS = -3.0  # Rerun reads a negative radius as one in points of the screen.
 _SCREEN_LINES = -1.5
-_IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+_REMEMBERED = 1000  # sets of names
+_SYMBOL_SIZE = 0.02  # of the scene's size
+_BAR_PARTS = 64
+_DENSITY = 4.0  # of a volume: how much light its largest values take on their way through
+_MOVES = {"position", "orientation"}
+_RIGID = {"box", "sphere", "capsule", "cylinder", "height_field", "slice", "volume"}
+_GRID_VALUES = {"heights", "values"}
+_SHAPING = {"positions", "cells", "spacing", *_GRID_VALUES}
+_COLORING = {"color", "alpha", "scalar_field", "values", "colormap", "vmin", "vmax"}
+_VOLUME_MAPS = {
+    "gray": rr.components.Colormap.Grayscale,
+    "inferno": rr.components.Colormap.Inferno,
+    "magma": rr.components.Colormap.Magma,
+    "plasma": rr.components.Colormap.Plasma,
+    "Spectral": rr.components.Colormap.Spectral,
+    "turbo": rr.components.Colormap.Turbo,
+    "twilight": rr.components.Colormap.Twilight,
+    "viridis": rr.components.Colormap.Viridis,
+}
 
 
 @dataclass
@@ -31,19 +53,59 @@ class Item:
         kind: Kind of the object.
         name: Its name.
         entity: Path of its entity.
+        frame: Name of its frame; None: it is not drawn yet.
         values: All options set so far.
-        is_new: Whether it is being added.
+        is_new: Whether all of it is to be drawn.
+        bodies: Places of its bodies among those of the instance.
         limits: Smallest and largest value of its scalar field so far.
+        barred: Limits that its color bar shows.
         edges: Pairs of vertices of a wireframe mesh, shape (edges, 2).
+        seen: Points that it had since the last flush.
+        shapes: Shapes of a robot.
     """
 
     kind: str
     name: str
-    entity: str
+    entity: str = ""
+    frame: str | None = None
     values: dict[str, Any] = field(default_factory=dict)
     is_new: bool = True
+    bodies: Array = field(default_factory=lambda: np.zeros(0, np.int64))
     limits: tuple[float, float] = (np.inf, -np.inf)
+    barred: tuple[float, float] | None = None
     edges: Array | None = None
+    seen: list[Array] = field(default_factory=list)
+    shapes: list[Any] = field(default_factory=list)
+
+    @property
+    def is_hidden(self) -> bool:
+        """Whether it is not to be seen."""
+        return self.values.get("visible") is False
+
+    @property
+    def in_view(self) -> bool:
+        """Whether the camera shows it."""
+        return self.values.get("in_view") is not False
+
+    @property
+    def alpha(self) -> float:
+        """Its opacity."""
+        alpha = self.values.get("alpha")
+        return 1.0 if alpha is None else alpha
+
+    @property
+    def colormap(self) -> str:
+        """Name of its colormap."""
+        return self.values.get("colormap") or "viridis"
+
+    def widen(self, shown: Array) -> tuple[float, float]:
+        """Return the limits of its colors: those that are set, else the extremes so far."""
+        self.limits = (
+            min(self.limits[0], float(shown.min())),
+            max(self.limits[1], float(shown.max())),
+        )
+        low, high = self.values.get("vmin"), self.values.get("vmax")
+        return self.limits[0] if low is None else low, self.limits[1] if high is None else high
 
 
 class Drawing:
@@ -68,48 +130,59 @@ class Drawing:
             pixels: Size of the pictures that are rendered; None: a person looks at it.
         """
         self._pixels = pixels
-        self._id, self._rows, self._layout, self._draws_shapes = (
-            instance_id,
-            rows,
-            layout,
-            draws_shapes,
-        )
+        self._id, self._rows, self._layout = instance_id, rows, layout
+        self._draws_shapes = draws_shapes
         self._origin = f"env_{instance_id}"
+        self._world = f"tf#/{self._origin}"  # the frame that Rerun gives the origin
         self._drawn: dict[str, Item] = {}
-        self._frames: list[str] = []
-        self._poses: list[Array] = []
+        self._moved: dict[tuple[str, ...], Array] = {}
+        self._bodies = Bodies(f"{self._origin}/tf")
+        self._lives: dict[str, int] = {}
         self._has_world = False
         self._followed: str | None = None
         self._draw_kind: dict[str, Callable[[Item, dict[str, Any], Times], None]] = {
             "mesh": self._mesh,
+            "height_field": self._mesh,
+            "slice": self._mesh,
+            "volume": self._volume,
             "points": self._points,
             "arrows": self._arrows,
             "lines": self._lines,
+            "symbols": self._symbols,
             "box": self._box,
             "sphere": self._sphere,
             "capsule": self._capsule,
+            "cylinder": self._cylinder,
+            "image": self._image,
             "text": self._text,
             "scalars": self._scalars,
             "robot": self._robot,
         }
+        rows.sources.append(self._pop)
 
     def draw(self, events: Iterable[Event], times: Times) -> None:
         """Draw the events of one step."""
         for event in events:
-            self._draw(event, times)
+            if event.action == "update" and event.values.keys() <= _MOVES:
+                places = self._places(event.names)
+                if places is not None:
+                    self._bodies.move(places, times, event.values)
+                    continue
+            for one in event.each():
+                self._draw(one, times)
         self._follow()
-        if self._frames:
-            poses = np.concatenate(self._poses)
-            self._rows.add_many(
-                f"{self._origin}/tf",
-                rr.Transform3D,
-                times,
-                translation=poses[:, :3],
-                quaternion=poses[:, 3:],
-                child_frame=self._frames,
-                parent_frame=[self._world] * len(poses),
-            )
-            self._frames, self._poses = [], []
+
+    def _places(self, names: tuple[str, ...]) -> Array | None:
+        """Return the places of rigid bodies; None if not all of the objects are."""
+        places = self._moved.get(names)
+        if places is None:
+            drawn = [self._drawn.get(name) for name in names]
+            found = [each.bodies for each in drawn if each is not None and each.kind in _RIGID]
+            if len(found) == len(names):
+                if len(self._moved) >= _REMEMBERED:
+                    self._moved.clear()
+                self._moved[names] = places = np.concatenate(found)
+        return places
 
     def _draw(self, event: Event, times: Times) -> None:
         if event.kind not in (*self._draw_kind, "view"):
@@ -125,113 +198,189 @@ class Drawing:
             self._layout.set_view(self._id, **values)
             return
         if event.action == "add":
-            entity = "/".join(rr.escape_entity_path_part(part) for part in event.name.split("/"))
-            self._drawn[event.name] = Item(event.kind, event.name, f"{self._origin}/{entity}")
+            self._drawn[event.name] = Item(event.kind, event.name)
+            self._moved.clear()
         drawn = self._drawn.get(event.name)
         if drawn is None:
             raise VisualizerError(
                 f'Instance {self._id} changes "{event.name}", which it has not added. '
                 f"Objects: {listed(self._drawn)}."
             )
-        changes = dict(event.values)
+        if event.action == "remove":
+            self._hide(drawn, times)
+            del self._drawn[event.name]
+            self._moved.clear()
+        else:
+            self._change(drawn, dict(event.values), times)
+
+    def _change(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
+        was_hidden, is_first = drawn.is_hidden, drawn.frame is None
         drawn.values.update(changes)
-        if drawn.is_new and event.kind not in ("scalars", "text"):
+        if "color" in changes and "scalar_field" not in changes:
+            drawn.values.pop("scalar_field", None)
+        if is_first:
             self._register(drawn)
-        self._draw_kind[event.kind](drawn, changes, times)
-        drawn.is_new = False
+        elif drawn.is_hidden and not was_hidden:
+            self._hide(drawn, times)
+        elif was_hidden and not drawn.is_hidden:
+            drawn.is_new, drawn.barred, changes = True, None, dict(drawn.values)
+        moves = {name: changes[name] for name in _MOVES & changes.keys()}
+        if (moves or is_first) and drawn.kind in _RIGID:
+            self._bodies.move(drawn.bodies, times, moves)
+        if drawn.kind == "robot" or not drawn.is_hidden:
+            self._draw_kind[drawn.kind](drawn, changes, times)
+            drawn.is_new = False
+
+    def _hide(self, drawn: Item, times: Times) -> None:
+        if drawn.kind == "robot":
+            place_shapes(self._rows, drawn.shapes, times, is_visible=False)
+        else:
+            self._rows.add(drawn.entity, rr.Clear, times, is_recursive=[True])
 
     def _follow(self) -> None:
         """Let the camera follow the configured object, once it is drawn."""
-        drawn = self._drawn.get(self._followed or "")
+        if self._followed is None:
+            return
+        drawn = self._drawn.get(self._followed)
         if drawn is not None:
             # The first shape of a robot belongs to its root link, if that has any.
-            shapes = drawn.values.get("shapes", ())
-            self._layout.follow(self._id, shapes[0][0] if shapes else drawn.entity)
+            self._layout.follow(self._id, drawn.shapes[0][0] if drawn.shapes else drawn.entity)
             self._followed = None
+
+    def _pop(self) -> list[Chunk]:
+        """Return and clear the moves of bodies, and tell the camera where everything was."""
+        frame = self._layout.frame(self._id) if self._has_world else None
+        chunks = self._bodies.pop(frame)
+        for drawn in self._drawn.values():
+            if drawn.seen and frame is not None:
+                margin = drawn.values.get("size") or 0.0
+                low, high = _extremes(np.concatenate(drawn.seen))
+                frame.see(low - margin, high + margin)
+                drawn.seen = []
+        self._layout.grow(self._id)
+        return chunks
 
     # Frames ----------------------------------------------------------------------------------
 
-    @property
-    def _world(self) -> str:
-        return f"{self._origin}/world"
-
     def _register(self, drawn: Item) -> None:
+        """Give an object its frame: one of its own if it is rigid, else the world's."""
+        life = self._lives[drawn.name] = self._lives.get(drawn.name, 0) + 1
+        name = drawn.name if life == 1 else f"{drawn.name} ({life})"
+        entity = "/".join(map(rr.escape_entity_path_part, name.split("/")))
+        # What lies below the origin is drawn in the scene.
+        folder = f"images/{self._origin}" if drawn.kind == "image" else self._origin
+        drawn.entity = f"{folder}/{entity}"
+        drawn.frame = self._world
+        if drawn.kind in ("scalars", "text", "image"):
+            return
         if not self._has_world:
             self._has_world = True
-            self._rows.add_static(self._origin, rr.CoordinateFrame(self._world))
             self._rows.add_static(self._origin, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._layout.add_object(self._id, drawn.kind, drawn.name)
-        if drawn.kind not in ("robot", "box", "sphere", "capsule"):
-            self._rows.add_static(drawn.entity, rr.CoordinateFrame(self._world))
+        if drawn.kind in _RIGID or drawn.kind == "robot":
+            drawn.frame = f"{self._origin}/{name}"
+        if drawn.kind in _RIGID:
+            drawn.bodies = self._bodies.add([drawn.frame])
+            self._rows.add_static(drawn.entity, rr.CoordinateFrame(drawn.frame))
 
-    def _set_poses(self, frames: list[str], poses: Array) -> None:
-        self._frames += frames
-        self._poses.append(poses)
-
-    def _pose(self, drawn: Item, changes: dict[str, Any], reach: Array) -> None:
-        frame = f"{self._origin}/{drawn.name}"
-        if drawn.is_new:
-            self._rows.add_static(drawn.entity, rr.CoordinateFrame(frame))
-        elif "position" not in changes and "orientation" not in changes:
+    def _see(self, drawn: Item, points: Array) -> None:
+        """Keep points of an object in view, in its frame."""
+        if not drawn.in_view or not len(points):
             return
-        position = drawn.values.get("position", np.zeros(3))
-        orientation = drawn.values.get("orientation", _IDENTITY)
-        self._set_poses([frame], np.concatenate([position, orientation])[None])
-        self._layout.place(self._id, drawn.name, np.array([position - reach, position + reach]))
+        if drawn.kind not in _RIGID:
+            drawn.seen.append(points)
+        else:
+            self._bodies.set_box(int(drawn.bodies[0]), points)
 
     # Looks -----------------------------------------------------------------------------------
 
-    def _colors(self, drawn: Item, changes: dict[str, Any]) -> Array | None:
+    def _colors(self, drawn: Item, changes: dict[str, Any], times: Times) -> Array | None:
         """Return the object's colors, one or one per value; None if they do not change."""
-        if not drawn.is_new and not changes.keys() & {"color", "alpha", "scalar_field"}:
+        if not drawn.is_new and not changes.keys() & _COLORING:
             return None
         values = drawn.values
-        alpha = 1.0 if values.get("alpha") is None else values["alpha"]
-        if "color" in changes and "scalar_field" not in changes:
-            values.pop("scalar_field", None)
-        shown = values.get("scalar_field")
-        if shown is None or not len(shown):
-            return colors.rgba(values.get("color") or DEFAULT_COLOR, alpha)
-        low, high = drawn.limits
-        drawn.limits = (min(low, float(np.nanmin(shown))), max(high, float(np.nanmax(shown))))
-        return colors.map_values(shown, drawn.limits, values.get("colormap") or "viridis", alpha)
+        shown = values.get("values" if drawn.kind == "slice" else "scalar_field")
+        if shown is None or not shown.size:
+            return colors.rgba(values.get("color") or DEFAULT_COLOR, drawn.alpha)
+        limits = drawn.widen(shown)
+        self._color_bar(drawn, limits, times)
+        return colors.map_values(shown.ravel(), limits, drawn.colormap, drawn.alpha)
 
-    def _fill(self, drawn: Item, changes: dict[str, Any]) -> dict[str, Any]:
+    def _color_bar(self, drawn: Item, limits: tuple[float, float], times: Times) -> None:
+        """Draw the colors of the limits beside the object."""
+        if not drawn.values.get("color_bar") or limits == drawn.barred:
+            return
+        points = self._points_of(drawn)
+        levels = np.linspace(*limits, _BAR_PARTS + 1)
+        tints = np.tile(colors.map_values(levels, limits, drawn.colormap, 1.0), 2)
+        corners, cells, ticks = surfaces.bar_beside(points, RIGHT, _BAR_PARTS)
+        bar, texts = f"{drawn.entity}/color_bar", f"{drawn.entity}/color_bar/values"
+        drawn.barred = limits
+        self._rows.add(
+            bar,
+            rr.Mesh3D,
+            times,
+            vertex_positions=corners,
+            triangle_indices=cells,
+            vertex_colors=tints,
+        )
+        labels = [f"{level:.4g}" for level in (limits[0], sum(limits) / 2, limits[1])]
+        labels[-1] += f"  {drawn.name}"
+        self._rows.add(
+            texts, rr.Points3D, times, positions=ticks, labels=labels, radii=np.zeros(1, np.float32)
+        )
+        self._layout.frame(self._id).see(*_extremes(np.concatenate([corners, ticks])))
+
+    def _points_of(self, drawn: Item) -> Array:
+        """Return points of an object in the world."""
+        if drawn.kind in surfaces.GRIDS:
+            corners = surfaces.corners_of_grid(drawn.kind, drawn.values)
+            return self._bodies.in_world(int(drawn.bodies[0]), corners)
+        return drawn.values["positions"]
+
+    def _fill(self, drawn: Item, changes: dict[str, Any], times: Times) -> dict[str, Any]:
         look: dict[str, Any] = {}
-        tint = self._colors(drawn, changes)
+        tint = self._colors(drawn, changes, times)
         if tint is not None:
             look["colors"] = tint
         if drawn.is_new or "wireframe" in changes:
             wireframe = drawn.values.get("wireframe")
             mode = rr.components.FillMode.MajorWireframe if wireframe else "solid"
             look["fill_mode"] = [mode]
+        if "size" in changes:
+            look["line_radii"] = _radius(changes["size"], _SCREEN_LINES)
+        if changes.get("label") is not None:
+            look["labels"] = [changes["label"]]
         return look
 
     def _add(self, drawn: Item, archetype: type[Any], times: Times, look: dict[str, Any]) -> None:
         if look:
             self._rows.add(drawn.entity, archetype, times, **look)
 
-    # Kinds -----------------------------------------------------------------------------------
+    # Surfaces and volumes --------------------------------------------------------------------
 
     def _mesh(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
         look: dict[str, Any] = {}
-        positions, cells = drawn.values["positions"], drawn.values["cells"]
-        if drawn.is_new:
-            self._rows.add_static(drawn.entity, rr.Mesh3D.from_fields(triangle_indices=cells))
-            self._layout.place(self._id, drawn.name, positions)
-        if drawn.is_new or changes.keys() & {"positions", "wireframe"}:
-            wireframe = bool(drawn.values.get("wireframe"))
+        values, wireframe = drawn.values, bool(drawn.values.get("wireframe"))
+        moved = drawn.is_new or bool(changes.keys() & _SHAPING)
+        if moved or "wireframe" in changes:
+            positions, cells = surfaces.mesh_of(drawn.kind, values)
+            self._see(drawn, positions)
             shown = positions[:0] if wireframe else positions
             look["vertex_positions"] = shown
-            look["vertex_normals"] = _normals(shown, cells)
+            if drawn.kind != "slice":  # without normals its colors are not shaded
+                look["vertex_normals"] = vertex_normals(shown, cells)
+            if drawn.is_new or changes.keys() & {"cells", "spacing", "wireframe", *_GRID_VALUES}:
+                look["triangle_indices"] = cells[:0] if wireframe else cells
+                drawn.edges = None
             if wireframe or "wireframe" in changes:
                 self._edges(drawn, positions if wireframe else None, cells, times)
-        tint = self._colors(drawn, changes)
+        tint = self._colors(drawn, changes, times)
         if tint is not None:
-            has_field = drawn.values.get("scalar_field") is not None
-            look["vertex_colors"] = tint if has_field else tint[:0]
+            has_field = drawn.kind == "slice" or values.get("scalar_field") is not None
+            look["vertex_colors"] = tint if has_field and not wireframe else tint[:0]
             look["albedo_factor"] = (tint[:1] | 0xFFFFFF00) if has_field else tint
-            if drawn.values.get("wireframe"):
+            if wireframe:
                 edges = f"{drawn.entity}/edges"
                 self._rows.add(edges, rr.LineStrips3D, times, colors=tint[:1])
         self._add(drawn, rr.Mesh3D, times, look)
@@ -239,60 +388,188 @@ class Drawing:
     def _edges(self, drawn: Item, positions: Array | None, cells: Array, times: Times) -> None:
         entity = f"{drawn.entity}/edges"
         if drawn.edges is None:
-            pairs = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-            drawn.edges = np.unique(pairs, axis=0)
-            thin = rr.LineStrips3D.from_fields(radii=[_SCREEN_LINES / 2])
-            self._rows.add_static(entity, rr.CoordinateFrame(self._world), thin)
-        strips = np.zeros((0, 2, 3)) if positions is None else positions[drawn.edges]
-        self._rows.add(entity, rr.LineStrips3D, times, strips=strips)
+            drawn.edges = surfaces.edges_of(cells)
+            if drawn.kind in _RIGID:
+                self._rows.add_static(entity, rr.CoordinateFrame(str(drawn.frame)))
+        self._rows.add(
+            entity,
+            rr.LineStrips3D,
+            times,
+            strips=np.zeros((0, 2, 3)) if positions is None else positions[drawn.edges],
+            radii=_radius(drawn.values.get("size"), _SCREEN_LINES / 2),
+        )
+
+    def _volume(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
+        if not drawn.is_new and not changes.keys() & {*_COLORING, "spacing"}:
+            return
+        values = drawn.values["values"]
+        low, high = drawn.widen(values)
+        self._see(drawn, surfaces.corners_of_grid("volume", drawn.values))
+        self._color_bar(drawn, (low, high), times)
+        share = np.clip((values - low) / max(high - low, 1e-30), 0.0, 1.0)
+        known = _VOLUME_MAPS.get(drawn.colormap)
+        if known is None:
+            warnings.warn(
+                f'Rerun draws no volumes in "{drawn.colormap}" but in {listed(_VOLUME_MAPS)}: '
+                f'"{drawn.name}" is drawn in viridis.',
+                stacklevel=2,
+            )
+        self._rows.add_archetype(
+            drawn.entity,
+            rr.Volume3D(
+                np.ascontiguousarray(share.astype(np.float16).transpose(2, 1, 0)),
+                voxel_size=drawn.values["spacing"],
+                value_range=(0.0, 1.0),
+                colormap=known or _VOLUME_MAPS["viridis"],
+                gamma=1.0,
+                optical_density=_DENSITY * drawn.alpha,
+            ),
+            times,
+        )
+        slices = f"{drawn.entity}/slices"
+        if drawn.is_new:
+            self._layout.add_window(self._id, drawn.name, rrb.TensorView, slices)
+        tensor = rr.Tensor(values, dim_names=("x", "y", "z"), value_range=(low, high))
+        self._rows.add_archetype(slices, tensor, times)
+
+    # Points and lines ------------------------------------------------------------------------
 
     def _points(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
         look = {"positions": changes["positions"]} if "positions" in changes else {}
-        self._add(drawn, rr.Points3D, times, look | self._stroke(drawn, changes, _SCREEN_POINTS))
+        if look:
+            self._see(drawn, look["positions"])
+        look |= self._stroke(drawn, changes, times, _SCREEN_POINTS)
+        self._add(drawn, rr.Points3D, times, look)
 
     def _arrows(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
         names = {"positions": "origins", "vectors": "vectors"}
-        look = {names[name]: changes[name] for name in names if name in changes}
-        self._add(drawn, rr.Arrows3D, times, look | self._stroke(drawn, changes, _SCREEN_LINES))
+        look: dict[str, Any] = {names[name]: changes[name] for name in names if name in changes}
+        if look:
+            positions, vectors = drawn.values["positions"], drawn.values["vectors"]
+            self._see(drawn, np.concatenate([positions, positions + vectors]))
+        look |= self._stroke(drawn, changes, times, _SCREEN_LINES)
+        self._add(drawn, rr.Arrows3D, times, look)
 
     def _lines(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
-        look = {"strips": [changes["positions"]]} if "positions" in changes else {}
-        self._add(drawn, rr.LineStrips3D, times, look | self._stroke(drawn, changes, _SCREEN_LINES))
+        look = {"strips": changes["positions"]} if "positions" in changes else {}
+        if look:
+            self._see(drawn, np.concatenate(look["strips"]))
+        look |= self._stroke(drawn, changes, times, _SCREEN_LINES)
+        self._add(drawn, rr.LineStrips3D, times, look)
 
-    def _stroke(self, drawn: Item, changes: dict[str, Any], default: float) -> dict[str, Any]:
-        if drawn.is_new:
-            self._layout.place(self._id, drawn.name, drawn.values["positions"])
+    def _symbols(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
+        values = drawn.values
         look: dict[str, Any] = {}
-        tint = self._colors(drawn, changes)
+        if drawn.is_new and values.get("size") is None:
+            size = max(self._layout.frame(self._id).size, _size(values["positions"]))
+            values["size"] = _SYMBOL_SIZE * size or 0.05
+        name, positions = values.get("symbol", "circle"), values["positions"]
+        if drawn.is_new or changes.keys() & {"positions", "orientations", "size"}:
+            self._see(drawn, positions)
+            look["strips"] = surfaces.symbol_lines(
+                name, positions, values.get("orientations"), values["size"]
+            )
+        tint = self._colors(drawn, changes, times)
+        if tint is not None:
+            parts = len(surfaces.SYMBOLS[name])
+            look["colors"] = np.repeat(tint, parts) if len(tint) > 1 else tint
+        if drawn.is_new:
+            look["radii"] = _radius(None, _SCREEN_LINES)
+        self._add(drawn, rr.LineStrips3D, times, look)
+        labels = values.get("labels")
+        if labels and changes.keys() & {"labels", "positions"}:
+            entity = f"{drawn.entity}/labels"
+            none = np.zeros(1, np.float32)
+            self._rows.add(
+                entity, rr.Points3D, times, positions=positions, labels=labels, radii=none
+            )
+
+    def _stroke(
+        self, drawn: Item, changes: dict[str, Any], times: Times, default: float
+    ) -> dict[str, Any]:
+        look: dict[str, Any] = {}
+        tint = self._colors(drawn, changes, times)
         if tint is not None:
             look["colors"] = tint
         if drawn.is_new or "size" in changes:
-            size = drawn.values.get("size")
-            look["radii"] = np.array([default if size is None else size], np.float32)
+            look["radii"] = _radius(drawn.values.get("size"), default)
+        if "labels" in changes:
+            look["labels"] = changes["labels"] or []
         return look
 
+    # Solids ----------------------------------------------------------------------------------
+
     def _box(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
-        half = drawn.values["half_sizes"]
-        if drawn.is_new:
-            self._rows.add_static(drawn.entity, rr.Boxes3D.from_fields(half_sizes=[half]))
-        self._pose(drawn, changes, half)
-        self._add(drawn, rr.Boxes3D, times, self._fill(drawn, changes))
+        look = self._fill(drawn, changes, times)
+        if "half_sizes" in changes:
+            half = changes["half_sizes"]
+            look["half_sizes"] = half[np.newaxis]
+            self._see(drawn, np.stack([-half, half]))
+        self._add(drawn, rr.Boxes3D, times, look)
 
     def _sphere(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
-        radius, look = drawn.values["radius"], self._fill(drawn, changes)
+        look = self._fill(drawn, changes, times)
         if "radius" in changes:
-            look["half_sizes"] = np.full((1, 3), radius, np.float32)
-        self._pose(drawn, changes, np.full(3, radius))
+            half = np.full((1, 3), changes["radius"], np.float32)
+            look["half_sizes"] = half
+            self._see(drawn, np.concatenate([-half, half]))
         self._add(drawn, rr.Ellipsoids3D, times, look)
 
     def _capsule(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
-        radius, length = drawn.values["radius"], drawn.values["length"]
-        look = self._fill(drawn, changes)
+        look = self._fill(drawn, changes, times)
         if changes.keys() & {"radius", "length"}:
+            radius, length = drawn.values["radius"], drawn.values["length"]
             look["radii"], look["lengths"] = np.array([radius]), np.array([length])
             look["translations"] = np.array([[0.0, 0.0, -length / 2]])
-        self._pose(drawn, changes, np.full(3, radius + length / 2))
+            half = np.array([radius, radius, radius + length / 2])
+            self._see(drawn, np.stack([-half, half]))
         self._add(drawn, rr.Capsules3D, times, look)
+
+    def _cylinder(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
+        look = self._fill(drawn, changes, times)
+        if changes.keys() & {"radius", "length"}:
+            radius, length = drawn.values["radius"], drawn.values["length"]
+            look["radii"], look["lengths"] = np.array([radius]), np.array([length])
+            half = np.array([radius, radius, length / 2])
+            self._see(drawn, np.stack([-half, half]))
+        self._add(drawn, rr.Cylinders3D, times, look)
+
+    def _robot(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
+        values = drawn.values
+        if not drawn.shapes and not drawn.bodies.size:
+            frames = [f"{drawn.frame}/{body}" for body in values["bodies"]]
+            drawn.shapes, rest = draw_robot(
+                self._rows, drawn.entity, values, frames, self._world, self._pixels
+            )
+            drawn.bodies = self._bodies.add(frames)
+            if changes.get("poses") is None:
+                changes["poses"] = rest
+            if drawn.in_view:
+                self._see_robot(drawn)
+        if drawn.is_new:
+            place_shapes(self._rows, drawn.shapes, times, is_visible=not drawn.is_hidden)
+        if drawn.is_new or changes.keys() & {"color", "alpha"}:
+            tint_robot(self._rows, drawn.shapes, values, times)
+        poses = changes.get("poses")
+        if poses is not None:
+            place = {"position": poses[:, :3], "orientation": poses[:, 3:]}
+            self._bodies.move(drawn.bodies, times, place)
+
+    def _see_robot(self, drawn: Item) -> None:
+        """Keep a robot's shapes in view, and the origins of its bodies."""
+        for number, body in enumerate(drawn.bodies):
+            shapes = [shape for _, shape in drawn.shapes if shape.body == number]
+            self._bodies.set_box(int(body), corners_of(shapes))
+        fixed = [shape for _, shape in drawn.shapes if shape.body is None]
+        if fixed:
+            self._layout.frame(self._id).see(*_extremes(corners_of(fixed)))
+
+    # Windows beside the scene ----------------------------------------------------------------
+
+    def _image(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
+        if drawn.is_new:
+            self._layout.add_window(self._id, drawn.name, rrb.Spatial2DView, drawn.entity)
+        self._rows.add_archetype(drawn.entity, rr.Image(changes["image"]), times)
 
     def _text(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
         if drawn.is_new:
@@ -305,8 +582,8 @@ class Drawing:
             self._rows.add(drawn.entity, rr.TextDocument, times, text=[content])
 
     def _scalars(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
-        labels = drawn.values["labels"]
         if drawn.is_new:
+            labels = drawn.values["labels"]
             prefix = f"{self._layout.title(self._id)}: " if self._layout.instance_nb > 1 else ""
             shift = (self._id - 1) * len(labels) if self._layout.instance_nb > 1 else 0
             lines = colors.curves(len(labels), shift)
@@ -317,47 +594,17 @@ class Drawing:
                 title = f"{drawn.name} ({unit})" if unit else drawn.name
                 self._layout.add_plot(title, drawn.entity, "step", len(labels))
         values = changes.get("values")
-        if values is None:
-            return
-        if len(values) != len(labels):
-            raise VisualizerError(
-                f'The scalars "{drawn.name}" have {len(labels)} labels but {len(values)} values.'
-            )
-        self._rows.add(drawn.entity, rr.Scalars, times, scalars=values)
-
-    def _robot(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
-        values = drawn.values
-        frames = [f"{self._origin}/{drawn.name}/{body}" for body in values["bodies"]]
-        if drawn.is_new:
-            values["shapes"], rest = draw_robot(
-                self._rows, drawn.entity, values, frames, self._world, self._pixels
-            )
-            if changes.get("poses") is None:
-                changes["poses"] = rest
-        if drawn.is_new or changes.keys() & {"color", "alpha"}:
-            tint_robot(self._rows, values, times)
-        poses = changes.get("poses")
-        if poses is None:
-            return
-        if len(poses) != len(frames):
-            raise VisualizerError(
-                f'The robot "{drawn.name}" has {len(frames)} bodies but got {len(poses)} poses.'
-            )
-        self._set_poses(frames, poses)
-        if drawn.is_new:
-            corners = corners_of([shape for _, shape in values["shapes"]], poses)
-            self._layout.place(self._id, drawn.name, corners)
+        if values is not None:
+            self._rows.add(drawn.entity, rr.Scalars, times, scalars=values)
 
 
-def _normals(positions: Array, cells: Array) -> Array:
-    """Return the unit normals of a mesh's vertices: area-weighted means of the triangles'."""
-    normals = np.zeros_like(positions)
-    if not len(positions) or not len(cells):
-        return normals
-    corners = positions[cells]
-    faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    for axis in range(3):
-        weights = np.repeat(faces[:, axis], 3)
-        normals[:, axis] = np.bincount(cells.ravel(), weights, minlength=len(positions))
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.maximum(lengths, 1e-12)
+def _radius(size: float | None, default: float) -> Array:
+    return np.array([default if size is None else size], np.float32)
+
+
+def _size(points: Array) -> float:
+    return float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
+
+
+def _extremes(points: Array) -> tuple[Array, Array]:
+    return points.min(axis=0), points.max(axis=0)

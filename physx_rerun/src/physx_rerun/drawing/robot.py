@@ -13,8 +13,9 @@ from physx_core.rotations import from_matrix_rows, rotate_rows
 from physx_core.typing import Array
 from physx_rerun.drawing import colors
 from physx_rerun.drawing.chunks import ChunkBuilder, Times
+from physx_rerun.drawing.meshes import corners_of_mesh
 from physx_rerun.drawing.triangles import SimpleMesh, simple_mesh
-from physx_rerun.drawing.urdf import MESH_TYPES, VisualShape, read
+from physx_rerun.drawing.urdf import MESH_TYPES, Model, VisualShape, read
 
 _FINEST = 3.0  # pixels of the smallest detail of a robot that fills a picture
 _SILVER = (0.75, 0.78, 0.81, 1.0)
@@ -53,35 +54,47 @@ def draw_robot(
             stacklevel=2,
         )
     drawn = []
-    corners = corners_of(model.shapes, model.rest)
-    reach = float(np.linalg.norm(np.ptp(corners, axis=0)))
-    detail = None if pixels is None else _FINEST * reach / pixels
+    detail = None if pixels is None else _FINEST * _extent(model) / pixels
     for shape in model.shapes:
         path = f"{entity}/{rr.escape_entity_path_part(shape.name)}"
         frame = world if shape.body is None else frames[shape.body]
-        pose = rr.InstancePoses3D(
-            translations=[_center(shape)],
-            quaternions=from_matrix_rows(shape.pose[np.newaxis, :3, :3]),
-            scales=[shape.size] if shape.kind == "mesh" else None,
-        )
         simple = _simplified(shape, detail)
         if simple is not None:
             values.setdefault("simple", {})[path] = colors.pack_rgba(simple.colors)
-        rows.add_static(path, rr.CoordinateFrame(frame), pose, _geometry(shape, simple))
+        rows.add_static(path, rr.CoordinateFrame(frame), _geometry(shape, simple))
         drawn.append((path, shape))
     return drawn, model.rest
 
 
-def tint_robot(rows: ChunkBuilder, values: dict[str, Any], times: Times) -> None:
+def place_shapes(
+    rows: ChunkBuilder, shapes: Sequence[DrawnShape], times: Times, *, is_visible: bool
+) -> None:
+    """Place a robot's shapes in the frames of their bodies; hidden ones shrink to nothing."""
+    for path, shape in shapes:
+        scale = shape.size if shape.kind == "mesh" else (1.0, 1.0, 1.0)
+        rows.add(
+            path,
+            rr.InstancePoses3D,
+            times,
+            translations=_center(shape)[np.newaxis],
+            quaternions=from_matrix_rows(shape.pose[np.newaxis, :3, :3]),
+            scales=np.array([scale if is_visible else (0.0, 0.0, 0.0)]),
+        )
+
+
+def tint_robot(
+    rows: ChunkBuilder, shapes: Sequence[DrawnShape], values: dict[str, Any], times: Times
+) -> None:
     """Set the color and opacity of a robot's shapes, by default those of the URDF.
 
     Args:
         rows: Collects the rows.
-        values: The robot's values, with its ``shapes``.
+        shapes: The shapes.
+        values: The robot's values.
         times: Time of the change.
     """
     color, alpha = values.get("color"), values.get("alpha")
-    for path, shape in values["shapes"]:
+    for path, shape in shapes:
         own = shape.color
         file_colors = values.get("simple", {}).get(path)
         if color is None and alpha is None and own is None and shape.kind == "mesh":
@@ -110,20 +123,29 @@ _LOOKS: dict[str, tuple[type[Any], str]] = {
 }
 
 
-def corners_of(shapes: Sequence[VisualShape], poses: Array) -> Array:
-    """Return points that bound a robot: its bodies' origins, and the corners of its shapes.
-
-    Args:
-        shapes: Its shapes; of a mesh only the origin is known.
-        poses: Poses of the bodies, shape (bodies, 7).
-    """
-    found = [poses[:, :3]]
+def corners_of(shapes: Sequence[VisualShape]) -> Array:
+    """Return the corners of a body's shapes in its frame, and its origin, shape (n, 3)."""
+    found = [np.zeros((1, 3))]
     for shape in shapes:
-        points = _SIGNS * _half_extents(shape) @ shape.pose[:3, :3].T + shape.pose[:3, 3]
-        if shape.body is not None:
-            points = rotate_rows(poses[shape.body, 3:], points) + poses[shape.body, :3]
-        found.append(points)
+        if shape.mesh is None:
+            corners = _SIGNS * _half_extents(shape)
+        else:
+            box = shape.size * corners_of_mesh(shape.mesh)
+            corners = np.where(_SIGNS > 0, box[-1], box[0])
+        found.append(corners @ shape.pose[:3, :3].T + shape.pose[:3, 3])
     return np.concatenate(found)
+
+
+def _extent(model: Model) -> float:
+    """Return the diagonal of the box around a robot at rest, in m."""
+    found = [model.rest[:, :3]]
+    for shape in model.shapes:
+        points = corners_of([shape])
+        if shape.body is not None:
+            pose = model.rest[shape.body]
+            points = rotate_rows(pose[3:], points) + pose[:3]
+        found.append(points)
+    return float(np.linalg.norm(np.ptp(np.concatenate(found), axis=0)))
 
 
 _SIGNS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
@@ -131,8 +153,6 @@ _SIGNS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in 
 
 def _half_extents(shape: VisualShape) -> Array:
     """Return a shape's half extents along its axes."""
-    if shape.kind == "mesh":
-        return np.zeros(3)
     if shape.kind == "box":
         return np.array(shape.size)
     radius, length = shape.size[0], shape.size[-1]

@@ -7,14 +7,13 @@ import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
-import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from physx_core.typing import Array
 from physx_rerun.drawing.chunks import SIM_TIME, TIME
+from physx_rerun.drawing.framing import Frame
 
-_VIEW_FROM = np.array([1.0, -1.1, 0.65]) / np.linalg.norm([1.0, -1.1, 0.65])
 _BACKGROUND = (25, 28, 36)
 _GRID = (58, 63, 76)
 
@@ -22,9 +21,8 @@ _ROW = 3  # largest number of scenes side by side
 _COLUMN = 4  # largest number of plots in a column
 _LEGEND = 8  # largest number of names in a plot's legend
 
+_Window = type[rrb.Spatial2DView | rrb.TensorView]
 Container = rrb.Grid | rrb.Vertical | rrb.Horizontal | rrb.Tabs
-Box = tuple[Array, Array]
-"""Lower and upper corner, each of shape (3,)."""
 
 
 @dataclass
@@ -43,8 +41,9 @@ class WindowLayout:
     has_time_panel: bool = True
     has_sim_time: bool = False
     _kinds: set[tuple[str, str]] = field(default_factory=set)
-    _scenes: dict[int, dict[str, Box]] = field(default_factory=dict)
+    _scenes: dict[int, Frame] = field(default_factory=dict)
     _plots: dict[str, dict[str, int]] = field(default_factory=dict)
+    _windows: dict[str, dict[int, tuple[_Window, str]]] = field(default_factory=dict)
     _texts: dict[str, dict[int, str]] = field(default_factory=dict)
     _timelines: set[str] = field(default_factory=set)
     _titles: dict[int, str] = field(default_factory=dict)
@@ -71,7 +70,7 @@ class WindowLayout:
     def add_object(self, instance_id: int, kind: str, name: str) -> None:
         """Register a shape in the scene of an instance."""
         self.changed |= instance_id not in self._scenes
-        self._scenes.setdefault(instance_id, {})
+        self._scenes.setdefault(instance_id, Frame())
         self._kinds.add((kind, name))
 
     def add_plot(self, name: str, entity: str, timeline: str, curve_nb: int) -> None:
@@ -91,17 +90,21 @@ class WindowLayout:
         self._kinds.add(("text", name))
         self.changed = True
 
-    def place(self, instance_id: int, name: str, points: Array) -> None:
-        """Register the place of an object, once; by default the camera shows all places.
+    def add_window(self, instance_id: int, name: str, view: _Window, entity: str) -> None:
+        """Register an entity of an instance that has a view of its own."""
+        self._windows.setdefault(name, {})[instance_id] = (view, entity)
+        self._kinds.add((view.__name__, name))
+        self.changed = True
 
-        Args:
-            instance_id: The object's instance.
-            name: Name of the object.
-            points: Points that the object contains, shape (n, 3), in m.
-        """
-        scene = self._scenes.setdefault(instance_id, {})
-        if name not in scene and len(points) and np.isfinite(points).all():
-            scene[name] = (points.min(axis=0), points.max(axis=0))
+    def frame(self, instance_id: int) -> Frame:
+        """Return what the camera of an instance shows: by default everything that there was."""
+        return self._scenes.setdefault(instance_id, Frame())
+
+    def grow(self, instance_id: int) -> None:
+        """Show more of an instance if something is out of view, unless its camera is placed."""
+        is_placed = "eye" in self._cameras.get(instance_id, {}) or instance_id in self._followed
+        if instance_id in self._scenes and not is_placed:
+            self.changed |= self._scenes[instance_id].grow()
 
     def digest(self, kinds: Set[tuple[str, str]] = frozenset()) -> str:
         """Return a text that is the same for equal sets of objects and numbers of instances.
@@ -135,6 +138,7 @@ class WindowLayout:
         plots: list[rrb.View | Container] = [
             *(_plot_view(name, curves) for name, curves in self._plots.items()),
             *further,
+            *(self._window_views(name, views) for name, views in self._windows.items()),
         ]
         texts = [self._text_views(name, entities) for name, entities in self._texts.items()]
         in_a_row = 1 < len(scenes) <= _ROW
@@ -178,14 +182,21 @@ class WindowLayout:
             )
         )
 
+    def _window_views(self, name: str, views: Mapping[int, tuple[_Window, str]]) -> Container:
+        several = self.instance_nb > 1
+        return rrb.Tabs(
+            *(
+                view(origin=entity, name=f"{name} {instance_id}" if several else name)
+                for instance_id, (view, entity) in sorted(views.items())
+            )
+        )
+
     def _scene_view(self, instance_id: int) -> rrb.Spatial3DView:
-        low, high = self._bounds(instance_id)
-        size = max(_diagonal((low, high)), 0.2)
         camera = self._cameras.get(instance_id, {})
-        target = camera.get("target", (low + high) / 2)
+        position, target, distance = self._scenes[instance_id].camera(camera.get("target"))
         eye = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=camera.get("eye", target + 1.3 * size * _VIEW_FROM),
+            position=camera.get("eye", position),
             look_target=target,
             eye_up=(0.0, 0.0, 1.0),
             tracking_entity=self._followed.get(instance_id),
@@ -197,7 +208,7 @@ class WindowLayout:
             background=rrb.Background(color=_BACKGROUND),
             line_grid=rrb.LineGrid3D(
                 visible=True,
-                spacing=10.0 ** math.floor(math.log10(size / 2)),
+                spacing=10.0 ** math.floor(math.log10(distance / 2.6)),
                 plane=rr.components.Plane3D.XY,
                 stroke_width=1.0,
                 color=_GRID,
@@ -205,29 +216,8 @@ class WindowLayout:
             eye_controls=eye,
         )
 
-    def _bounds(self, instance_id: int) -> Box:
-        """Return the bounding box of the scene, without a floor much larger than the rest."""
-        boxes = sorted(self._scenes[instance_id].values(), key=_diagonal)
-        while len(boxes) > 1:
-            rest = _union(boxes[:-1])
-            if _diagonal(boxes[-1]) <= 5 * _diagonal(rest):
-                break
-            boxes.pop()
-        return _union(boxes) if boxes else (np.full(3, -0.5), np.full(3, 0.5))
-
 
 def _plot_view(name: str, curves: Mapping[str, int]) -> rrb.TimeSeriesView:
     visible = sum(curves.values()) <= _LEGEND
     legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=visible)
     return rrb.TimeSeriesView(name=name, contents=list(curves), plot_legend=legend)
-
-
-def _union(boxes: Sequence[Box]) -> Box:
-    return (
-        np.min([low for low, _ in boxes], axis=0),
-        np.max([high for _, high in boxes], axis=0),
-    )
-
-
-def _diagonal(box: Box) -> float:
-    return float(np.linalg.norm(box[1] - box[0]))

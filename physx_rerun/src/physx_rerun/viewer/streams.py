@@ -23,7 +23,7 @@ QUEUE_BYTES = 64_000_000
 """Largest size of the rows that wait for a live viewer; further rows are dropped."""
 QUEUE_LENGTH = 4096
 """Largest number of chunks that wait for a live viewer; further rows are dropped."""
-CLOSE_SECONDS = 3.0
+CLOSE_SECONDS = 2.5
 """Time that the end of a run waits for live viewers."""
 RETRY_SECONDS = 2.0
 """Time between two looks for a live viewer that is not there."""

@@ -99,7 +99,7 @@ class TensorBoard(Visualizer):
 
     def events(self, instance_id: int, step: int, events: list[Event]) -> None:
         """Write the points and meshes of an environment; other objects are not supported."""
-        for event in events:
+        for event in (one for several in events for one in several.each()):
             if event.kind not in ("points", "mesh"):
                 continue
             tag = f"environment_{instance_id}/{event.name}"

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from physx_core.components.scene import Event
+from physx_core.components.scene.event import Event
 from physx_core.errors import PhysxError
 from physx_core.net.frames import Kind, pack
 from physx_core.net.remote_errors import encode_error
@@ -175,7 +175,7 @@ class RemoteServices:
         if self._to_skip:
             self._to_skip -= 1
             return
-        plain = [(event.action, event.kind, event.name, dict(event.values)) for event in events]
+        plain = [(event.action, event.kind, event.names, dict(event.values)) for event in events]
         self._link.send(pack(Kind.SHOW, encode(plain, "update_visualization()"), step))
 
     def _ask(self, kind: Kind, value: Any, what: str) -> Any:

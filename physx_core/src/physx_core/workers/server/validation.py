@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from physx_core.components.parameter import Parameter
-from physx_core.components.scene import Event
+from physx_core.components.scene.event import ACTIONS, Event
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.fields import RESERVED, Field, first_not_finite
 from physx_core.net.frames import MAX_PAYLOAD
@@ -22,7 +22,6 @@ from physx_core.typing import Batch
 
 _DTYPE = re.compile(r"[<>|=]?[biufc]\d{1,2}")
 _ROLES = ("training", "additional")
-_ACTIONS = ("add", "update")
 _MOST_PARAMETERS = 4096
 _MOST_EPISODES = 2**48
 
@@ -139,8 +138,9 @@ def parse_events(payload: bytes | bytearray) -> list[Event]:
 def _is_event(parts: Any) -> bool:
     return (
         isinstance(parts, tuple)
-        and [type(part) for part in parts] == [str, str, str, dict]
-        and parts[0] in _ACTIONS
+        and [type(part) for part in parts] == [str, str, tuple, dict]
+        and parts[0] in ACTIONS
+        and {*map(type, parts[2])} == {str}
         and all(type(name) is str for name in parts[3])
     )
 

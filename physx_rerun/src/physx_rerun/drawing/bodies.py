@@ -1,0 +1,153 @@
+"""Bodies: the frames of one instance's rigid bodies, which move in every step."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+
+from physx_core.rotations import rotate_rows, to_matrix_rows
+from physx_core.typing import Array
+from physx_rerun.drawing.chunks import Chunk, Times, columns_of, indexes_of
+from physx_rerun.drawing.framing import Frame
+
+_UPRIGHT = np.array([0, 0, 0, 1], np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class _Move:
+    """A move of some bodies at one time; a part that is None stays as it was."""
+
+    times: Times
+    places: Array
+    positions: Array | None
+    orientations: Array | None
+
+
+class Bodies:
+    """Poses of bodies, collected into columns.
+
+    A pose is x, y, z in m and a quaternion x, y, z, w, in the frame of the world.
+    """
+
+    def __init__(self, entity: str) -> None:
+        """Start without bodies.
+
+        Args:
+            entity: Path of the entity that holds all poses; its parent is the world.
+        """
+        self._entity = entity
+        self._frames: list[str] = []
+        self._positions = np.zeros((0, 3), np.float32)
+        self._orientations = np.zeros((0, 4), np.float32)
+        self._boxes: dict[int, Array] = {}
+        self._moves: list[_Move] = []
+        self._named: tuple[Array, pa.Array] = (np.zeros(0, np.int64), pa.array([], pa.utf8()))
+
+    def add(self, frames: Sequence[str]) -> Array:
+        """Add bodies at the origin, by the names of their frames, and return their places."""
+        first, count = len(self._frames), len(frames)
+        self._frames += frames
+        self._positions = np.concatenate([self._positions, np.zeros((count, 3), np.float32)])
+        self._orientations = np.concatenate([self._orientations, np.tile(_UPRIGHT, (count, 1))])
+        return np.arange(first, first + count)
+
+    def set_box(self, place: int, corners: Array) -> None:
+        """Set the points around a body that are kept in view, in its frame, shape (n, 3)."""
+        self._boxes[place] = np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+    def move(self, places: Array, times: Times, values: Mapping[str, Array]) -> None:
+        """Move bodies.
+
+        Args:
+            places: Of the bodies, shape (n,).
+            times: Time of the row.
+            values: ``position`` (n, 3), ``orientation`` (n, 4), or both.
+        """
+        move = _Move(times, places, values.get("position"), values.get("orientation"))
+        self._moves.append(move)
+
+    def in_world(self, place: int, points: Array) -> Array:
+        """Return points of a body's frame, shape (n, 3), in the frame of the world."""
+        position, orientation = self._positions[place], self._orientations[place]
+        for move in self._moves:
+            for row in np.flatnonzero(move.places == place):
+                if move.positions is not None:
+                    position = move.positions.reshape(-1, 3)[row]
+                if move.orientations is not None:
+                    orientation = move.orientations.reshape(-1, 4)[row]
+        return rotate_rows(orientation.astype(np.float64), points) + position
+
+    def pop(self, frame: Frame | None) -> list[Chunk]:
+        """Return and clear the rows since the last call.
+
+        Args:
+            frame: What the camera shows, to be told where the bodies were; None: nothing.
+        """
+        moves, self._moves = self._moves, []
+        chunks = []
+        for _, group in itertools.groupby(moves, lambda move: tuple(move.times)):
+            same = list(group)
+            places, positions, orientations = self._rows(same)
+            indexes = indexes_of([move.times for move in same], [len(m.places) for m in same])
+            columns = columns_of(
+                rr.Transform3D,
+                translation=positions,
+                quaternion=orientations,
+                child_frame=self._names(places),
+            )
+            chunks.append(Chunk.of(self._entity, indexes, columns))
+            if frame is not None:
+                self._tell(frame, places, positions, orientations)
+        return chunks
+
+    def _rows(self, moves: Sequence[_Move]) -> tuple[Array, Array, Array]:
+        """Return places, positions and orientations of moves, one after another."""
+        positions, orientations = [], []
+        lacks = any(m.positions is None or m.orientations is None for m in moves)
+        for move in moves:
+            if move.positions is not None:
+                positions.append(move.positions.reshape(-1, 3))
+            if move.orientations is not None:
+                orientations.append(move.orientations.reshape(-1, 4))
+            if lacks:  # the parts that stay are those of the moves before
+                if move.positions is not None:
+                    self._positions[move.places] = positions.pop()
+                if move.orientations is not None:
+                    self._orientations[move.places] = orientations.pop()
+                positions.append(self._positions[move.places])
+                orientations.append(self._orientations[move.places])
+        places = np.concatenate([move.places for move in moves])
+        rows = np.concatenate(positions), np.concatenate(orientations)
+        self._positions[places], self._orientations[places] = rows
+        return places, *rows
+
+    def _names(self, places: Array) -> pa.Array:
+        """Return the names of frames; mostly the same bodies move in the same order as before."""
+        known, names = self._named
+        if not np.array_equal(known[: len(places)], places):
+            names = pa.array(self._frames, pa.utf8()).take(pa.array(places))
+            self._named = places, names
+        return names[: len(places)]
+
+    def _tell(self, frame: Frame, places: Array, positions: Array, orientations: Array) -> None:
+        """Tell a frame where bodies were, unless it surely shows them."""
+        boxes = np.full((len(self._frames), 2, 3), np.nan, np.float32)
+        for place, box in self._boxes.items():
+            boxes[place] = box
+        seen = ~np.isnan(boxes[places, 0, 0])
+        if not seen.any():
+            return
+        places, positions, orientations = places[seen], positions[seen], orientations[seen]
+        radius = np.nanmax(np.linalg.norm(np.abs(boxes).max(axis=1), axis=1))
+        if frame.shows(positions.min(axis=0) - radius, positions.max(axis=0) + radius):
+            return
+        centers, halves = boxes.mean(axis=1)[places], 0.5 * np.ptp(boxes, axis=1)[places]
+        turns = to_matrix_rows(orientations)
+        middles = positions + np.einsum("nij,nj->ni", turns, centers)
+        reach = np.einsum("nij,nj->ni", np.abs(turns), halves)
+        frame.see((middles - reach).min(axis=0), (middles + reach).max(axis=0))

@@ -1,0 +1,87 @@
+"""Frame: what the camera of one scene shows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physx_core.typing import Array
+
+VIEW_FROM = np.array([1.0, -1.1, 0.65]) / np.linalg.norm([1.0, -1.1, 0.65])
+"""Direction from what is shown to the camera."""
+
+RIGHT = np.array([1.1, 1.0, 0.0]) / np.linalg.norm([1.1, 1.0])
+"""Direction to the right in the picture."""
+
+_UP = np.cross(RIGHT, -VIEW_FROM)
+_SLOPE = np.tan(np.deg2rad(55 / 2))  # of the edges of Rerun's pictures, and of square ones
+_FILLED = 0.85  # share of the picture that the box fills at first
+_POINT = 0.5  # half of the edge of what is shown around a single point, in m
+_RESERVE = 0.25  # share by which a scene that outgrew its picture is shown larger than it is
+
+
+class Frame:
+    """The box around all objects of a scene, since its beginning."""
+
+    def __init__(self) -> None:
+        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
+        self._shown: tuple[Array, Array] | None = None
+        self._position: Array | None = None
+
+    def grow(self) -> bool:
+        """Show more if something is out of the picture, and return whether it was."""
+        if self._shown is None or self.shows(self._low, self._high):
+            return False
+        reserve = _RESERVE * (self._high - self._low)
+        self._shown = self._low - reserve, self._high + reserve
+        return True
+
+    def shows(self, low: Array, high: Array) -> bool:
+        """Return whether a box is in the picture.
+
+        Args:
+            low: Its lower corner, shape (3,), in m.
+            high: Its upper corner, shape (3,), in m.
+        """
+        if self._position is None:
+            return False
+        corners = _corners(low, high) - self._position
+        sides = np.maximum(np.abs(corners @ RIGHT), np.abs(corners @ _UP))
+        return bool((sides <= _SLOPE * -(corners @ VIEW_FROM)).all())
+
+    def see(self, low: Array, high: Array) -> None:
+        """Extend the box by another one: see `shows`."""
+        if np.isfinite(low).all() and np.isfinite(high).all():
+            self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
+
+    @property
+    def size(self) -> float:
+        """Diagonal of the box, in m; 0 without objects."""
+        if not np.isfinite(self._low).all():
+            return 0.0
+        return float(np.linalg.norm(self._high - self._low))
+
+    def camera(self, target: Array | None = None) -> tuple[Array, Array, float]:
+        """Return position and target of the camera that shows everything, and its distance.
+
+        Args:
+            target: Where the camera looks; None: to the middle.
+        """
+        if self._shown is None and np.isfinite(self._low).all():
+            self._shown = self._low, self._high
+        low, high = self._shown or (np.zeros(3), np.zeros(3))
+        middle = 0.5 * (low + high)
+        look = middle if target is None else target
+        half = 0.5 * (high - low)
+        half = half if half.any() else np.full(3, _POINT)
+        corners = _corners(middle - half, middle + half) - look
+        sides = np.maximum(np.abs(corners @ RIGHT), np.abs(corners @ _UP))
+        distance = float((corners @ VIEW_FROM + sides / (_FILLED * _SLOPE)).max())
+        self._position = look + distance * VIEW_FROM
+        return self._position, look, distance
+
+
+def _corners(low: Array, high: Array) -> Array:
+    return np.where(_SIGNS, high, low)
+
+
+_SIGNS = np.array([[x, y, z] for x in (False, True) for y in (False, True) for z in (False, True)])
