@@ -175,7 +175,7 @@ class Viewer:
         self.shown = []
 
     def show(self, instance_id, step, events):
-        self.shown.append((step, events))
+        self.shown.append((step, [event for event in events if event.kind != "time"]))
 
 
 def watch(environment):

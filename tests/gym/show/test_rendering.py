@@ -247,10 +247,9 @@ def test_objects_of_all_kinds_are_drawn_where_they_are(tmp_path):
     np.testing.assert_allclose(
         found["mesh"]["poses"], [(11, 2, 3, *pose["orientation"])], atol=1e-6
     )
-    corners = found["can"]["positions"]
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    np.testing.assert_allclose(low, (10.5, 1.9, 2.9), atol=1e-6)  # it lies along x
-    np.testing.assert_allclose(high, (11.5, 2.1, 3.1), atol=1e-6)
+    np.testing.assert_allclose(found["can"]["position"], (11, 2, 3))
+    np.testing.assert_allclose(found["can"]["orientation"], pose["orientation"], atol=1e-6)
+    assert (found["can"]["radius"], found["can"]["length"]) == (0.1, 1.0)
     assert found["robot"]["bodies"] == ["rail", "cart", "pole"]
     assert found["robot"]["urdf"].endswith("cartpole.urdf")
 
@@ -268,12 +267,13 @@ def test_grounds_are_drawn(ground, names):
     found = drawn(World([Robot("ant", fixed_base=False)], ground=ground))
     assert found.keys() - {"robot", "view"} == names
     assert found["view"]["follow"] == "robot"
+    assert [name for name in found if found[name].get("in_view") is False] == ["ground"][
+        : len(names)
+    ]
     if isinstance(ground, HeightField):
-        points, cells = found["ground"]["positions"], found["ground"]["cells"]
-        assert points.shape == (12, 3)
-        assert len(cells) == 2 * 2 * 3
-        a, b, c = (points[cells[:, corner]] for corner in range(3))
-        assert (np.cross(b - a, c - a)[:, 2] > 0).all()
+        np.testing.assert_array_equal(found["ground"]["heights"], ground.heights)
+        assert found["ground"]["spacing"].tolist() == [1.0, 1.0]
+        assert found["ground"]["position"].tolist() == [*ground.corner(), 0.0]
     elif isinstance(ground, Ground):
         assert found["ground"]["position"][2] == pytest.approx(-1.0, abs=0.02)
 
