@@ -9,8 +9,10 @@ import sys
 import numpy as np
 import pytest
 import rerun as rr
+from rerun.experimental import Hdf5Reader
 
 from physx_core import Dataset, Field
+from physx_core.cli import main as physx
 from physx_rerun import dataset as drawing
 from physx_rerun.importer import FOREIGN
 from physx_rerun.viewer.viewer import find_executable, find_free_port
@@ -112,3 +114,16 @@ def test_the_end_of_a_large_dataset_is_left_out(folder, tmp_path, read, monkeypa
     rows = read(tmp_path / "out.rrd", "/training/env_1/energy", "Scalars:scalars", "row")
     shown = int(capfd.readouterr().err.partition("first ")[2].partition(" of 12")[0])
     assert [row for row, _ in rows] == list(range(0, shown, 2)) and 0 < shown < ROWS
+
+
+def test_rerun_itself_reads_a_single_file_and_a_partition(folder, tmp_path):
+    single, partition = tmp_path / "single.h5", folder / "run_training_cloud_0.h5"
+    assert physx(["export", str(folder), str(single), "--to", "hdf5-single"]) == 0
+    chunks = Hdf5Reader(single).stream(root_group="training")
+    (rows,) = (c for c in chunks if c.entity_path == "/")
+    (columns,) = rows.to_record_batch()["data"].to_pylist()[:1]
+    assert {"cloud", "force", "energy", "heat"} <= columns[0].keys()
+    ignored = ["/commits", "/header", "/rows"]
+    chunks = Hdf5Reader(partition).stream(ignore_datasets=ignored)
+    (rows,) = (c for c in chunks if c.entity_path == "/")
+    assert rows.to_record_batch().num_rows == ROWS
