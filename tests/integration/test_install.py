@@ -45,7 +45,7 @@ def empty(tmp_path, run, wheels, root):
     def install(*names):
         files = [next(wheels.glob(f"{name}-*.whl")) for name in names]
         constraints = ("-c", root / "constraints.txt")
-        quiet = ("--quiet", "--disable-pip-version-check")
+        quiet = ("--quiet", "--disable-pip-version-check", "--no-compile")
         run("-m", "pip", "install", *quiet, *constraints, *files, python=python)
         return python
 
