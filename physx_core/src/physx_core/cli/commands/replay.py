@@ -24,7 +24,8 @@ def run(words: Sequence[str]) -> None:
     """
     words = ["--dataset.mode" if word == "--mode" else word for word in words]
     place = ("dataset.existing_dir", "environment.environment")
-    viewers = _visualizer_plugins()
+    is_given = any(word.partition("=")[0] == _VISUALIZER for word in words)
+    viewers = [] if is_given else _visualizer_plugins()  # to find them imports all plugins
     viewer = {"visualizer": viewers[0]} if len(viewers) == 1 else {}
     pipeline = pipeline_from(
         Replay,
@@ -40,7 +41,6 @@ def run(words: Sequence[str]) -> None:
         ),
     )
     config = pipeline.environment_config
-    is_given = any(word.partition("=")[0] == _VISUALIZER for word in words)
     if config is not None and config.visualizer is None and not is_given:
         raise UsageError(
             f"physx replay needs {_VISUALIZER} REFERENCE, as there is not exactly one visualizer "
