@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 from measure import claim, finish
+from viewer_robots import films, replays
 
 from physx_core.components import Factory
 from physx_rerun.viewer.viewer import Viewer
@@ -142,7 +143,7 @@ def main() -> None:
     for part in (to_a_file, with_a_frozen_viewer, size):
         with tempfile.TemporaryDirectory() as name:
             met += part(Path(name))
-    finish(met)
+    finish([*met, *films(), *replays()])
 
 
 if __name__ == "__main__":

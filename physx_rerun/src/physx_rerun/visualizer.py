@@ -68,6 +68,9 @@ class RerunVisualizer(Visualizer):
     """Picture of the headless mode; None: beside the file, with the suffix .png."""
     picture_size: tuple[int, int] = (1600, 900)
     """Width and height in pixels of the pictures of the headless and offscreen modes."""
+    detail: float = at_least(0, 3.0)
+    """Pixels of the smallest details of meshes in offscreen pictures that a robot fills; 0: all
+    details, which take most of the time without a graphics card."""
     max_instances: int = at_least(0, 4)
     """Number of instances to draw completely; of others only numbers and texts are recorded."""
     every: int = at_least(1, 1)
@@ -198,7 +201,7 @@ class RerunVisualizer(Visualizer):
                 self._rows,
                 self._layout,
                 draws_shapes=instance_id <= self.max_instances,
-                pixels=max(self.picture_size) if self.mode == "offscreen" else None,
+                resolution=self._resolution,
             )
         times = {"step": step, TIME: self._now()}
         seconds = self._clocks[instance_id].seconds
@@ -310,6 +313,12 @@ class RerunVisualizer(Visualizer):
         self._positions[timeline] = step
         self._layout.add_timeline(timeline)
         return {**self._positions, TIME: self._now()}
+
+    @property
+    def _resolution(self) -> float | None:
+        """How many of the smallest details a robot has from end to end; None: all."""
+        is_drawn_roughly = self.mode == "offscreen" and self.detail > 0
+        return max(self.picture_size) / self.detail if is_drawn_roughly else None
 
     def _now(self) -> float:
         return time.monotonic() - self._begun

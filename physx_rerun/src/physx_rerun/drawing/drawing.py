@@ -118,7 +118,7 @@ class Drawing:
         layout: WindowLayout,
         *,
         draws_shapes: bool,
-        pixels: int | None = None,
+        resolution: float | None = None,
     ) -> None:
         """Set the targets of the drawing.
 
@@ -127,9 +127,10 @@ class Drawing:
             rows: Collects the rows.
             layout: Lays out the windows.
             draws_shapes: Whether to draw shapes; otherwise only numbers and texts are recorded.
-            pixels: Size of the pictures that are rendered; None: a person looks at it.
+            resolution: How many of the smallest details of its meshes a robot has from end to end;
+                None: all.
         """
-        self._pixels = pixels
+        self._resolution = resolution
         self._id, self._rows, self._layout = instance_id, rows, layout
         self._draws_shapes = draws_shapes
         self._origin = f"env_{instance_id}"
@@ -539,7 +540,7 @@ class Drawing:
         if not drawn.shapes and not drawn.bodies.size:
             frames = [f"{drawn.frame}/{body}" for body in values["bodies"]]
             drawn.shapes, rest = draw_robot(
-                self._rows, drawn.entity, values, frames, self._world, self._pixels
+                self._rows, drawn.entity, values, frames, self._world, self._resolution
             )
             drawn.bodies = self._bodies.add(frames)
             if changes.get("poses") is None:

@@ -17,7 +17,6 @@ from physx_rerun.drawing.meshes import corners_of_mesh
 from physx_rerun.drawing.triangles import SimpleMesh, simple_mesh
 from physx_rerun.drawing.urdf import MESH_TYPES, Model, VisualShape, read
 
-_FINEST = 3.0  # pixels of the smallest detail of a robot that fills a picture
 _SILVER = (0.75, 0.78, 0.81, 1.0)
 
 DrawnShape = tuple[str, VisualShape]
@@ -30,7 +29,7 @@ def draw_robot(
     values: dict[str, Any],
     frames: Sequence[str],
     world: str,
-    pixels: int | None = None,
+    resolution: float | None = None,
 ) -> tuple[list[DrawnShape], Array]:
     """Draw the visual shapes of a robot; warn of mesh files that do not exist.
 
@@ -40,8 +39,8 @@ def draw_robot(
         values: Options of the robot; ``simple`` becomes the colors of simplified meshes by entity.
         frames: Names of the bodies' frames.
         world: Name of the frame of shapes without body.
-        pixels: Size of the pictures that it is drawn for; details of meshes that are smaller than
-            a few of them are left out. None: meshes are drawn as they are.
+        resolution: How many of the smallest details of its meshes fit into its whole size; smaller
+            ones are left out. None: meshes are drawn as they are.
 
     Returns:
         The shapes drawn, and the bodies' poses with all joints at zero, shape (bodies, 7).
@@ -54,7 +53,7 @@ def draw_robot(
             stacklevel=2,
         )
     drawn = []
-    detail = None if pixels is None else _FINEST * _extent(model) / pixels
+    detail = None if resolution is None else _extent(model) / resolution
     for shape in model.shapes:
         path = f"{entity}/{rr.escape_entity_path_part(shape.name)}"
         frame = world if shape.body is None else frames[shape.body]

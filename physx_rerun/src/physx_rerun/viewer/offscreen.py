@@ -13,7 +13,7 @@ from physx_core.processes import TemporaryFolder
 from physx_core.typing import Array
 from physx_rerun.viewer.headless import Camera, start_viewer
 
-_MARGIN = (16, 80)  # pixels of the window around a view: frame and title, with some reserve
+_MARGIN = (8, 36)  # pixels of the window around a view, frame and title, without its menu bar
 _PATIENCE = 60.0  # s per picture
 
 

@@ -1,0 +1,125 @@
+"""A part of `viewer.py`: pictures of a robot without a graphics card, and replays of samples.
+
+Pictures of the quadruped, 640 x 480, are rendered with its meshes without small details, and as
+they are, in turn, each frame after a step. The driver's own time is that of a picture of a scene in
+which nothing changed. The replay is a command of its own, start-up included.
+"""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+from measure import claim
+
+import physx_gym  # noqa: F401 - registers the environments
+from physx_core import DataGeneration, Environment, EnvironmentConfig
+
+FRAMES, ROUNDS = 10, 5
+SAMPLES, POINTS = 10_000, 100
+_BOUND = 0.7  # part of the driver in the time of a picture, from which it sets the pace
+SIMPLE, WHOLE = "without small details", "meshes as they are"
+
+
+class Cloud(Environment):
+    """Random points, or the stored ones."""
+
+    def create(self) -> None:
+        """Nothing is simulated."""
+
+    def init_database(self) -> None:
+        """Store the points."""
+        self.define_training_fields([("points", np.ndarray)])
+
+    def init_visualization(self) -> None:
+        """Draw the points."""
+        self.factory.add_points("points", np.zeros((POINTS, 3)), size=0.01)
+
+    def step(self) -> None:
+        """Show the next points."""
+        stored = self.sample
+        points = self.rng.random((POINTS, 3)) if stored is None else stored["points"]
+        self.set_training_data(points=points)
+        self.factory.update_points("points", positions=points)
+        self.update_visualization()
+
+
+class Film:
+    """A quadruped that is rendered after every step."""
+
+    def __init__(self, detail: float) -> None:
+        """Render the first picture."""
+        self.env = gymnasium.make("physx/Quadruped-v0", render_mode="rgb_array").unwrapped
+        self.env.viewer_kwargs["detail"] = detail
+        self.env.reset(seed=0)
+        self.env.render()
+
+    def rate(self, *, moves: bool = True) -> float:
+        """Return pictures per second."""
+        action = np.zeros(12)
+        begin = time.perf_counter()
+        for _ in range(FRAMES):
+            if moves:
+                self.env.step(action)
+            self.env.render()
+        return FRAMES / (time.perf_counter() - begin)
+
+    def driver(self) -> float:
+        """Return the time of a picture of what is drawn already, in s."""
+        offscreen = self.env._own_renderer._viewer._offscreen
+        scene = offscreen._camera.wait_for_position("picture", 0)
+        begin = time.perf_counter()
+        for _ in range(FRAMES):
+            offscreen._camera.screenshot(scene)
+        return (time.perf_counter() - begin) / FRAMES
+
+
+def films() -> list[bool]:
+    """Measure pictures of the quadruped."""
+    begun = time.perf_counter()
+    scenes = {SIMPLE: Film(3.0), WHOLE: Film(0.0)}
+    rates: dict[str, list[float]] = {name: [] for name in scenes}
+    drivers = []
+    for _ in range(ROUNDS):
+        for name, film in scenes.items():
+            rates[name].append(film.rate())
+        drivers.append(scenes[SIMPLE].driver())
+    for film in scenes.values():
+        film.env.close()
+    print(f"Pictures of the quadruped, 640 x 480 ({time.perf_counter() - begun:.0f} s)")
+    middle = {name: statistics.median(values) for name, values in rates.items()}
+    for name, values in rates.items():
+        print(f"  {name:24} {middle[name]:7.2f} a second  [{min(values):.2f} .. {max(values):.2f}]")
+    ratio, driver = middle[SIMPLE] / middle[WHOLE], statistics.median(drivers)
+    share = driver * middle[SIMPLE]
+    print(f"  the driver's own time is {1000 * driver:.0f} ms a picture, {share:.0%} of all")
+    if share > _BOUND:
+        print(f"  {ratio:.2f} times as many; more are not possible with this driver")
+        return [claim("the driver's part of the time", share, at_least=_BOUND)]
+    return [claim("times as many", ratio, at_least=3)]
+
+
+def replays() -> list[bool]:
+    """Measure ``physx replay``."""
+    with tempfile.TemporaryDirectory() as name:
+        config = EnvironmentConfig(Cloud, as_tcp_ip_client=False, seed=0)
+        run = DataGeneration(
+            config, session_dir=name, batch_nb=20, batch_size=SAMPLES // 20, quiet=True
+        )
+        run.execute()
+        words = [sys.executable, "-m", "physx_core.cli", "replay", str(run.session.path)]
+        words += [f"{Path(__file__).resolve()}:Cloud", "--environment.visualizer", "rerun"]
+        words += ["--environment.no-as-tcp-ip-client", "--quiet", "--session-dir", name]
+        times = []
+        for _ in range(ROUNDS):
+            begin = time.perf_counter()
+            subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+            times.append(time.perf_counter() - begin)
+    print(f"Replay of {SAMPLES} samples of {POINTS} points")
+    return [claim("s, start-up included", statistics.median(times), at_most=1.5)]
