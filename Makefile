@@ -40,6 +40,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/gym.py
 	$(BIN)/python benchmarks/idle_threads.py
 	$(BIN)/python benchmarks/remote.py
+	$(BIN)/python benchmarks/viewer.py
 
 clean:
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

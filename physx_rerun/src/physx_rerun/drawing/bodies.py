@@ -45,6 +45,7 @@ class Bodies:
         self._positions = np.zeros((0, 3), np.float32)
         self._orientations = np.zeros((0, 4), np.float32)
         self._boxes: dict[int, Array] = {}
+        self._radii: dict[int, float] = {}
         self._moves: list[_Move] = []
         self._named: tuple[Array, pa.Array] = (np.zeros(0, np.int64), pa.array([], pa.utf8()))
 
@@ -58,7 +59,9 @@ class Bodies:
 
     def set_box(self, place: int, corners: Array) -> None:
         """Set the points around a body that are kept in view, in its frame, shape (n, 3)."""
-        self._boxes[place] = np.stack([corners.min(axis=0), corners.max(axis=0)])
+        box = np.stack([corners.min(axis=0), corners.max(axis=0)])
+        self._boxes[place] = box
+        self._radii[place] = float(np.linalg.norm(np.abs(box).max(axis=0)))
 
     def move(self, places: Array, times: Times, values: Mapping[str, Array]) -> None:
         """Move bodies.
@@ -90,8 +93,8 @@ class Bodies:
         """
         moves, self._moves = self._moves, []
         chunks = []
-        for _, group in itertools.groupby(moves, lambda move: tuple(move.times)):
-            same = list(group)
+        for _, group in itertools.groupby(moves, lambda move: len(move.times)):
+            same = list(group)  # timelines only ever come in addition
             places, positions, orientations = self._rows(same)
             indexes = indexes_of([move.times for move in same], [len(m.places) for m in same])
             columns = columns_of(
@@ -136,16 +139,19 @@ class Bodies:
 
     def _tell(self, frame: Frame, places: Array, positions: Array, orientations: Array) -> None:
         """Tell a frame where bodies were, unless it surely shows them."""
-        boxes = np.full((len(self._frames), 2, 3), np.nan, np.float32)
-        for place, box in self._boxes.items():
-            boxes[place] = box
-        seen = ~np.isnan(boxes[places, 0, 0])
-        if not seen.any():
+        if not self._boxes:
             return
-        places, positions, orientations = places[seen], positions[seen], orientations[seen]
-        radius = np.nanmax(np.linalg.norm(np.abs(boxes).max(axis=1), axis=1))
+        if len(self._boxes) < len(self._frames):
+            seen = np.isin(places, list(self._boxes))
+            places, positions, orientations = places[seen], positions[seen], orientations[seen]
+            if not len(places):
+                return
+        radius = max(self._radii.values())
         if frame.shows(positions.min(axis=0) - radius, positions.max(axis=0) + radius):
             return
+        boxes = np.zeros((len(self._frames), 2, 3), np.float32)
+        for place, box in self._boxes.items():
+            boxes[place] = box
         centers, halves = boxes.mean(axis=1)[places], 0.5 * np.ptp(boxes, axis=1)[places]
         turns = to_matrix_rows(orientations)
         middles = positions + np.einsum("nij,nj->ni", turns, centers)

@@ -6,7 +6,9 @@ costs a few µs and stores far less.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import itertools
+import string
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,7 +51,7 @@ class Chunk:
     @classmethod
     def of(cls, entity: str, indexes: list[rr.TimeColumn], columns: list[Any]) -> Chunk:
         """Return the chunk of some columns."""
-        nbytes = sum(column.as_arrow_array().nbytes for column in columns)
+        nbytes = sum(column.component_batch.as_arrow_array().nbytes for column in columns)
         return cls(entity, indexes, columns, nbytes)
 
     def send(self, stream: rr.RecordingStream) -> None:
@@ -74,6 +76,7 @@ class ChunkBuilder:
     def __init__(self) -> None:
         self.nbytes = 0
         self.sources: list[Callable[[], Iterable[Chunk]]] = []
+        self._frames = map("".join, _short_words())
         self._whole: list[Chunk] = []
         self._blocks: dict[tuple[Any, ...], _Block] = {}
 
@@ -109,6 +112,10 @@ class ChunkBuilder:
             block.values[name].append(value)
             self.nbytes += value.nbytes if isinstance(value, np.ndarray) else 50 * len(value)
 
+    def next_frame(self) -> str:
+        """Return a name for another frame, as short as can be: each row of a pose contains it."""
+        return next(self._frames)
+
     def pop_chunks(self) -> list[Chunk]:
         """Return and clear everything as chunks, static ones first."""
         chunks, self._whole = self._whole, []
@@ -125,6 +132,13 @@ class ChunkBuilder:
         for source in self.sources:
             chunks += source()
         return chunks
+
+
+def _short_words() -> Iterator[tuple[str, ...]]:
+    letters = string.ascii_letters + string.digits
+    return itertools.chain.from_iterable(
+        itertools.product(letters, repeat=length) for length in itertools.count(1)
+    )
 
 
 def _components(archetypes: Iterable[Any]) -> list[Any]:
@@ -156,16 +170,26 @@ def indexes_of(times: Sequence[Times], counts: Sequence[int]) -> list[rr.TimeCol
     return columns
 
 
-def columns_of(archetype: type[Any], **values: Any) -> list[Any]:
-    """Return the columns of an archetype's fields; the first axis of the values is that of rows."""
-    return [column for name in values for column in archetype.columns(**{name: values[name]})]
+def columns_of(
+    archetype: type[Any], lengths: Sequence[int] | None = None, /, **values: Any
+) -> list[rr.ComponentColumn]:
+    """Return the columns of an archetype's fields.
+
+    Args:
+        archetype: The archetype.
+        lengths: Number of instances in each row; None: one.
+        values: The fields: arrays or lists of all instances of all rows.
+    """
+    return [
+        rr.ComponentColumn(batch.component_descriptor(), batch, lengths=lengths)
+        for batch in archetype.from_fields(**values).as_component_batches()
+    ]
 
 
-def _columns(archetype: type[Any], name: str, values: list[Any]) -> Any:
+def _columns(archetype: type[Any], name: str, values: list[Any]) -> list[rr.ComponentColumn]:
     joined: Array | list[Any]
     if isinstance(values[0], np.ndarray):
         joined = np.concatenate(values)
     else:
         joined = [item for value in values for item in value]
-    columns = archetype.columns(**{name: joined})
-    return columns.partition([len(value) for value in values])
+    return columns_of(archetype, [len(value) for value in values], **{name: joined})

@@ -20,10 +20,13 @@ class SimulatedClock:
 
     def read(self, events: Sequence[Event]) -> list[Event]:
         """Take the time from the events of a step, and return the other events."""
+        others = []
         for event in events:
-            if event.kind == "time":
-                told = float(event.values["seconds"])
-                if told < self._told:
-                    self._before += self._told
-                self._told, self.seconds = told, self._before + told
-        return [event for event in events if event.kind != "time"]
+            if event.kind != "time":
+                others.append(event)
+                continue
+            told = float(event.values["seconds"])
+            if told < self._told:
+                self._before += self._told
+            self._told, self.seconds = told, self._before + told
+        return others

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -169,6 +169,11 @@ class Drawing:
                 if places is not None:
                     self._bodies.move(places, times, event.values)
                     continue
+            if event.kind == "scalars" and event.action == "update":
+                drawn = self._drawn.get(event.name)
+                if drawn is not None and len(event.names) == 1 and not drawn.is_new:
+                    self._scalars(drawn, event.values, times)
+                    continue
             for one in event.each():
                 self._draw(one, times)
         self._follow()
@@ -278,9 +283,8 @@ class Drawing:
             self._has_world = True
             self._rows.add_static(self._origin, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._layout.add_object(self._id, drawn.kind, drawn.name)
-        if drawn.kind in _RIGID or drawn.kind == "robot":
-            drawn.frame = f"{self._origin}/{name}"
         if drawn.kind in _RIGID:
+            drawn.frame = self._rows.next_frame()
             drawn.bodies = self._bodies.add([drawn.frame])
             self._rows.add_static(drawn.entity, rr.CoordinateFrame(drawn.frame))
 
@@ -538,7 +542,7 @@ class Drawing:
     def _robot(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
         values = drawn.values
         if not drawn.shapes and not drawn.bodies.size:
-            frames = [f"{drawn.frame}/{body}" for body in values["bodies"]]
+            frames = [self._rows.next_frame() for _ in values["bodies"]]
             drawn.shapes, rest = draw_robot(
                 self._rows, drawn.entity, values, frames, self._world, self._resolution
             )
@@ -582,7 +586,7 @@ class Drawing:
             content = str(changes["content"])
             self._rows.add(drawn.entity, rr.TextDocument, times, text=[content])
 
-    def _scalars(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
+    def _scalars(self, drawn: Item, changes: Mapping[str, Any], times: Times) -> None:
         if drawn.is_new:
             labels = drawn.values["labels"]
             prefix = f"{self._layout.title(self._id)}: " if self._layout.instance_nb > 1 else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -72,6 +73,11 @@ class Numbers:
         return True
 
 
+@functools.lru_cache(maxsize=256)
+def _rows_of(check: Numbers, count: int) -> Numbers:
+    return Numbers((count, *check.shape), check.dtype)
+
+
 def _as_array(value: Any) -> Array:
     try:
         return np.asarray(value)
@@ -88,7 +94,7 @@ def many(check: Check, value: Any, count: int) -> Any:
         count: Number of objects.
     """
     if isinstance(check, Numbers):
-        return Numbers((count, *check.shape), check.dtype)(value)
+        return _rows_of(check, count)(value)
     if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != count:
         raise ConfigError(f"must have {count} entries, one for each object")
     return [check(entry) for entry in value]
