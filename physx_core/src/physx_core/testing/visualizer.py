@@ -1,0 +1,226 @@
+"""What a visualizer must do."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.components import Event, Factory, Visualizer
+from physx_core.processes import TemporaryFolder
+from physx_core.testing.report import NotApplicable, Report, run_checks
+from physx_core.testing.scene import OBJECTS, add_all, move_all
+
+Make = Callable[[], Visualizer]
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
+_PATIENCE = 5.0
+"""Seconds within which what a visualizer started must have ended after `close`."""
+
+
+def check_visualizer(make: Make, *, expected_failures: Mapping[str, str] | None = None) -> Report:
+    """Check that a visualizer keeps the contract of `Visualizer`, without a display.
+
+    Args:
+        make: Returns a new visualizer, as ``MyVisualizer`` or ``lambda: MyVisualizer(size=3)``.
+        expected_failures: Names of checks that may fail, and why.
+    """
+    component = type(make()).__name__
+    checks = {
+        name: functools.partial(_in_folder, check, make)
+        for name, check in {
+            **{f"draws {kind}": functools.partial(_draws, kind) for kind in OBJECTS},
+            **_CHECKS,
+        }.items()
+    }
+    return run_checks(component, checks, expected_failures)
+
+
+def _in_folder(check: Callable[[Make, Path], None], make: Make) -> None:
+    with TemporaryFolder("check-") as folder, _no_display():
+        check(make, folder.path)
+
+
+@contextlib.contextmanager
+def _no_display() -> Iterator[None]:
+    kept = {name: os.environ.pop(name) for name in _DISPLAYS if name in os.environ}
+    try:
+        yield
+    finally:
+        os.environ.update(kept)
+
+
+@contextlib.contextmanager
+def _opened(make: Make, folder: Path, instances: int = 1) -> Iterator[Visualizer]:
+    visualizer = make()
+    visualizer.open("run", folder, instances)
+    try:
+        yield visualizer
+    finally:
+        visualizer.close()
+
+
+def _draws(kind: str, make: Make, folder: Path) -> None:
+    """Add objects of a kind, move them, and remove them again."""
+    factory = Factory()
+    with _opened(make, folder) as visualizer:
+        OBJECTS[kind].add(factory)
+        visualizer.events(1, 0, factory.take_events())
+        OBJECTS[kind].move(factory)
+        visualizer.events(1, 1, factory.take_events())
+        if kind != "view":
+            factory.remove(kind)
+            visualizer.events(1, 2, factory.take_events())
+
+
+def _many(make: Make, folder: Path) -> None:
+    factory = Factory()
+    names = [f"box {number}" for number in range(20)]
+    with _opened(make, folder) as visualizer:
+        for name in names:
+            factory.add_box(name, [0.1, 0.1, 0.1])
+        visualizer.events(1, 0, factory.take_events())
+        positions = np.arange(60.0).reshape(20, 3)
+        turns = np.tile([0.0, 0.0, 0.0, 1.0], (20, 1))
+        factory.update_many("box", names, {"position": positions, "orientation": turns})
+        factory.set_time(0.1)
+        visualizer.events(1, 1, factory.take_events())
+
+
+def _unknown(make: Make, folder: Path) -> None:
+    with _opened(make, folder) as visualizer:
+        for action in ("add", "update", "remove"):
+            visualizer.events(1, 0, [Event(action, "of a later version", ("new",), {"size": 3})])
+
+
+def _several_instances(make: Make, folder: Path) -> None:
+    factories = {number: Factory() for number in (1, 2, 3)}
+    with _opened(make, folder, len(factories)) as visualizer:
+        for step in range(3):
+            for number in (2, 1, 3):
+                (move_all if step else add_all)(factories[number])
+                visualizer.events(number, step, factories[number].take_events())
+
+
+def _closed(make: Make, folder: Path) -> None:
+    visualizer, factory = make(), Factory()
+    add_all(factory)
+    events = factory.take_events()
+    visualizer.events(1, 0, events)
+    visualizer.scalars({"loss": 1.0}, 0, "batch")
+    visualizer.open("run", folder, 1)
+    visualizer.close()
+    visualizer.events(1, 1, events)
+    visualizer.close()
+
+
+def _opens_again(make: Make, folder: Path) -> None:
+    visualizer, outputs = make(), set()
+    for run in range(2):
+        factory = Factory()
+        visualizer.open("run", folder, 1)
+        add_all(factory)
+        visualizer.events(1, 0, factory.take_events())
+        visualizer.close()
+        lines = visualizer.outputs()
+        if run and set(lines) & outputs:
+            raise AssertionError(f"the second run overwrote what the first one left: {lines}")
+        outputs |= set(lines)
+
+
+def _outputs(make: Make, folder: Path) -> None:
+    factory = Factory()
+    with _opened(make, folder) as visualizer:
+        add_all(factory)
+        visualizer.events(1, 0, factory.take_events())
+    lines = visualizer.outputs()
+    if not lines:
+        raise NotApplicable("it leaves no files")
+    for line in lines:
+        what, colon, rest = line.partition(": ")
+        path = Path(rest.partition("  (")[0])
+        if not (what and colon and path.is_file() and path.stat().st_size):
+            raise AssertionError(f'"{line}" does not name a file that it left, as "what: PATH"')
+
+
+def _changes_nothing(make: Make, folder: Path) -> None:
+    factory = Factory()
+    with _opened(make, folder) as visualizer:
+        for step in range(3):
+            (move_all if step else add_all)(factory)
+            events = factory.take_events()
+            before = [_copied(event.values) for event in events]
+            visualizer.events(1, step, events)
+            for event, values in zip(events, before, strict=True):
+                if not all(np.array_equal(event.values[name], values[name]) for name in values):
+                    raise AssertionError(f'it changed the values of the event of "{event.name}"')
+
+
+def _copied(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        name: each.copy() if isinstance(each, np.ndarray) else each for name, each in values.items()
+    }
+
+
+def _numbers(make: Make, folder: Path) -> None:
+    with _opened(make, folder) as visualizer:
+        visualizer.begin("training", None, "batches")
+        for step, value in enumerate((1.0, np.nan, np.inf, -np.inf, 0.0)):
+            visualizer.scalars({"loss/training": value, "lr": 1e-3}, step, "batch")
+            visualizer.advance(1)
+        arrays = {"weights/a": np.zeros(3), "weights/b": np.zeros(0), "c": np.array([1.0, np.nan])}
+        visualizer.histograms(arrays, 1, "epoch")
+        visualizer.note("stopped early")
+        visualizer.end()
+
+
+def _pictures(make: Make, folder: Path) -> None:
+    factory = Factory()
+    with _opened(make, folder) as visualizer:
+        OBJECTS["box"].add(factory)
+        visualizer.events(1, 0, factory.take_events())
+        first = visualizer.capture()
+        if first is None:
+            raise NotApplicable("it has no pictures")
+        OBJECTS["box"].move(factory)
+        visualizer.events(1, 1, factory.take_events())
+        second = visualizer.capture()
+    if second is None or first.ndim != 3 or first.shape[2] != 3 or first.dtype != np.uint8:
+        raise AssertionError(f"a picture is {first.dtype} of shape {first.shape}")
+    if first.shape != second.shape or np.array_equal(first, second):
+        raise AssertionError("a box moved, but the picture did not change")
+
+
+def _leaves_nothing(make: Make, folder: Path) -> None:
+    before = set(threading.enumerate())
+    _outputs_or_none(make, folder)
+    deadline = time.monotonic() + _PATIENCE
+    while left := set(threading.enumerate()) - before:
+        if time.monotonic() > deadline:
+            raise AssertionError(f"threads run on after close: {[each.name for each in left]}")
+        time.sleep(0.05)
+
+
+def _outputs_or_none(make: Make, folder: Path) -> None:
+    with contextlib.suppress(NotApplicable):
+        _outputs(make, folder)
+
+
+_CHECKS: dict[str, Callable[[Make, Path], None]] = {
+    "draws many objects at once": _many,
+    "ignores kinds that it does not know": _unknown,
+    "draws several instances": _several_instances,
+    "ignores what comes before open and after close": _closed,
+    "opens again, and keeps what it left before": _opens_again,
+    "names the files that it leaves": _outputs,
+    "does not change what it draws": _changes_nothing,
+    "takes numbers that are not finite": _numbers,
+    "shows motion in its pictures": _pictures,
+    "leaves no thread behind": _leaves_nothing,
+}
