@@ -9,7 +9,7 @@ from typing import Literal
 Status = Literal["passed", "failed", "expected", "skipped"]
 
 
-class NotApplicable(Exception):
+class NotApplicableError(Exception):
     """Raised by a check of something that the component does not offer; its text is the reason."""
 
 
@@ -85,7 +85,7 @@ def run_checks(
     for name, check in checks.items():
         try:
             check()
-        except NotApplicable as reason:
+        except NotApplicableError as reason:
             found.append(Check(name, "skipped", str(reason)))
         except Exception as error:  # whatever a component raises is what the report is about
             status: Status = "expected" if name in expected else "failed"

@@ -17,7 +17,7 @@ import numpy as np
 from physx_core.components import Event, Factory, Visualizer
 from physx_core.errors import VisualizerError
 from physx_core.processes import TemporaryFolder
-from physx_core.testing.report import NotApplicable, Report, run_checks
+from physx_core.testing.report import NotApplicableError, Report, run_checks
 from physx_core.testing.scene import OBJECTS, add_all, move_all
 
 Make = Callable[[], Visualizer]
@@ -34,14 +34,11 @@ def check_visualizer(make: Make, *, expected_failures: Mapping[str, str] | None 
         expected_failures: Names of checks that may fail, and why.
     """
     component = type(make()).__name__
-    checks = {
-        name: functools.partial(_in_folder, check, make)
-        for name, check in {
-            **{f"draws {kind}": functools.partial(_draws, kind) for kind in OBJECTS},
-            **_CHECKS,
-        }.items()
+    checks = {f"draws {kind}": functools.partial(_draws, kind) for kind in OBJECTS} | _CHECKS
+    in_folders = {
+        name: functools.partial(_in_folder, check, make) for name, check in checks.items()
     }
-    return run_checks(component, checks, expected_failures)
+    return run_checks(component, in_folders, expected_failures)
 
 
 def _in_folder(check: Callable[[Make, Path], None], make: Make) -> None:
@@ -96,9 +93,8 @@ def _many(make: Make, folder: Path) -> None:
 
 
 def _unknown(make: Make, folder: Path) -> None:
-    with _opened(make, folder) as visualizer:
-        with contextlib.suppress(VisualizerError):
-            visualizer.events(1, 0, [Event("add", "of a later version", ("new",), {"size": 3})])
+    with _opened(make, folder) as visualizer, contextlib.suppress(VisualizerError):
+        visualizer.events(1, 0, [Event("add", "of a later version", ("new",), {"size": 3})])
 
 
 def _several_instances(make: Make, folder: Path) -> None:
@@ -123,7 +119,8 @@ def _closed(make: Make, folder: Path) -> None:
 
 
 def _opens_again(make: Make, folder: Path) -> None:
-    visualizer, outputs = make(), set()
+    visualizer = make()
+    outputs: set[str] = set()
     for run in range(2):
         factory = Factory()
         visualizer.open("run", folder, 1)
@@ -143,7 +140,7 @@ def _outputs(make: Make, folder: Path) -> None:
         visualizer.events(1, 0, factory.take_events())
     lines = visualizer.outputs()
     if not lines:
-        raise NotApplicable("it leaves no files")
+        raise NotApplicableError("it leaves no files")
     for line in lines:
         what, colon, rest = line.partition(": ")
         path = Path(rest.partition("  (")[0])
@@ -189,7 +186,7 @@ def _pictures(make: Make, folder: Path) -> None:
         visualizer.events(1, 0, factory.take_events())
         first = visualizer.capture()
         if first is None:
-            raise NotApplicable("it has no pictures")
+            raise NotApplicableError("it has no pictures")
         OBJECTS["box"].move(factory)
         visualizer.events(1, 1, factory.take_events())
         second = visualizer.capture()
@@ -210,7 +207,7 @@ def _leaves_nothing(make: Make, folder: Path) -> None:
 
 
 def _outputs_or_none(make: Make, folder: Path) -> None:
-    with contextlib.suppress(NotApplicable):
+    with contextlib.suppress(NotApplicableError):
         _outputs(make, folder)
 
 
