@@ -1,6 +1,8 @@
 import os
 import shutil
 import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -35,7 +37,11 @@ def complete(request, capsys):
         before, call = ("", BASH) if shell == "bash" else (COMPSYS.format(), ZSH)
         flags = ["--norc"] if shell == "bash" else ["-f"]
         text = before + script + call.format(words=words)
-        done = subprocess.run([shell, *flags, "-c", text], capture_output=True, text=True)
+        folder = Path(sys.executable).parent  # where `physx` is, which the script asks
+        path = {"PATH": f"{folder}{os.pathsep}{os.environ['PATH']}"}
+        done = subprocess.run(
+            [shell, *flags, "-c", text], capture_output=True, text=True, env=os.environ | path
+        )
         assert done.stderr == ""
         return done.stdout.split()
 
