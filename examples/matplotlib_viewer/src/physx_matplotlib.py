@@ -30,7 +30,7 @@ class MatplotlibVisualizer(Visualizer):
             elif event.name in scene:  # which the simulated time is not
                 scene[event.name][1].update(event.values)
 
-    def draw(self):
+    def figure(self):
         figure = Figure(figsize=[length / 100 for length in self.size], dpi=100)
         for number, (instance, scene) in enumerate(sorted(self.scenes.items()), 1):
             axes = figure.add_subplot(1, len(self.scenes), number, projection="3d")
@@ -39,9 +39,7 @@ class MatplotlibVisualizer(Visualizer):
                 if points := self.points(kind, values):
                     color = values.get("color")
                     axes.scatter(*np.concatenate(points).T, s=4, color=color)
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        return figure, np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+        return figure
 
     def points(self, kind, values):
         position = values.get("position", np.zeros(3))
@@ -55,11 +53,15 @@ class MatplotlibVisualizer(Visualizer):
         return positions if isinstance(positions, (list, tuple)) else [positions]
 
     def capture(self):
-        return self.draw()[1] if self.scenes else None
+        if not self.scenes:
+            return None
+        canvas = FigureCanvasAgg(self.figure())
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 
     def close(self):
         if self.scenes:
-            self.draw()[0].savefig(self.path)
+            self.figure().savefig(self.path)
             self.files, self.scenes = [f"picture: {self.path}"], {}
 
     def outputs(self):

@@ -35,15 +35,13 @@ def check_visualizer(make: Make, *, expected_failures: Mapping[str, str] | None 
     """
     component = type(make()).__name__
     checks = {f"draws {kind}": functools.partial(_draws, kind) for kind in OBJECTS} | _CHECKS
-    in_folders = {
-        name: functools.partial(_in_folder, check, make) for name, check in checks.items()
-    }
-    return run_checks(component, in_folders, expected_failures)
-
-
-def _in_folder(check: Callable[[Make, Path], None], make: Make) -> None:
     with TemporaryFolder("check-") as folder, _no_display():
-        check(make, folder.path)
+        in_folders = {}
+        for number, (name, check) in enumerate(checks.items()):
+            own = Path(folder.path, str(number))
+            own.mkdir()
+            in_folders[name] = functools.partial(check, make, own)
+        return run_checks(component, in_folders, expected_failures)
 
 
 @contextlib.contextmanager
