@@ -98,7 +98,9 @@ def films() -> list[bool]:
     ratio, driver = middle[SIMPLE] / middle[WHOLE], statistics.median(drivers)
     print(f"  the driver's own time is {1000 * driver:.0f} ms a picture")
     if (alone := 1 / (driver * middle[WHOLE])) < TIMES:
-        print(f"  {ratio:.2f} times as many; the driver alone, at a scene at rest, {alone:.2f} times")
+        print(
+            f"  {ratio:.2f} times as many; the driver alone, at a scene at rest, {alone:.2f} times"
+        )
         return []
     return [claim("times as many", ratio, at_least=TIMES)]
 
