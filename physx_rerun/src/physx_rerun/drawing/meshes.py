@@ -15,6 +15,8 @@ from physx_core.typing import Array
 _LARGEST = 2**26
 """Bytes of a mesh file; of larger ones only the origin is shown for certain."""
 _NOTHING = np.zeros((1, 3))
+PLACEMENTS = ("matrix", "translate", "scale", "rotate")
+"""Steps of the placement of a node of COLLADA."""
 
 
 @functools.lru_cache(maxsize=256)
@@ -83,8 +85,8 @@ def _dae(path: Path) -> Array:
         node, pose = nodes.pop()
         for part in node:
             kind = part.tag.removeprefix(tag)
-            if kind in ("matrix", "translate", "scale"):
-                pose = pose @ _step(kind, np.array((part.text or "").split(), np.float64))
+            if kind in PLACEMENTS:
+                pose = pose @ placement(kind, np.array((part.text or "").split(), np.float64))
             elif kind == "node":
                 nodes.append((part, pose))
             elif kind == "instance_geometry":
@@ -93,15 +95,20 @@ def _dae(path: Path) -> Array:
     return meter * np.concatenate(found)
 
 
-def _step(kind: str, numbers: Array) -> Array:
+def placement(kind: str, numbers: Array) -> Array:
     """Return a step of a node's placement as a homogeneous matrix (4, 4)."""
     if kind == "matrix":
         return numbers.reshape(4, 4)
     matrix = np.eye(4)
     if kind == "translate":
         matrix[:3, 3] = numbers
-    else:
+    elif kind == "scale":
         matrix[[0, 1, 2], [0, 1, 2]] = numbers
+    else:
+        x, y, z = numbers[:3] / np.linalg.norm(numbers[:3])
+        across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        angle = np.radians(numbers[3])
+        matrix[:3, :3] += np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
     return matrix
 
 

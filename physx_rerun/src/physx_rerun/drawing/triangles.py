@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from physx_core.typing import Array
+from physx_rerun.drawing.meshes import PLACEMENTS, placement
 
 _LARGEST = 2**26  # bytes of a file
 _MANY = 1000  # triangles, fewer of which are drawn as they are
@@ -174,8 +175,8 @@ class _Collada:
     def _node(self, node: Element, pose: Array) -> Iterator[Triangles]:
         for part in node:
             kind = part.tag.removeprefix(self._tag)
-            if kind in ("matrix", "translate", "scale", "rotate"):
-                pose = pose @ _step(kind, np.array((part.text or "").split(), np.float64))
+            if kind in PLACEMENTS:
+                pose = pose @ placement(kind, np.array((part.text or "").split(), np.float64))
         for child in self._all(node, "node"):
             yield from self._node(child, pose)
         for instance in self._all(node, "instance_geometry"):
@@ -247,20 +248,3 @@ def _fans(counts: Array) -> Array:
     first = np.repeat(np.cumsum(counts) - counts, sizes)
     second = first + np.arange(len(first)) - np.repeat(np.cumsum(sizes) - sizes, sizes) + 1
     return np.stack([first, second, second + 1], axis=1)
-
-
-def _step(kind: str, numbers: Array) -> Array:
-    """Return a step of a node's placement as a homogeneous matrix (4, 4)."""
-    if kind == "matrix":
-        return numbers.reshape(4, 4)
-    matrix = np.eye(4)
-    if kind == "translate":
-        matrix[:3, 3] = numbers
-    elif kind == "scale":
-        matrix[[0, 1, 2], [0, 1, 2]] = numbers
-    else:
-        x, y, z = numbers[:3] / np.linalg.norm(numbers[:3])
-        across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        angle = np.radians(numbers[3])
-        matrix[:3, :3] += np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
-    return matrix
