@@ -119,7 +119,7 @@ def test_viewers_that_come_late_and_come_back_get_the_last_state_and_go_on(pytho
                 for _ in range(5):
                     run.stdin.write("step\n")
                 time.sleep(0.05)
-                with contextlib.suppress(FileNotFoundError, ValueError):
+                with contextlib.suppress(FileNotFoundError, ValueError, RuntimeError):
                     if len(steps_of(path)) > 20:
                         return
             raise TimeoutError(path)

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from physx_core import checkpoint, files
+from physx_core import files
+from physx_core.checkpoint import writing
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.store import syncing
 from physx_core.dataset.store.partition import format as partition_format
@@ -197,12 +198,12 @@ BUGS = (
     Bug("a checkpoint's name is not synced", _skip("sync_folder", "_publish"), checkpoints=True),
     Bug(
         "the former best checkpoint is removed first",
-        _instead(checkpoint, "_publish", _publish_removing_first),
+        _instead(writing, "_publish", _publish_removing_first),
         checkpoints=True,
     ),
     Bug(
         "the former best checkpoint is removed before the new one is on the disk",
-        _instead(checkpoint, "_publish", _publish_forgetting_early),
+        _instead(writing, "_publish", _publish_forgetting_early),
         checkpoints=True,
     ),
 )
