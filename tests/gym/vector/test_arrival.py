@@ -5,6 +5,7 @@ A model of lone environments is compared with real processes, bit for bit.
 
 import contextlib
 import importlib.util
+import time
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from hypothesis.stateful import (
 from physx_gym import ParallelVectorEnv
 
 WALK = Path(__file__).parents[1] / "programs" / "walk.py"
+LATE = WALK.with_name("slow_to_count.py")
 spec = importlib.util.spec_from_file_location("walk", WALK)
 walk = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(walk)
@@ -196,6 +198,17 @@ def test_recv_of_all_returns_what_step_returns(count, nothing_stays_behind):
             assert infos.pop("env_id").tolist() == [0, 1, 2]
             for one, other in zip((*found, infos), first.step(actions), strict=True):
                 same(one, other)
+
+
+def test_a_message_is_read_although_one_of_another_worker_is_not_counted_yet(nothing_stays_behind):
+    vector = ParallelVectorEnv(f"{LATE}:LongInfos", 3, num_processes=3, batch_size=1)
+    with contextlib.closing(vector):
+        vector.async_reset(seed=0)
+        found = [vector.recv()[4]]  # meanwhile the message of the first worker is read
+        time.sleep(0.5)
+        found += [vector.recv()[4] for _ in range(2)]
+    assert [infos["env_id"].tolist() for infos in found] == [[2], [1], [0]]
+    assert [infos["text"].tolist() for infos in found[1:]] == [["1" * 1000], ["0" * 1000]]
 
 
 def test_observations_need_not_be_copied(nothing_stays_behind):

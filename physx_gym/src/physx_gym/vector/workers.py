@@ -70,7 +70,7 @@ class Workers:
         self._poll = select.poll()
         self._spins = has_core_for_each(len(self._shares) + 1)  # this process is one more
         self._errors: dict[int, PhysxError] = {}
-        self._received = 0
+        self._received = [0] * len(self._shares)
         self.is_open = True
         self.asked = [0] * len(self._shares)
         self.messages: list[tuple[int, Frame]] = []
@@ -162,10 +162,11 @@ class Workers:
                 batch.awaited[0] = NEVER
         done = list(batch.done)
         order()
-        if sum(batch.sent) > self._received:
-            for number in range(len(self._links)):
-                if not self._receive(number) and done[number] < self.asked[number]:
-                    self._fail(self._end_of(number))
+        # Not by their sums: a message may be read before it is counted.
+        for number, sent in enumerate(batch.sent):
+            is_read = sent <= self._received[number] or self._receive(number)
+            if not is_read and done[number] < self.asked[number]:
+                self._fail(self._end_of(number))
         if self._errors:
             error = self._errors[min(self._errors)]
             self._errors.clear()
@@ -219,7 +220,7 @@ class Workers:
             while (frame := link.reader.read(link.socket)) is not None:
                 if frame.kind is Kind.READY:  # it only woke this process
                     continue
-                self._received += 1
+                self._received[number] += 1
                 if frame.kind is Kind.ERROR:
                     self._errors.setdefault(frame.number, decode_error(frame.payload))
                 else:
