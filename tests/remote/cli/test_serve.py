@@ -52,7 +52,9 @@ def start(monkeypatch):
 def end(process, number=signal.SIGINT):
     process.send_signal(number)
     out, error = process.stdout.read(), process.stderr.read()
-    return process.wait(PATIENCE), out, error
+    status = process.wait(PATIENCE)
+    assert status != -signal.SIGABRT, error  # it hung; the error says where
+    return status, out, error
 
 
 def test_a_generated_token_is_removed(start):

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 
 from physx_core.errors import PhysxError, PluginError, UsageError, nearest, printable
 from physx_core.origin import install_hint
-from physx_core.pipelines.interrupt import Terminated, raised_at_sigterm
 from physx_core.plugins.entries import (
     COMMANDS,
     OFFICIAL,
@@ -26,6 +25,7 @@ from physx_core.plugins.entries import (
     owner_of,
 )
 from physx_core.plugins.loading import loading
+from physx_core.processes import Terminated, raised_at_sigterm
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

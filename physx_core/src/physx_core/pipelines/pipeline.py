@@ -19,10 +19,10 @@ from physx_core.components.visualizer import Observer
 from physx_core.config import EnvironmentConfig, to_plain
 from physx_core.errors import UsageError
 from physx_core.observers import Observers, ProgressBar, ScalarsFile
-from physx_core.pipelines.interrupt import Terminated, raised_at_sigterm
 from physx_core.pipelines.services import Predict, RunServices, Show
 from physx_core.pipelines.storage import remove_unused
 from physx_core.plugins import resolve
+from physx_core.processes import Terminated, raised_at_sigterm
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.workers.instance import NOTHING, Skip

@@ -13,7 +13,6 @@ from physx_core.components.environment import not_finite_prediction
 from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, at_least, options
 from physx_core.dataset import Dataset
 from physx_core.fields import Field, first_not_finite
-from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.learning.learner import Learner, load_learner
 from physx_core.pipelines.pipeline import Pipeline, choose_seed, derive_seed
 from physx_core.pipelines.run_description import (
@@ -29,6 +28,7 @@ from physx_core.pipelines.storage import (
     record_beside_rows,
 )
 from physx_core.pipelines.stored_rows import StoredRows
+from physx_core.processes import deferred_interrupt
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch

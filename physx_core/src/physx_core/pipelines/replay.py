@@ -18,10 +18,10 @@ from physx_core.config import (
 )
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, UntrustedReferenceError
-from physx_core.pipelines.interrupt import deferred_interrupt
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.plugins.references import check_recorded, find, is_recorded_as
+from physx_core.processes import deferred_interrupt
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 

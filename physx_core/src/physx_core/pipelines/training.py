@@ -27,7 +27,6 @@ from physx_core.config import (
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DivergedError
 from physx_core.observers import statistics_observers
-from physx_core.pipelines.interrupt import Interrupt, Terminated, deferred_interrupt
 from physx_core.pipelines.learning.components import create
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.opening import DataOpening, join_group, open_dataset
@@ -41,6 +40,7 @@ from physx_core.pipelines.run_description import (
     describe_training,
 )
 from physx_core.pipelines.storage import GENERATION, check_sources, reject_environments
+from physx_core.processes import Interrupt, Terminated, deferred_interrupt
 from physx_core.session import Session
 from physx_core.typing import Batch
 

@@ -1,4 +1,4 @@
-"""Child processes and temporary folders that go with this process, however it ends."""
+"""How this process ends, and the child processes and temporary folders that go with it."""
 
 from __future__ import annotations
 

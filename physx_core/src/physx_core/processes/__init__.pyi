@@ -1,8 +1,12 @@
-"""Child processes and temporary folders that go with this process, however it ends."""
+"""How this process ends, and the child processes and temporary folders that go with it."""
 
 from .child import ChildProcess as ChildProcess
 from .descendants import kill_descendants as kill_descendants
 from .folder import TemporaryFolder as TemporaryFolder
+from .interrupt import Interrupt as Interrupt
+from .interrupt import Terminated as Terminated
+from .interrupt import deferred_interrupt as deferred_interrupt
+from .interrupt import raised_at_sigterm as raised_at_sigterm
 from .memory import anonymous_file as anonymous_file
 from .tail import OutputTail as OutputTail
 from .worker import CLIENT_VARIABLE as CLIENT_VARIABLE

@@ -19,7 +19,7 @@ from physx_core.net import TOKEN_VARIABLE
 from physx_core.processes import TemporaryFolder
 from physx_remote.endpoints import serve
 from physx_remote.godot_rl.launch import write_launcher
-from physx_remote.serving.service import LOG, Service
+from physx_remote.serving.service import LOG, Service, poll_until_interrupted
 
 _PORTS = {"godot-gym": 9090, "godot-rl": 0, "physx": 0}
 _WITH_TOKEN = "physx"
@@ -82,8 +82,7 @@ def run(words: Sequence[str]) -> None:
             )
         )
         _print_address(chosen, service, options.get("token_file"))
-        while service.poll(None):  # Ctrl-C and SIGTERM pass through: physx knows what to do
-            continue
+        poll_until_interrupted(service.poll)
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections.abc import Awaitable, Generator, Iterator
@@ -17,6 +18,7 @@ from physx_remote.godot_gym.frames_timer import PhysicsFramesTimer
 from physx_remote.godot_gym.messages import DESCRIPTION, Messages, encode_extension
 from physx_remote.godot_gym.parts import RLAgent, RLEnvWorld
 from physx_remote.godot_gym.requests import as_count, as_object, as_seed, as_speed
+from physx_remote.serving.service import poll_until_interrupted
 from physx_remote.serving.spaces import describe_space
 
 FRAME_TIME = 1 / 60
@@ -143,11 +145,8 @@ class RLEnvironment:
                 "Call self.communication.start_server(port, address) in _ready(), or serve the "
                 'environment with physx_remote.serve(environment, "godot-gym", port=...).'
             )
-        try:
-            while self._process(None):
-                continue
-        except KeyboardInterrupt:
-            return
+        with contextlib.suppress(KeyboardInterrupt):
+            poll_until_interrupted(self._process)
 
     def close(self) -> None:
         """End all connections and the simulation; calling it again does nothing."""

@@ -18,6 +18,7 @@ from physx_core.config import reference_of
 from physx_core.errors import ConfigError, UsageError
 from physx_remote.endpoints import serve
 from physx_remote.godot_rl.protocol import PORT, GodotRL
+from physx_remote.serving.service import poll_until_interrupted
 
 SUFFIX = ".x86_64"
 """Suffix of the applications that godot-rl starts on Linux."""
@@ -150,8 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     try:
         with serve(words[0], GodotRL, **parse_flags(words[1:])) as service:
-            while service.poll(None):
-                continue
+            poll_until_interrupted(service.poll)
     except PhysxError as error:
         print(f"{COMMAND}: {type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
         return 1

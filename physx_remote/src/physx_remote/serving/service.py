@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from abc import abstractmethod
+from collections.abc import Callable
 
 from physx_core import Closeable
+from physx_core.processes import deferred_interrupt
 
 LOG = logging.getLogger("physx.remote")
 """Log of all services."""
+
+_PERIOD = 0.1
+"""How often to look for a signal while nothing arrives, in s."""
 
 
 class Service(Closeable):
@@ -38,12 +44,26 @@ class Service(Closeable):
 
     def run(self) -> None:
         """Serve until Ctrl-C, or until a signal handler or another thread calls `close`."""
-        try:
-            while self.poll(None):
-                continue
-        except KeyboardInterrupt:
-            return
+        with contextlib.suppress(KeyboardInterrupt):
+            poll_until_interrupted(self.poll)
 
     @abstractmethod
     def close(self) -> None:
         """End all connections; calling it again does nothing."""
+
+
+def poll_until_interrupted(poll: Callable[[float], bool]) -> None:
+    """Call `poll` until it returns False, or until a signal came.
+
+    A signal that raises an exception could be lost where Python ignores exceptions, as in a
+    finalizer.
+
+    Raises:
+        KeyboardInterrupt: After Ctrl-C; at once after a second one.
+        Terminated: Likewise for SIGTERM.
+    """
+    with deferred_interrupt() as interrupt:
+        while not interrupt and poll(_PERIOD):
+            continue
+    if interrupt:
+        interrupt.end()
