@@ -144,7 +144,7 @@ def write_launcher(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command and return its exit status: 0, 1 after an error, 130 after Ctrl-C."""
+    """Run the command; return its exit status: 0, 1 after an error, 130 after Ctrl-C."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
         print(USAGE, end="")  # noqa: T201 - it is a command
