@@ -33,7 +33,7 @@ from physx_rerun.viewer.viewer import Viewer, has_display, is_listening, start_w
 
 MODES = ("save", "spawn", "connect", "web", "headless", "offscreen", "none")
 FLUSH_SECONDS = 0.2
-FLUSH_STEPS = 100
+FLUSH_STEPS = 1000
 FLUSH_BYTES = 8_000_000
 _MARK = "picture"
 
@@ -186,7 +186,10 @@ class RerunVisualizer(Visualizer):
         if not self._is_open:
             return
         self._step = step
-        events = self._clocks.setdefault(instance_id, SimulatedClock()).read(events)
+        clock = self._clocks.get(instance_id)
+        if clock is None:
+            clock = self._clocks[instance_id] = SimulatedClock()
+        events = clock.read(events)
         if self.every > 1:
             changes = self._changes.setdefault(instance_id, Changes())
             if changes.add(step, events) and step % self.every:
@@ -203,13 +206,14 @@ class RerunVisualizer(Visualizer):
                 draws_shapes=instance_id <= self.max_instances,
                 resolution=self._resolution,
             )
-        times = {"step": step, TIME: self._now()}
+        now = self._now()
+        times = {"step": step, TIME: now}
         seconds = self._clocks[instance_id].seconds
         if seconds is not None:
             times[SIM_TIME] = seconds
             self._layout.has_sim_time = True
         self._drawings[instance_id].draw(events, times)
-        self._flush_if_due()
+        self._flush_if_due(now)
 
     def _draw_changes(self) -> None:
         for instance_id, changes in self._changes.items():
@@ -323,10 +327,11 @@ class RerunVisualizer(Visualizer):
     def _now(self) -> float:
         return time.monotonic() - self._begun
 
-    def _flush_if_due(self) -> None:
+    def _flush_if_due(self, now: float | None = None) -> None:
+        now = self._now() if now is None else now
         self._waiting += 1
         full = self._waiting >= FLUSH_STEPS or self._rows.nbytes >= FLUSH_BYTES
-        if full or self._now() - self._flushed >= FLUSH_SECONDS:
+        if full or now - self._flushed >= FLUSH_SECONDS:
             self._flush()
 
     def _flush(self) -> None:

@@ -18,7 +18,7 @@ from physx_rerun.drawing.framing import Frame
 _UPRIGHT = np.array([0, 0, 0, 1], np.float32)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Move:
     """A move of some bodies at one time; a part that is None stays as it was."""
 

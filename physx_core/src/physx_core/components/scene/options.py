@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -35,21 +34,26 @@ class Numbers:
     shape: tuple[int | None, ...]
     dtype: type = np.float32
 
-    def __call__(self, value: Any) -> Array:
-        """Return a copy of the array, or raise a ConfigError."""
+    def __call__(self, value: Any, count: int | None = None) -> Array:
+        """Return a copy of the array, or of one for each of `count` objects.
+
+        Raises:
+            ConfigError: If it is not such an array.
+        """
+        shape = self.shape if count is None else (count, *self.shape)
         # The common case in few operations; what it refuses is looked at again.
         raw = value if type(value) is np.ndarray else _as_array(value)
         if (
             raw.dtype.kind == "f"
             and self.dtype is not np.int32
             and raw.size <= _SMALL
-            and self._fits(raw.shape)
+            and (raw.shape == shape or _fits(raw.shape, shape))
         ):
             flat = raw.ravel()
             if float(flat.dot(flat)) < LARGEST**2:
                 return raw.astype(self.dtype)
-        if not self._fits(raw.shape):
-            wanted = str(self.shape).replace("None", "n")
+        if not _fits(raw.shape, shape):
+            wanted = str(shape).replace("None", "n")
             raise ConfigError(f"has shape {raw.shape}, expected {wanted}")
         try:
             with np.errstate(over="ignore", invalid="ignore"):
@@ -64,18 +68,11 @@ class Numbers:
             raise ConfigError(f"is {array[place]} at index {place}, but must be finite")
         return array
 
-    def _fits(self, shape: tuple[int, ...]) -> bool:
-        if len(shape) != len(self.shape):
-            return False
-        for want, have in zip(self.shape, shape, strict=True):
-            if want is not None and want != have:
-                return False
-        return True
 
-
-@functools.lru_cache(maxsize=256)
-def _rows_of(check: Numbers, count: int) -> Numbers:
-    return Numbers((count, *check.shape), check.dtype)
+def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
+    if len(shape) != len(wanted):
+        return False
+    return all(want in (None, have) for want, have in zip(wanted, shape, strict=True))
 
 
 def _as_array(value: Any) -> Array:
@@ -94,7 +91,7 @@ def many(check: Check, value: Any, count: int) -> Any:
         count: Number of objects.
     """
     if isinstance(check, Numbers):
-        return _rows_of(check, count)(value)
+        return check(value, count)
     if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != count:
         raise ConfigError(f"must have {count} entries, one for each object")
     return [check(entry) for entry in value]
