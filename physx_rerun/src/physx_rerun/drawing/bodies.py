@@ -13,7 +13,7 @@ import rerun as rr
 from physx_core.rotations import rotate_rows, to_matrix_rows
 from physx_core.typing import Array
 from physx_rerun.drawing.chunks import Chunk, Times, columns_of, indexes_of
-from physx_rerun.drawing.framing import Frame
+from physx_rerun.drawing.framing import Frame, extremes
 
 _UPRIGHT = np.array([0, 0, 0, 1], np.float32)
 
@@ -59,7 +59,7 @@ class Bodies:
 
     def set_box(self, place: int, corners: Array) -> None:
         """Set the points around a body that are kept in view, in its frame, shape (n, 3)."""
-        box = np.stack([corners.min(axis=0), corners.max(axis=0)])
+        box = np.stack(extremes(corners))
         self._boxes[place] = box
         self._radii[place] = float(np.linalg.norm(np.abs(box).max(axis=0)))
 
@@ -147,7 +147,8 @@ class Bodies:
             if not len(places):
                 return
         radius = max(self._radii.values())
-        if frame.shows(positions.min(axis=0) - radius, positions.max(axis=0) + radius):
+        low, high = extremes(positions)
+        if frame.shows(low - radius, high + radius):
             return
         boxes = np.zeros((len(self._frames), 2, 3), np.float32)
         for place, box in self._boxes.items():
@@ -156,4 +157,4 @@ class Bodies:
         turns = to_matrix_rows(orientations)
         middles = positions + np.einsum("nij,nj->ni", turns, centers)
         reach = np.einsum("nij,nj->ni", np.abs(turns), halves)
-        frame.see((middles - reach).min(axis=0), (middles + reach).max(axis=0))
+        frame.see(*extremes(np.concatenate([middles - reach, middles + reach])))

@@ -17,7 +17,7 @@ from physx_core.typing import Array
 from physx_rerun.drawing import colors, surfaces
 from physx_rerun.drawing.bodies import Bodies
 from physx_rerun.drawing.chunks import Chunk, ChunkBuilder, Times
-from physx_rerun.drawing.framing import RIGHT
+from physx_rerun.drawing.framing import RIGHT, extremes
 from physx_rerun.drawing.robot import corners_of, draw_robot, place_shapes, tint_robot
 from physx_rerun.drawing.windows import WindowLayout
 
@@ -174,7 +174,7 @@ class Drawing:
                 if drawn is not None and len(event.names) == 1 and not drawn.is_new:
                     self._scalars(drawn, event.values, times)
                     continue
-            for one in event.each():
+            for one in event.each() if len(event.names) > 1 else (event,):
                 self._draw(one, times)
         self._follow()
 
@@ -191,7 +191,7 @@ class Drawing:
         return places
 
     def _draw(self, event: Event, times: Times) -> None:
-        if event.kind not in (*self._draw_kind, "view"):
+        if event.kind not in self._draw_kind and event.kind != "view":
             raise VisualizerError(
                 f'Rerun cannot draw "{event.name}": it is of the unknown kind "{event.kind}". '
                 f"Kinds: {listed(self._draw_kind)}."
@@ -230,9 +230,10 @@ class Drawing:
             self._hide(drawn, times)
         elif was_hidden and not drawn.is_hidden:
             drawn.is_new, drawn.barred, changes = True, None, dict(drawn.values)
-        moves = {name: changes[name] for name in _MOVES & changes.keys()}
-        if (moves or is_first) and drawn.kind in _RIGID:
-            self._bodies.move(drawn.bodies, times, moves)
+        if drawn.kind in _RIGID:
+            moves = {name: changes[name] for name in _MOVES & changes.keys()}
+            if moves or is_first:
+                self._bodies.move(drawn.bodies, times, moves)
         if drawn.kind == "robot" or not drawn.is_hidden:
             self._draw_kind[drawn.kind](drawn, changes, times)
             drawn.is_new = False
@@ -260,7 +261,7 @@ class Drawing:
         for drawn in self._drawn.values():
             if drawn.seen and frame is not None:
                 margin = drawn.values.get("size") or 0.0
-                low, high = _extremes(np.concatenate(drawn.seen))
+                low, high = extremes(np.concatenate(drawn.seen))
                 frame.see(low - margin, high + margin)
                 drawn.seen = []
         self._layout.grow(self._id)
@@ -334,7 +335,7 @@ class Drawing:
         self._rows.add(
             texts, rr.Points3D, times, positions=ticks, labels=labels, radii=np.zeros(1, np.float32)
         )
-        self._layout.frame(self._id).see(*_extremes(np.concatenate([corners, ticks])))
+        self._layout.frame(self._id).see(*extremes(np.concatenate([corners, ticks])))
 
     def _points_of(self, drawn: Item) -> Array:
         """Return points of an object in the world."""
@@ -567,7 +568,7 @@ class Drawing:
             self._bodies.set_box(int(body), corners_of(shapes))
         fixed = [shape for _, shape in drawn.shapes if shape.body is None]
         if fixed:
-            self._layout.frame(self._id).see(*_extremes(corners_of(fixed)))
+            self._layout.frame(self._id).see(*extremes(corners_of(fixed)))
 
     # Windows beside the scene ----------------------------------------------------------------
 
@@ -609,7 +610,3 @@ def _radius(size: float | None, default: float) -> Array:
 
 def _size(points: Array) -> float:
     return float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
-
-
-def _extremes(points: Array) -> tuple[Array, Array]:
-    return points.min(axis=0), points.max(axis=0)

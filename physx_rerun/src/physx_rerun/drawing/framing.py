@@ -85,3 +85,9 @@ def _corners(low: Array, high: Array) -> Array:
 
 
 _SIGNS = np.array([[x, y, z] for x in (False, True) for y in (False, True) for z in (False, True)])
+
+
+def extremes(points: Array) -> tuple[Array, Array]:
+    """Return the smallest and largest coordinates of points, shape (n, 3) with n > 0."""
+    columns = np.ascontiguousarray(points.T)  # many times faster than along the first axis
+    return columns.min(axis=1), columns.max(axis=1)

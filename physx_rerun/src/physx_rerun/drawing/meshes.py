@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from physx_core.typing import Array
+from physx_rerun.drawing.framing import extremes
 
 _LARGEST = 2**26
 """Bytes of a mesh file; of larger ones only the origin is shown for certain."""
@@ -32,7 +33,7 @@ def corners_of_mesh(path: Path) -> Array:
     except (OSError, ValueError, KeyError, TypeError, IndexError, struct.error, SyntaxError):
         return _NOTHING
     points = points[np.isfinite(points).all(axis=1)]
-    return np.stack([points.min(axis=0), points.max(axis=0)]) if len(points) else _NOTHING
+    return np.stack(extremes(points)) if len(points) else _NOTHING
 
 
 def _stl(path: Path) -> Array:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from physx_core.typing import Array
+from physx_rerun.drawing.framing import extremes
 
 _ANGLES = np.linspace(0, 2 * np.pi, 25)
 
@@ -99,7 +100,7 @@ def bar_beside(points: Array, right: Array, parts: int) -> tuple[Array, Array, A
     Returns:
         Vertices (2 (parts + 1), 3), triangles (m, 3), and a point beside each of three heights.
     """
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = extremes(points)
     size = max(float(np.linalg.norm(high - low)), 1e-3)
     foot = 0.5 * (low + high) + 0.6 * size * right - [0.0, 0.0, 0.35 * size]
     levels = foot + np.linspace(0.0, 0.7 * size, parts + 1)[:, None] * [0.0, 0.0, 1.0]

@@ -72,7 +72,10 @@ class Numbers:
 def _fits(shape: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
     if len(shape) != len(wanted):
         return False
-    return all(want in (None, have) for want, have in zip(wanted, shape, strict=True))
+    for want, have in zip(wanted, shape, strict=True):
+        if want is not None and want != have:
+            return False
+    return True
 
 
 def _as_array(value: Any) -> Array:
