@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import inspect
 import itertools
+import sys
 import textwrap
 import typing
 from collections.abc import Mapping, Sequence
@@ -182,8 +183,9 @@ def _docstrings(cls: type[Any]) -> dict[str, str]:
     """Return the docstrings below the attributes in the source of a class and its bases."""
     docs: dict[str, str] = {}
     for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__)):
-        tree = ast.parse(textwrap.dedent(inspect.getsource(base)))
-        body = typing.cast("ast.ClassDef", tree.body[0]).body
+        tree = ast.parse(inspect.getsource(sys.modules[base.__module__]))
+        found = (node for node in tree.body if isinstance(node, ast.ClassDef))
+        body = next(node.body for node in found if node.name == base.__name__)
         for statement, following in itertools.pairwise(body):
             if isinstance(statement, ast.AnnAssign) and isinstance(following, ast.Expr):
                 name, text = ast.unparse(statement.target), following.value

@@ -73,24 +73,36 @@ def _read_entries(
     Returns:
         Group to name to entry points, and the packages that cannot be read.
     """
-    from importlib.metadata import distributions
-
     found: list[EntryPoint] = []
     unreadable: dict[str, str] = {}
     seen: set[str] = set()
-    for package in distributions():
-        try:
-            # From the folder's name, as importlib.metadata does it; reading all names takes long.
-            name = getattr(package, "_normalized_name", None) or _name_of(package)
-            if name not in seen:  # Python imports from the first folder that contains it
-                found += package.entry_points
+    for folder in dict.fromkeys(installed):
+        for name, entries, problem in _read_folder(*folder):
+            if problem:
+                unreadable[name] = problem
+            elif name not in seen:  # Python imports from the first folder that contains it
+                found += entries
             seen.add(name)
-        except Exception as error:  # it is another package's file and may hold anything
-            unreadable[_name_of(package)] = f"{type(error).__name__}: {error}"
     groups = (PLUGINS, COMMANDS)
     return {
         group: _by_name(entry for entry in found if entry.group == group) for group in groups
     }, unreadable
+
+
+@functools.lru_cache(maxsize=64)
+def _read_folder(folder: str, last_change: int) -> list[tuple[str, list[EntryPoint], str]]:
+    """Return name, entry points, and what is wrong with them, of each package in a folder."""
+    from importlib.metadata import distributions
+
+    packages: list[tuple[str, list[EntryPoint], str]] = []
+    for package in distributions(path=[folder]):
+        try:
+            # From the folder's name, as importlib.metadata does it; reading all names takes long.
+            name = getattr(package, "_normalized_name", None) or _name_of(package)
+            packages.append((name, list(package.entry_points), ""))
+        except Exception as error:  # it is another package's file and may hold anything
+            packages.append((_name_of(package), [], f"{type(error).__name__}: {error}"))
+    return packages
 
 
 def _by_name(entries: Iterable[EntryPoint]) -> dict[str, list[EntryPoint]]:

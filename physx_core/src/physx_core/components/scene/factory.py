@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -503,12 +503,6 @@ class Factory:
             self._moves = moves
         return True
 
-    def _checked(self, name: str, option: str, check: Callable[..., Any], *arguments: Any) -> Any:
-        try:
-            return check(*arguments)
-        except ConfigError as error:
-            raise _told(name, option, error) from error
-
     def _check_names(self, kind: str, names: tuple[str, ...]) -> None:
         """Check that objects are of a kind; what was found is remembered."""
         if self._known_names.get(names) == kind:
@@ -532,7 +526,10 @@ class Factory:
         except ConfigError as error:
             if np.shape(value)[:1] == (len(names),):
                 for name, entry in zip(names, value, strict=True):
-                    self._checked(name, option, check, entry)
+                    try:
+                        check(entry)
+                    except ConfigError as wrong:
+                        raise _told(name, option, wrong) from wrong
             raise _told(" ".join(names[:1]), option, error) from error
 
     def _plain(
@@ -544,12 +541,13 @@ class Factory:
         values: Mapping[str, Any],
     ) -> dict[str, Any]:
         """Return the plain values of options, if they fit each other and those set before."""
-        plain = {
-            option: None
-            if value is None and option in RESETTABLE
-            else self._checked(name, option, checks[option], value)
-            for option, value in values.items()
-        }
+        plain: dict[str, Any] = {}
+        for option, value in values.items():
+            try:
+                is_reset = value is None and option in RESETTABLE
+                plain[option] = None if is_reset else checks[option](value)
+            except ConfigError as error:
+                raise _told(name, option, error) from error
         if known.fits(plain, spec):
             return plain
         after = _Object(known.kind, {**known.lengths}, {**known.limits}, known.largest)
