@@ -32,7 +32,7 @@ def wait_for_steps(path, is_enough):
     """Wait until a receiver, which writes its file behind what it has taken, has these steps."""
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
-        with contextlib.suppress(FileNotFoundError, ValueError):  # there is nothing in it yet
+        with contextlib.suppress(FileNotFoundError, ValueError, RuntimeError):  # being written
             steps = steps_of(path)
             if is_enough(steps):
                 return steps
@@ -56,6 +56,7 @@ def test_a_live_viewer_gets_everything(opened, receiver):
     run_steps(visualizer, 350)
     visualizer.close()
     wait_for_steps(path, lambda steps: len(steps) == 350)
+    viewer.end()
     assert steps_of(path) == steps_of(visualizer.file) == list(range(350))
     live, file = (rr.chunk.RrdReader(p).recordings()[0] for p in (path, visualizer.file))
     assert (live.application_id, live.recording_id) == (file.application_id, file.recording_id)

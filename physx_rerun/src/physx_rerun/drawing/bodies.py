@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +14,15 @@ from physx_core.typing import Array
 from physx_rerun.drawing.chunks import Chunk, Times, columns_of, indexes_of
 from physx_rerun.drawing.framing import Frame, extremes
 
+_BLOCK_ROWS = 2000
+"""Rows of a chunk. Rerun's compression finds what repeats within 64 KiB only: a column's offsets
+are those of the column before."""
 _UPRIGHT = np.array([0, 0, 0, 1], np.float32)
 
 
 @dataclass(slots=True)
 class _Move:
-    """A move of some bodies at one time; a part that is None stays as it was."""
+    """A move of some bodies at one time: rows of them; a part that is None stays as it was."""
 
     times: Times
     places: Array
@@ -71,8 +73,11 @@ class Bodies:
             times: Time of the row.
             values: ``position`` (n, 3), ``orientation`` (n, 4), or both.
         """
-        move = _Move(times, places, values.get("position"), values.get("orientation"))
-        self._moves.append(move)
+        positions, orientations = values.get("position"), values.get("orientation")
+        if len(places) == 1:
+            positions = None if positions is None else positions.reshape(1, 3)
+            orientations = None if orientations is None else orientations.reshape(1, 4)
+        self._moves.append(_Move(times, places, positions, orientations))
 
     def in_world(self, place: int, points: Array) -> Array:
         """Return points of a body's frame, shape (n, 3), in the frame of the world."""
@@ -80,9 +85,9 @@ class Bodies:
         for move in self._moves:
             for row in np.flatnonzero(move.places == place):
                 if move.positions is not None:
-                    position = move.positions.reshape(-1, 3)[row]
+                    position = move.positions[row]
                 if move.orientations is not None:
-                    orientation = move.orientations.reshape(-1, 4)[row]
+                    orientation = move.orientations[row]
         return rotate_rows(orientation.astype(np.float64), points) + position
 
     def pop(self, frame: Frame | None) -> list[Chunk]:
@@ -93,8 +98,7 @@ class Bodies:
         """
         moves, self._moves = self._moves, []
         chunks = []
-        for _, group in itertools.groupby(moves, lambda move: len(move.times)):
-            same = list(group)  # timelines only ever come in addition
+        for same in _blocks(moves):
             places, positions, orientations = self._rows(same)
             indexes = indexes_of([move.times for move in same], [len(m.places) for m in same])
             columns = columns_of(
@@ -110,24 +114,19 @@ class Bodies:
 
     def _rows(self, moves: Sequence[_Move]) -> tuple[Array, Array, Array]:
         """Return places, positions and orientations of moves, one after another."""
-        positions, orientations = [], []
-        lacks = any(m.positions is None or m.orientations is None for m in moves)
-        for move in moves:
-            if move.positions is not None:
-                positions.append(move.positions.reshape(-1, 3))
-            if move.orientations is not None:
-                orientations.append(move.orientations.reshape(-1, 4))
-            if lacks:  # the parts that stay are those of the moves before
+        if any(move.positions is None or move.orientations is None for move in moves):
+            for move in moves:  # the parts that stay are those of the moves before
                 if move.positions is not None:
-                    self._positions[move.places] = positions.pop()
+                    self._positions[move.places] = move.positions
                 if move.orientations is not None:
-                    self._orientations[move.places] = orientations.pop()
-                positions.append(self._positions[move.places])
-                orientations.append(self._orientations[move.places])
+                    self._orientations[move.places] = move.orientations
+                move.positions = self._positions[move.places]
+                move.orientations = self._orientations[move.places]
         places = np.concatenate([move.places for move in moves])
-        rows = np.concatenate(positions), np.concatenate(orientations)
-        self._positions[places], self._orientations[places] = rows
-        return places, *rows
+        positions = np.concatenate([move.positions for move in moves])
+        orientations = np.concatenate([move.orientations for move in moves])
+        self._positions[places], self._orientations[places] = positions, orientations
+        return places, positions, orientations
 
     def _names(self, places: Array) -> pa.Array:
         """Return the names of frames; mostly the same bodies move in the same order as before."""
@@ -158,3 +157,17 @@ class Bodies:
         middles = positions + np.einsum("nij,nj->ni", turns, centers)
         reach = np.einsum("nij,nj->ni", np.abs(turns), halves)
         frame.see(*extremes(np.concatenate([middles - reach, middles + reach])))
+
+
+def _blocks(moves: Iterable[_Move]) -> Iterator[list[_Move]]:
+    """Yield moves in blocks that have the same timelines, and not too many rows to be packed."""
+    block: list[_Move] = []
+    count = 0
+    for move in moves:
+        if block and (count >= _BLOCK_ROWS or len(move.times) != len(block[0].times)):
+            yield block
+            block, count = [], 0
+        block.append(move)
+        count += len(move.places)
+    if block:
+        yield block
