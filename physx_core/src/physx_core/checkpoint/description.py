@@ -1,4 +1,4 @@
-"""What a checkpoint consists of, and what its files and folders are called."""
+"""Parts of a checkpoint, and the names of its files and folders."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ import dataclasses
 import errno
 import re
 import tempfile
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -104,11 +104,16 @@ def save(
             check_session(network_dir)
         if isinstance(cause, OSError):
             others = [f"{name}_{number}" for number in numbers]
-            safe = f"The checkpoints {listed(others)}" if others else "The session's samples"
-            what, advice = f"Checkpoint {path}", "resume the training"
-            raise files.storage_error(what, cause, safe, CheckpointError, advice) from error
+            raise _not_stored(path, cause, others) from error
         raise
     return path
+
+
+def _not_stored(path: Path, cause: OSError, others: Sequence[str]) -> PhysxError:
+    """Return the error of a checkpoint that could not be stored."""
+    safe = f"The checkpoints {listed(others)}" if others else "The session's samples"
+    what, advice = f"Checkpoint {path}", "resume the training"
+    return files.storage_error(what, cause, safe, CheckpointError, advice)
 
 
 def _describe(

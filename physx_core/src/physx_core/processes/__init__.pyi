@@ -1,4 +1,4 @@
-"""How this process ends, and the child processes and temporary folders that go with it."""
+"""Child processes and temporary folders that go with this process, and signals that end it."""
 
 from .child import ChildProcess as ChildProcess
 from .descendants import kill_descendants as kill_descendants

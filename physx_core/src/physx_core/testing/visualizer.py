@@ -1,4 +1,4 @@
-"""What a visualizer must do."""
+"""Checks that a visualizer does what physx and its users expect of one."""
 
 from __future__ import annotations
 

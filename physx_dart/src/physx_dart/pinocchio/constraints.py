@@ -186,12 +186,11 @@ def constrained(
             missed |= part.add_missed(after[span])
     of_rows = np.zeros(len(columns))
     of_rows[rows] = impulses[len(bias) :]
-    place, row = len(guess[0]), 0
-    for part, each in zip(parts, guess[1:], strict=True):
-        end, last_row = place + len(each), row + len(part.acts)
-        part.keep(impulses[place:end], of_rows[row:last_row])
-        place, row = end, last_row
-    return after, impulses[: len(guess[0])].reshape(-1, 3)
+    of_pairs, *of_points = np.split(impulses, np.cumsum([len(each) for each in guess]))
+    of_joints = np.split(of_rows, np.cumsum([len(part.acts) for part in parts]))
+    for part, *own in zip(parts, of_points, of_joints, strict=False):
+        part.keep(*own)
+    return after, of_pairs.reshape(-1, 3)
 
 
 def _diagonal(blocks: Sequence[Vector], spans: Sequence[slice]) -> Vector:

@@ -1,4 +1,4 @@
-"""What a replay draws beside the world: what the environment drew, contacts, ways, plots."""
+"""Drawings of a replay beside the world: the environment's own, contacts, ways, and plots."""
 
 from __future__ import annotations
 

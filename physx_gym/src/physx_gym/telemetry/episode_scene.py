@@ -1,4 +1,4 @@
-"""What an environment draws in an episode beside its world, and the contacts, step by step."""
+"""EpisodeScene: records an environment's own drawings and the contacts, step by step."""
 
 from __future__ import annotations
 

@@ -84,23 +84,9 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             UsageError: If a worker runs a script without ``if __name__ == "__main__":``.
             PhysxError: If an environment or a process fails.
         """
-        if os.environ.get(CLIENT_VARIABLE):
-            raise UsageError(
-                "A worker imported the script that defines its environment, and the script made a "
-                'vector environment. Put that under  if __name__ == "__main__":'
-            )
         workers = min(count_cores() if num_processes is None else num_processes, num_envs)
         batch_size = num_envs if batch_size is None else batch_size
-        if workers < 1 or not 1 <= batch_size <= num_envs:
-            raise ConfigError(
-                "num_envs and num_processes must be at least 1, and batch_size between 1 and "
-                f"num_envs: {num_envs}, {num_processes} and {batch_size} were given."
-            )
-        if not isinstance(env_kwargs or {}, Mapping):
-            raise ConfigError(f"env_kwargs is {env_kwargs!r} but must be a dictionary.")
-        modes = {each.value: each for each in AutoresetMode}
-        if not isinstance(autoreset_mode, AutoresetMode) and autoreset_mode not in modes:
-            raise UnknownOptionError("autoreset_mode", [str(autoreset_mode)], modes)
+        _check(num_envs, workers, batch_size, env_kwargs, autoreset_mode)
         name, options = reference_of(env), dict(env_kwargs or {})
         self.num_envs, self.batch_size = num_envs, batch_size
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -432,6 +418,31 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         if not self._workers.is_open:
             raise UsageError("This vector environment is closed, or ended with an error.")
         return self._workers
+
+
+def _check(
+    num_envs: int,
+    workers: int,
+    batch_size: int,
+    env_kwargs: Mapping[str, Any] | None,
+    autoreset_mode: AutoresetMode | str,
+) -> None:
+    """Check the arguments of a vector environment."""
+    if os.environ.get(CLIENT_VARIABLE):
+        raise UsageError(
+            "A worker imported the script that defines its environment, and the script made a "
+            'vector environment. Put that under  if __name__ == "__main__":'
+        )
+    if workers < 1 or not 1 <= batch_size <= num_envs:
+        raise ConfigError(
+            f"num_envs is {num_envs} and num_processes {workers}, but both must be at least 1; "
+            f"batch_size is {batch_size}, but must be between 1 and num_envs."
+        )
+    if not isinstance(env_kwargs or {}, Mapping):
+        raise ConfigError(f"env_kwargs is {env_kwargs!r} but must be a dictionary.")
+    modes = {each.value: each for each in AutoresetMode}
+    if not isinstance(autoreset_mode, AutoresetMode) and autoreset_mode not in modes:
+        raise UnknownOptionError("autoreset_mode", [str(autoreset_mode)], modes)
 
 
 class _Infos:
