@@ -222,6 +222,25 @@ def test_height_field(scene):
     assert saved("tf", "Transform3D:translation") == [(0, [[1, 0, 0]])]
 
 
+def test_grids_are_drawn_anew_only_when_their_size_changes(scene):
+    factory, show, saved = scene
+    factory.add_height_field("hills", np.zeros((2, 3)), [1, 1])
+    factory.add_slice("cut", np.zeros((2, 3)), [1, 1])
+    show(0)
+    factory.update_height_field("hills", heights=np.ones((2, 3)))
+    factory.update_slice("cut", values=np.ones((2, 3)))
+    show(1)
+    factory.update_height_field("hills", heights=np.ones((3, 3)))
+    factory.update_slice("cut", values=np.ones((3, 3)))
+    show(2)
+    for name in ("hills", "cut"):
+        cells = saved(name, "Mesh3D:triangle_indices")
+        assert [(step, len(rows)) for step, rows in cells] == [(0, 4), (2, 8)]
+    points = {name: saved(name, "Mesh3D:vertex_positions") for name in ("hills", "cut")}
+    assert [step for step, _ in points["hills"]] == [0, 1, 2]
+    assert [(step, len(rows)) for step, rows in points["cut"]] == [(0, 6), (2, 9)]
+
+
 def test_slice_with_limits_and_a_color_bar(scene):
     factory, show, saved = scene
     values = [[0.0, 1.0], [2.0, 9.0]]

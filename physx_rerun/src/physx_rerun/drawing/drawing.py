@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from physx_rerun.drawing import colors, surfaces
 from physx_rerun.drawing.bodies import Bodies
 from physx_rerun.drawing.chunks import Chunk, ChunkBuilder, Times
 from physx_rerun.drawing.framing import RIGHT, extremes
+from physx_rerun.drawing.items import Item
 from physx_rerun.drawing.robot import corners_of, draw_robot, place_shapes, tint_robot
 from physx_rerun.drawing.windows import WindowLayout
 
@@ -30,8 +30,6 @@ _BAR_PARTS = 64
 _DENSITY = 4.0  # of a volume: how much light its largest values take on their way through
 _MOVES = {"position", "orientation"}
 _RIGID = {"box", "sphere", "capsule", "cylinder", "height_field", "slice", "volume"}
-_GRID_VALUES = {"heights", "values"}
-_SHAPING = {"positions", "cells", "spacing", *_GRID_VALUES}
 _COLORING = {"color", "alpha", "scalar_field", "values", "colormap", "vmin", "vmax"}
 _VOLUME_MAPS = {
     "gray": rr.components.Colormap.Grayscale,
@@ -43,69 +41,6 @@ _VOLUME_MAPS = {
     "twilight": rr.components.Colormap.Twilight,
     "viridis": rr.components.Colormap.Viridis,
 }
-
-
-@dataclass
-class Item:
-    """A drawn object.
-
-    Attributes:
-        kind: Kind of the object.
-        name: Its name.
-        entity: Path of its entity.
-        frame: Name of its frame; None: it is not drawn yet.
-        values: All options set so far.
-        is_new: Whether all of it is to be drawn.
-        bodies: Places of its bodies among those of the instance.
-        limits: Smallest and largest value of its scalar field so far.
-        barred: Limits that its color bar shows.
-        edges: Pairs of vertices of a wireframe mesh, shape (edges, 2).
-        seen: Points that it had since the last flush.
-        shapes: Shapes of a robot.
-    """
-
-    kind: str
-    name: str
-    entity: str = ""
-    frame: str | None = None
-    values: dict[str, Any] = field(default_factory=dict)
-    is_new: bool = True
-    bodies: Array = field(default_factory=lambda: np.zeros(0, np.int64))
-    limits: tuple[float, float] = (np.inf, -np.inf)
-    barred: tuple[float, float] | None = None
-    edges: Array | None = None
-    seen: list[Array] = field(default_factory=list)
-    shapes: list[Any] = field(default_factory=list)
-
-    @property
-    def is_hidden(self) -> bool:
-        """Whether it is not to be seen."""
-        return self.values.get("visible") is False
-
-    @property
-    def in_view(self) -> bool:
-        """Whether the camera shows it."""
-        return self.values.get("in_view") is not False
-
-    @property
-    def alpha(self) -> float:
-        """Its opacity."""
-        alpha = self.values.get("alpha")
-        return 1.0 if alpha is None else alpha
-
-    @property
-    def colormap(self) -> str:
-        """Name of its colormap."""
-        return self.values.get("colormap") or "viridis"
-
-    def widen(self, shown: Array) -> tuple[float, float]:
-        """Return the limits of its colors: those that are set, else the extremes so far."""
-        self.limits = (
-            min(self.limits[0], float(shown.min())),
-            max(self.limits[1], float(shown.max())),
-        )
-        low, high = self.values.get("vmin"), self.values.get("vmax")
-        return self.limits[0] if low is None else low, self.limits[1] if high is None else high
 
 
 class Drawing:
@@ -368,15 +303,19 @@ class Drawing:
     def _mesh(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
         look: dict[str, Any] = {}
         values, wireframe = drawn.values, bool(drawn.values.get("wireframe"))
-        moved = drawn.is_new or bool(changes.keys() & _SHAPING)
-        if moved or "wireframe" in changes:
+        heights = values.get("heights", values.get("values"))
+        grid = () if heights is None else heights.shape
+        reshaped = drawn.is_new or grid != drawn.grid
+        reshaped = reshaped or bool(changes.keys() & {"cells", "spacing", "wireframe"})
+        drawn.grid = grid
+        if reshaped or changes.keys() & {"positions", "heights"}:
             positions, cells = surfaces.mesh_of(drawn.kind, values)
             self._see(drawn, positions)
             shown = positions[:0] if wireframe else positions
             look["vertex_positions"] = shown
             if drawn.kind != "slice":  # without normals its colors are not shaded
                 look["vertex_normals"] = vertex_normals(shown, cells)
-            if drawn.is_new or changes.keys() & {"cells", "spacing", "wireframe", *_GRID_VALUES}:
+            if reshaped:
                 look["triangle_indices"] = cells[:0] if wireframe else cells
                 drawn.edges = None
             if wireframe or "wireframe" in changes:

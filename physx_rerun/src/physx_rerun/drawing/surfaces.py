@@ -57,6 +57,7 @@ def mesh_of(kind: str, values: Mapping[str, Any]) -> tuple[Array, Array]:
     """Return vertices (n, 3) and triangles (m, 3) of a mesh, a height field or a slice."""
     if kind == "mesh":
         return values["positions"], values["cells"]
+    # Rerun's `GridMap` is flat, of square cells, with one color each instead of values at points.
     shape = (values["heights"] if kind == "height_field" else values["values"]).shape
     heights = values["heights"] if kind == "height_field" else np.zeros(shape, np.float32)
     x, y = (spacing * np.arange(n) for spacing, n in zip(values["spacing"], shape, strict=True))
