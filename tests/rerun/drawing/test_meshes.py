@@ -109,6 +109,8 @@ BOMB = b'<!DOCTYPE a [<!ENTITY b "c"><!ENTITY d "&b;&b;">]>'
         ("entities.dae", document().replace(b"<COLLADA", BOMB + b"<COLLADA")),
         ("utf16.dae", document().decode().replace("?>", ' encoding="utf-16"?>').encode("utf-16")),
         ("nested.dae", document(instance='<instance_node url="#moved"/>')),
+        ("tags.dae", document(instance="<a/>" * 2**20)),
+        ("items.gltf", gltf(*TURNED, {"extras": [[]] * 2**20})),
         ("cycle.gltf", gltf({"children": [0, 0]})),
         ("unknown.ply", b"ply"),
     ],

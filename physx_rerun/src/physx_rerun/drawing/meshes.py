@@ -24,6 +24,7 @@ LARGEST = 2**26
 """Bytes of a mesh file; of larger ones only the origin is shown for certain."""
 _MOST = 2**24  # points of a document, which can repeat its shapes without end
 _MOST_NODES = 2**14
+_MOST_ITEMS = 2**20  # tags, or items of JSON, which take many times as much memory as their text
 _NOTHING = np.zeros((1, 3))
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
@@ -60,7 +61,8 @@ def read_document(content: bytes) -> Collada:
         ValueError: If it is packed, or may expand to something much larger than it is.
     """
     # A zero byte is in every zip file, which pycollada would unpack, and in UTF-16.
-    if any(word in content for word in (b"\0", b"<!DOCTYPE", b"instance_node")):
+    bombs = b"\0", b"<!DOCTYPE", b"instance_node"
+    if content.count(b"<") > _MOST_ITEMS or any(word in content for word in bombs):
         raise ValueError("a document that may be a bomb")
     import collada  # only documents need it
 
@@ -82,17 +84,20 @@ def placed(document: Collada) -> list[Any]:
 
 def _stl(content: bytes) -> Iterator[Array]:
     facets = facets_of(content)
-    yield _rows(content, b"vertex") if facets is None else facets.reshape(-1, 3)
+    return _rows(content, b"vertex") if facets is None else iter([facets.reshape(-1, 3)])
 
 
 def _obj(content: bytes) -> Iterator[Array]:
-    yield _rows(content, b"v")
+    return _rows(content, b"v")
 
 
-def _rows(content: bytes, word: bytes) -> Array:
-    """Return the three numbers after a word at the beginning of lines."""
-    lines = (line.split() for line in content.splitlines())
-    return np.array([row[1:4] for row in lines if row[:1] == [word]], np.float64).reshape(-1, 3)
+def _rows(content: bytes, word: bytes) -> Iterator[Array]:
+    """Yield the three numbers after a word at the beginning of lines, in small blocks."""
+    file = io.BytesIO(content)
+    while lines := file.readlines(2**20):
+        rows = [line[:256].split(None, 4) for line in lines]
+        found = [row[1:4] for row in rows if row[:1] == [word]]
+        yield np.array(found, np.float64).reshape(-1, 3)
 
 
 def _dae(content: bytes) -> Iterator[Array]:
@@ -109,6 +114,8 @@ def _gltf(content: bytes) -> Iterator[Array]:
     if content[:4] == b"glTF":
         (length,) = struct.unpack_from("<I", content, 12)
         content = content[20 : 20 + length]
+    if content.count(b",") > _MOST_ITEMS:
+        raise ValueError("a document of too many items")
     document = json.loads(content)
     places = [(root, np.eye(4)) for scene in document["scenes"] for root in scene["nodes"]]
     for number, pose in places:
