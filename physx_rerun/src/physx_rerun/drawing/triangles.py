@@ -1,6 +1,7 @@
 """Meshes of few triangles, for pictures that are drawn without a graphics card.
 
 A processor needs most of its time for the triangles of a robot, far more than a picture has pixels.
+Documents that Rerun does not draw as they are become triangles for all pictures.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ from physx_core.typing import Array
 from physx_rerun.drawing.meshes import LARGEST, facets_of, placed, read_document
 
 _MANY = 1000  # triangles, fewer of which are drawn as they are
+_DRAWN = b"Z_UP", b"instance_material"
+"""What documents of COLLADA have that Rerun draws as they are: it omits shapes without material,
+and turns those that call another axis upward, which engines and other tools for URDF ignore."""
 _ROW, _LAYER = 1 << 20, 1 << 40  # steps of the number of a cell
 _WHITE = (1.0, 1.0, 1.0, 1.0)
 
@@ -38,7 +42,7 @@ class Triangles:
 
 @dataclass(frozen=True)
 class SimpleMesh:
-    """A mesh without details.
+    """A mesh that is drawn in place of a file.
 
     Attributes:
         positions: Vertices, shape (n, 3), in m.
@@ -54,34 +58,54 @@ class SimpleMesh:
 
 
 @functools.lru_cache(maxsize=64)
-def simple_mesh(path: Path, detail: float) -> SimpleMesh | None:
+def simple_mesh(path: Path, detail: float | None) -> SimpleMesh | None:
     """Return the mesh of a file without details.
 
     Args:
         path: The file.
-        detail: Size of what may be lost, in the file's units of length.
+        detail: Size of what may be lost, in the file's units of length; None: nothing.
 
     Returns:
-        None if the file is best left to the viewer: it has few triangles, or features that are not
-        read here, such as textures, or is damaged.
+        None if the file is best left to the viewer: nothing would be lost, or it has features that
+        are not read here, such as textures, or is damaged.
     """
     reader = {".stl": _stl, ".dae": _dae}.get(path.suffix.lower())
     try:
         if reader is None:
             return None
-        parts = reader(read_content(path, LARGEST))
-        if sum(len(part.points) for part in parts) < _MANY:
+        content = read_content(path, LARGEST)
+        is_misdrawn = reader is _dae and not all(word in content for word in _DRAWN)
+        if not detail and not is_misdrawn:
             return None
-        return _simplify(parts, detail)
+        parts = reader(content)
+        if detail and sum(len(part.points) for part in parts) >= _MANY:
+            return _simplify(parts, detail)
+        return _whole(parts) if is_misdrawn else None
     except Exception:  # strangers' files fail in any way, and the viewer reports it
         return None
 
 
-def _simplify(parts: list[Triangles], detail: float) -> SimpleMesh:
-    """Merge the vertices of each part in each cell of a grid; edges between sides stay sharp."""
+def _whole(parts: list[Triangles]) -> SimpleMesh:
+    """Return all triangles of parts."""
+    points, normals, owner = _corners(parts)
+    colors = np.array([part.color for part in parts])[owner]
+    return SimpleMesh(points, normals, colors, np.arange(len(points)).reshape(-1, 3))
+
+
+def _corners(parts: list[Triangles]) -> tuple[Array, Array, Array]:
+    """Return corners and normals of all triangles, shape (n, 3), and the parts they are of."""
     points = np.concatenate([part.points for part in parts]).reshape(-1, 3)
     normals = np.concatenate([part.normals for part in parts]).reshape(-1, 3)
-    owner = np.repeat(np.arange(len(parts)), [3 * len(part.points) for part in parts])
+    return (
+        points,
+        normals,
+        np.repeat(np.arange(len(parts)), [3 * len(each.points) for each in parts]),
+    )
+
+
+def _simplify(parts: list[Triangles], detail: float) -> SimpleMesh:
+    """Merge the vertices of each part in each cell of a grid; edges between sides stay sharp."""
+    points, normals, owner = _corners(parts)
     grid = np.floor((points - points.min(axis=0)) / detail).astype(np.int64)
     steps = np.array([_LAYER, _ROW, 1])
     _, cell = np.unique(grid @ steps, return_inverse=True)
@@ -132,8 +156,8 @@ def _dae(content: bytes) -> list[Triangles]:
     from collada.lineset import BoundLineSet
 
     textured = document.xmlnode.find(f".//{document.tag('texture')}") is not None
-    if document.errors or textured or document.assetInfo.upaxis != "Z_UP":
-        raise ValueError("damaged, with textures, or another direction upwards")
+    if document.errors or textured:
+        raise ValueError("damaged, or with textures")
     meter = document.assetInfo.unitmeter or 1.0
     parts = placed(document)
     return [_triangles(part, meter) for part in parts if not isinstance(part, BoundLineSet)]
