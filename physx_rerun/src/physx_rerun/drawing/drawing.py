@@ -31,6 +31,9 @@ _DENSITY = 4.0  # of a volume: how much light its largest values take on their w
 _MOVES = {"position", "orientation"}
 _RIGID = {"box", "sphere", "capsule", "cylinder", "height_field", "slice", "volume"}
 _COLORING = {"color", "alpha", "scalar_field", "values", "colormap", "vmin", "vmax"}
+_COLORING |= {"wireframe", "symbol"}  # which need them in another form
+_PARTS = ("/color_bar", "/color_bar/values", "/edges", "/labels", "/slices")
+"""What an object can consist of besides its own entity."""
 _VOLUME_MAPS = {
     "gray": rr.components.Colormap.Grayscale,
     "inferno": rr.components.Colormap.Inferno,
@@ -159,16 +162,15 @@ class Drawing:
         drawn.values.update(changes)
         if "color" in changes and "scalar_field" not in changes:
             drawn.values.pop("scalar_field", None)
+        moves = {name: changes[name] for name in _MOVES & changes.keys()}
         if is_first:
             self._register(drawn)
         elif drawn.is_hidden and not was_hidden:
             self._hide(drawn, times)
         elif was_hidden and not drawn.is_hidden:
             drawn.is_new, drawn.barred, changes = True, None, dict(drawn.values)
-        if drawn.kind in _RIGID:
-            moves = {name: changes[name] for name in _MOVES & changes.keys()}
-            if moves or is_first:
-                self._bodies.move(drawn.bodies, times, moves)
+        if drawn.kind in _RIGID and (moves or is_first):
+            self._bodies.move(drawn.bodies, times, moves)
         if drawn.kind == "robot" or not drawn.is_hidden:
             self._draw_kind[drawn.kind](drawn, changes, times)
             drawn.is_new = False
@@ -177,7 +179,12 @@ class Drawing:
         if drawn.kind == "robot":
             place_shapes(self._rows, drawn.shapes, times, is_visible=False)
         else:
-            self._rows.add(drawn.entity, rr.Clear, times, is_recursive=[True])
+            inner = f"{drawn.entity}/"
+            if not any(other.entity.startswith(inner) for other in self._drawn.values()):
+                self._rows.add(drawn.entity, rr.Clear, times, is_recursive=[True])
+                return
+            for part in ("", *_PARTS):  # other objects lie below it
+                self._rows.add(f"{drawn.entity}{part}", rr.Clear, times, is_recursive=[False])
 
     def _follow(self) -> None:
         """Let the camera follow the configured object, once it is drawn."""
@@ -290,8 +297,8 @@ class Drawing:
             look["fill_mode"] = [mode]
         if "size" in changes:
             look["line_radii"] = _radius(changes["size"], _SCREEN_LINES)
-        if changes.get("label") is not None:
-            look["labels"] = [changes["label"]]
+        if "label" in changes:
+            look["labels"] = [] if changes["label"] is None else [changes["label"]]
         return look
 
     def _add(self, drawn: Item, archetype: type[Any], times: Times, look: dict[str, Any]) -> None:
@@ -308,7 +315,8 @@ class Drawing:
         reshaped = drawn.is_new or grid != drawn.grid
         reshaped = reshaped or bool(changes.keys() & {"cells", "spacing", "wireframe"})
         drawn.grid = grid
-        if reshaped or changes.keys() & {"positions", "heights"}:
+        has_other_lines = wireframe and "size" in changes
+        if reshaped or has_other_lines or changes.keys() & {"positions", "heights"}:
             positions, cells = surfaces.mesh_of(drawn.kind, values)
             self._see(drawn, positions)
             shown = positions[:0] if wireframe else positions
@@ -405,11 +413,11 @@ class Drawing:
     def _symbols(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
         values = drawn.values
         look: dict[str, Any] = {}
-        if drawn.is_new and values.get("size") is None:
+        if values.get("size") is None:
             size = max(self._layout.frame(self._id).size, _size(values["positions"]))
             values["size"] = _SYMBOL_SIZE * size or 0.05
         name, positions = values.get("symbol", "circle"), values["positions"]
-        if drawn.is_new or changes.keys() & {"positions", "orientations", "size"}:
+        if drawn.is_new or changes.keys() & {"positions", "orientations", "size", "symbol"}:
             self._see(drawn, positions)
             look["strips"] = surfaces.symbol_lines(
                 name, positions, values.get("orientations"), values["size"]
@@ -421,13 +429,11 @@ class Drawing:
         if drawn.is_new:
             look["radii"] = _radius(None, _SCREEN_LINES)
         self._add(drawn, rr.LineStrips3D, times, look)
-        labels = values.get("labels")
-        if labels and changes.keys() & {"labels", "positions"}:
-            entity = f"{drawn.entity}/labels"
-            none = np.zeros(1, np.float32)
-            self._rows.add(
-                entity, rr.Points3D, times, positions=positions, labels=labels, radii=none
-            )
+        labels = values.get("labels") or []
+        if "labels" in changes or (labels and "positions" in changes):
+            look = {"labels": labels, "radii": np.zeros(1, np.float32)}
+            look["positions"] = positions if labels else positions[:0]
+            self._rows.add(f"{drawn.entity}/labels", rr.Points3D, times, **look)
 
     def _stroke(
         self, drawn: Item, changes: dict[str, Any], times: Times, default: float

@@ -39,7 +39,8 @@ def symbol_lines(symbol: str, positions: Array, normals: Array | None, size: flo
         normals: Directions that the symbols face, shape (n, 3); None: upward.
         size: Radius in m.
     """
-    facing = np.zeros_like(positions) if normals is None else np.array(normals)
+    is_given = normals is not None and len(normals) > 0
+    facing = np.array(normals) if is_given else np.zeros_like(positions)
     facing[~facing.any(axis=1), 2] = 1.0
     facing /= np.linalg.norm(facing, axis=1, keepdims=True)
     helper = np.where(np.abs(facing[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
