@@ -242,6 +242,16 @@ def test_marked_vertices_stay(factory):
     assert [event.name for event in factory.take_events()] == ["plate", "markers"]
 
 
+def test_markers_stay_where_a_refused_change_of_several_meshes_began(factory):
+    factory.update_mesh("mesh", scalar_field=[1, 2, 3, 4])
+    factory.take_events()
+    with pytest.raises(ConfigError, match='"mesh".*length 4, but positions has 5'):
+        factory.update_many("mesh", ["plate", "mesh"], {"positions": np.ones((2, 5, 3))})
+    factory.update_markers("markers", indices=[1])
+    (markers,) = factory.take_events()
+    assert markers.values["positions"].tolist() == [[1, 0, 0]]
+
+
 def test_large_numbers_need_no_warning(factory):
     for dtype, large in ((np.float16, 6e4), (np.float32, 1e30), (np.float64, 1e38)):
         factory.update_points("points", positions=np.full((4, 3), large, dtype))
