@@ -1,7 +1,8 @@
 """Meshes of few triangles, for pictures that are drawn without a graphics card.
 
 A processor needs most of its time for the triangles of a robot, far more than a picture has pixels.
-Documents that Rerun does not draw as they are become triangles for all pictures.
+COLLADA becomes triangles for all pictures: Rerun omits many documents, such as those of MeshLab,
+and turns those that call another axis upward, which engines ignore.
 """
 
 from __future__ import annotations
@@ -18,9 +19,6 @@ from physx_core.typing import Array
 from physx_rerun.drawing.meshes import LARGEST, facets_of, placed, read_document
 
 _MANY = 1000  # triangles, fewer of which are drawn as they are
-_DRAWN = b"Z_UP", b"instance_material"
-"""What documents of COLLADA have that Rerun draws as they are: it omits shapes without material,
-and turns those that call another axis upward, which engines and other tools for URDF ignore."""
 _ROW, _LAYER = 1 << 20, 1 << 40  # steps of the number of a cell
 _WHITE = (1.0, 1.0, 1.0, 1.0)
 
@@ -71,16 +69,12 @@ def simple_mesh(path: Path, detail: float | None) -> SimpleMesh | None:
     """
     reader = {".stl": _stl, ".dae": _dae}.get(path.suffix.lower())
     try:
-        if reader is None:
+        if reader is None or (reader is _stl and not detail):
             return None
-        content = read_content(path, LARGEST)
-        is_misdrawn = reader is _dae and not all(word in content for word in _DRAWN)
-        if not detail and not is_misdrawn:
-            return None
-        parts = reader(content)
+        parts = reader(read_content(path, LARGEST))
         if detail and sum(len(part.points) for part in parts) >= _MANY:
             return _simplify(parts, detail)
-        return _whole(parts) if is_misdrawn else None
+        return _whole(parts) if reader is _dae else None
     except Exception:  # strangers' files fail in any way, and the viewer reports it
         return None
 
