@@ -196,7 +196,7 @@ def main() -> int:
         for number in TRAJECTORIES
     }
     gain = print_table(errors)
-    print(f"\nsession:   {folder}\nrecording: {recording}  (rerun {recording})")
+    print(f"\nsession:   {folder}\nrecording: {recording}  (physx view {recording}, or rerun)")
     draw(recording, folder / "tracking.png", size.tracking_steps // 2)
     if gain < size.least_gain:
         print(f"The network is only {gain:.1f} times better than PD alone.")
