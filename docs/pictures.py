@@ -1,12 +1,17 @@
-"""Draws the pictures of the documentation that show environments.
+"""Draws the pictures of the documentation that show environments and examples.
 
-python docs/pictures.py    # writes environments.png and replay.png beside this file
+python docs/pictures.py    # writes environments.png, replay.png, examples.png beside this file
+python docs/pictures.py --demo PICTURE    # compares a picture of the demo with arm.png
+
+``make demo DEMO_ARGS="--picture docs/arm.png"`` draws arm.png.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +20,13 @@ import numpy as np
 from PIL import Image
 
 import physx_gym
+from physx_core import Visualizer
+from physx_core.components import Event, Factory
+from physx_rerun import RerunVisualizer, render_picture
 
+HERE = Path(__file__).parent
+EXAMPLES = HERE.parent / "examples"
+GUESSES = {"ground_truth": "prediction", "displacement": "displacement"}
 NAMES = ("Cartpole", "Acrobot", "Ant", "Quadruped", "ArmReach", "PushBox")
 COLUMNS = 3
 FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
@@ -58,8 +69,6 @@ def environments(path: Path, size: tuple[int, int] = (320, 240)) -> None:
 
 def replay(path: Path, size: tuple[int, int] = (1500, 800)) -> None:
     """Draw the replay of a quadruped: its signals, contacts, a foot's way, and another motion."""
-    from physx_rerun.viewer.headless import render_picture
-
     with tempfile.TemporaryDirectory() as folder:
         logs = []
         for steps in (40, 25):
@@ -72,8 +81,145 @@ def replay(path: Path, size: tuple[int, int] = (1500, 800)) -> None:
         render_picture(recording, path, size)
 
 
+def load(name: str) -> Any:
+    """Return a script of the examples as a module."""
+    path = EXAMPLES / name
+    spec = importlib.util.spec_from_file_location(f"example_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def play(environment: Any, number: int, steps: int) -> Iterator[list[Event]]:
+    """Step the environment of an example, and yield what it draws in each step.
+
+    In a network's place, what was true in the step before is predicted.
+
+    Args:
+        environment: Class of the environment.
+        number: Number of the instance, counted from 1.
+        steps: How many steps.
+    """
+
+    class Alone(environment):  # type: ignore[misc]
+        def update_visualization(self) -> None:
+            """Leave the events to the caller."""
+
+    env = Alone(instance_id=number, seed=3)
+    try:
+        env.create()
+        env.init()
+        env.init_database()
+        env.factory = Factory()
+        env.init_visualization()
+        before: dict[str, Any] = {}
+        for env.step_index in range(steps):
+            env.step()
+            for truth, guess in GUESSES.items():
+                if truth in before:
+                    env.apply_prediction({guess: before[truth]})
+            before = env.take_sample()
+            yield env.factory.take_events()
+    finally:
+        env.close()
+
+
+def show_environments(folder: Path, *visualizers: Visualizer) -> None:
+    """Show the arm, the beam and the cloud of the examples, side by side."""
+    scenes = (
+        play(load("arm_dynamics/run.py").ComparedArm, 1, 100),
+        play(load("beam/beam.py").Beam, 2, 10),
+        play(load("features/cloud.py").Cloud, 3, 4),
+    )
+    for visualizer in visualizers:
+        visualizer.open("examples", folder, len(scenes))
+    for number, scene in enumerate(scenes, 1):
+        for step, events in enumerate(scene):
+            for visualizer in visualizers:
+                visualizer.events(number, step, events)
+
+
+def show_robots(path: Path) -> None:
+    """Write a recording of the pushed box and the walking quadruped of the examples."""
+    pushing, walking = load("push_box.py"), load("quadruped/run.py")
+    box: Any = gymnasium.make("physx/PushBox-v0").unwrapped
+    robot: Any = physx_gym.load_pipeline(EXAMPLES / "quadruped" / "pipeline.toml")()
+    for env in (box, robot):
+        env.eval()
+    observation, _ = box.reset(seed=0)
+    for _ in range(12):
+        observation, *_ = box.step(pushing.push(observation))
+    walking.walk(robot, 0.5, 0)
+    logs = []
+    for env in (box, robot):
+        env.stop()
+        logs.append(env.log_data)
+        env.close()
+    physx_gym.replay(logs, plots=False, frame_rate=5.0, path=path)
+
+
+def examples() -> dict[str, np.ndarray]:
+    """Return pictures of what the examples show, by the viewer that draws them.
+
+    Returns:
+        Pictures of the width 1000: the scenes of the environments and those of the robots in
+        Rerun's viewer, and the former in that of ``examples/matplotlib_viewer``.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rerun = RerunVisualizer(path=folder / "environments.rrd")
+        plain = load("matplotlib_viewer/src/physx_matplotlib.py").MatplotlibVisualizer((1000, 340))
+        show_environments(folder, rerun, plain)
+        drawn = {"matplotlib": plain.capture()}
+        rerun.close()
+        show_robots(folder / "robots.rrd")
+        for name, height in (("environments", 520), ("robots", 340)):
+            path = render_picture(folder / f"{name}.rrd", folder / f"{name}.png", (1000, height))
+            drawn[name] = np.asarray(Image.open(path).convert("RGB"))
+    return drawn
+
+
+def sheet(drawn: dict[str, np.ndarray]) -> Image.Image:
+    """Return the pictures of `examples` below each other, with few colors."""
+    rows = [drawn[name] for name in ("environments", "robots", "matplotlib")]
+    return Image.fromarray(np.vstack(rows)).quantize(256)
+
+
+def shares(picture: np.ndarray) -> dict[str, float]:
+    """Return the shares of the pixels of a picture that are of these colors."""
+    red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
+    colors = {
+        "light": np.minimum(np.minimum(red, green), blue) > 150,
+        "red": red - np.maximum(green, blue) > 100,
+        "orange": (red - green > 40) & (green - blue > 40),
+        "yellow": (np.minimum(red, green) > 150) & (blue < 90),
+        "green": green - np.maximum(red, blue) > 25,
+        "blue": (blue - red > 50) & (blue >= green),
+    }
+    return {name: float(mask.mean()) for name, mask in colors.items()}
+
+
+def check_demo(path: Path) -> None:
+    """Check that a picture of the demo shows what arm.png does, maybe at another time."""
+    for file in (path, HERE / "arm.png"):
+        drawn = np.asarray(Image.open(file).convert("RGB"))
+        height, width = drawn.shape[:2]
+        row = drawn[height // 30 : height * 52 // 90]  # the windows without their titles
+        arms = [shares(each) for each in np.array_split(row, 3, axis=1)]
+        assert all(arm["light"] > 0.015 for arm in arms), (file, "the arms", arms)
+        lags = [arm["green"] for arm in arms]  # what is seen of the reference
+        assert lags[0] > max(0.005, 1.5 * lags[1], 1.5 * lags[2]), (file, "the reference", lags)
+        curves = shares(drawn[height * 56 // 90 : height * 85 // 90, : width * 52 // 90])
+        assert curves["blue"] > 5e-4 and curves["orange"] > 5e-4, (file, "the plot", curves)
+
+
 if __name__ == "__main__":
-    here = Path(__file__).parent
-    environments(here / "environments.png")
-    replay(here / "replay.png")
+    if sys.argv[1:2] == ["--demo"]:
+        check_demo(Path(sys.argv[2]))
+        sys.exit(0)
+    environments(HERE / "environments.png")
+    replay(HERE / "replay.png")
+    sheet(examples()).save(HERE / "examples.png", optimize=True)
     sys.exit(0)

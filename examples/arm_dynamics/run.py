@@ -9,6 +9,7 @@
 
     python examples/arm_dynamics/run.py             # a few minutes on 2 cores
     python examples/arm_dynamics/run.py --small     # some seconds, to see that it works
+    python examples/arm_dynamics/run.py --picture docs/arm.png     # the picture of the README
 """
 
 from __future__ import annotations
@@ -185,6 +186,7 @@ def main() -> int:
     parser.add_argument("--small", action="store_true", help="some seconds instead of minutes")
     parser.add_argument("--clients", type=int, default=2, help="processes that simulate")
     parser.add_argument("--session-dir", default="sessions", help="folder of the sessions")
+    parser.add_argument("--picture", type=Path, help="picture to draw; tracking.png by default")
     options = parser.parse_args()
     size = SMALL if options.small else FULL
     session = generate(size, options.session_dir, options.clients)
@@ -196,8 +198,8 @@ def main() -> int:
         for number in TRAJECTORIES
     }
     gain = print_table(errors)
-    print(f"\nsession:   {folder}\nrecording: {recording}  (rerun {recording})")
-    draw(recording, folder / "tracking.png", size.tracking_steps // 2)
+    print(f"\nsession:   {folder}\nrecording: {recording}  (physx view {recording}, or rerun)")
+    draw(recording, options.picture or folder / "tracking.png", size.tracking_steps // 2)
     if gain < size.least_gain:
         print(f"The network is only {gain:.1f} times better than PD alone.")
         return 1

@@ -218,7 +218,7 @@ def main() -> int:
     best = min(results, key=lambda name: np.mean(results[name].errors))
     folder = Path(options.session_dir) / session
     recording = folder / f"{best.lower()}.rrd"
-    print(f"\nsession:   {folder}\nrecording: {recording}  (rerun {recording})")
+    print(f"\nsession:   {folder}\nrecording: {recording}  (physx view {recording}, or rerun)")
     draw(recording, folder / "beam.png", int(np.argmax(results[best].lengths)) + 1)
     print(f"All of it took {time.perf_counter() - begin:.0f} s.")
     error = float(np.mean(results[best].errors))

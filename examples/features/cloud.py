@@ -31,9 +31,9 @@ class Cloud(Environment):
         )
 
     def init_visualization(self) -> None:
-        self.factory.add_points("cloud", self.points, size=0.04)
-        self.factory.add_points("mean", [self.mean], size=0.06, color="green")
-        self.factory.add_points("guess", [self.mean], size=0.06, color="orange", alpha=0.5)
+        self.factory.add_points("cloud", self.points, size=0.1)
+        self.factory.add_points("mean", [self.mean], size=0.15, color="green")
+        self.factory.add_points("guess", [self.mean], size=0.15, color="orange", alpha=0.5)
 
     def step(self) -> None:
         time.sleep(self.delay)  # as if there were more to simulate

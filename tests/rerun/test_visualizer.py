@@ -169,6 +169,30 @@ def test_every_third_step_is_recorded_and_the_last(opened, read):
     assert [(step, place[0][0]) for step, place in places] == [(0, 0), (1, 1), (3, 3), (6, 5)]
 
 
+def test_what_belongs_together_stays_together_where_few_steps_are_recorded(opened, read):
+    visualizer, factory = opened(every=4), Factory()
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    factory.add_mesh("plate", square[:3], [[0, 1, 2]])
+    visualizer.events(1, 0, factory.take_events())
+    factory.update_mesh("plate", positions=square)
+    factory.update_mesh("plate", cells=[[0, 2, 3]])
+    visualizer.events(1, 1, factory.take_events())
+    factory.update_mesh("plate", positions=square + 1)
+    visualizer.events(1, 2, factory.take_events())
+    for _ in range(2):
+        factory.add_sphere("ball", 1.0)
+        factory.remove("ball")
+    factory.add_sphere("ball", 2.0)
+    visualizer.events(1, 3, factory.take_events())
+    visualizer.close()
+    positions = read(visualizer.file, "/env_1/plate", "Mesh3D:vertex_positions")
+    assert positions[-1] == (3, (square + 1).tolist())
+    cells = read(visualizer.file, "/env_1/plate", "Mesh3D:triangle_indices")
+    assert cells[-1] == (3, [[0, 2, 3]])
+    third = r"/env_1/ball\ \(3\)"
+    assert read(visualizer.file, third, "Ellipsoids3D:half_sizes") == [(3, [[2.0] * 3])]
+
+
 def test_the_file_lies_in_the_session_and_is_never_overwritten(opened, tmp_path):
     first, second = opened(), None
     ball(first)
@@ -188,7 +212,7 @@ def test_the_run_is_told_of_a_recording_that_is_there(opened, tmp_path):
     ball(visualizer)
     visualizer.close()
     file = tmp_path / "run.rrd"
-    assert list(visualizer.outputs()) == [f"recording: {file}  (rerun {file})"]
+    assert list(visualizer.outputs()) == [f"recording: {file}  (physx view {file}, or rerun)"]
 
 
 def test_the_file_where_it_is_wanted(opened, tmp_path):

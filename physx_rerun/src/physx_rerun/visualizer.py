@@ -293,7 +293,9 @@ class RerunVisualizer(Visualizer):
         self._recording = self._offscreen = None
         if self.file is None:
             return
-        self._outputs.append(f"recording: {self.file}  (rerun {shlex.quote(str(self.file))})")
+        self._outputs.append(
+            f"recording: {self.file}  (physx view {shlex.quote(str(self.file))}, or rerun)"
+        )
         if self.mode == "headless":
             picture = Path(self.picture) if self.picture else self.file.with_suffix(".png")
             render_picture(self.file, picture, self.picture_size, timeline=self._layout.timeline)

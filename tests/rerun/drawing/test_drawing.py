@@ -205,6 +205,85 @@ def test_markers_move_with_their_mesh(scene):
     assert saved("marks", "LineStrips3D:colors")[0] == (0, [0x000000FF, 0xFFFFFFFF])
 
 
+def test_changed_looks_of_symbols(scene):
+    factory, show, saved = scene
+    look = {"symbol": "plus", "size": 0.5, "labels": ["here"], "orientations": [[0, 2, 0]]}
+    factory.add_symbols("marks", [[1, 2, 3]], **look)
+    show(0)
+    factory.update_symbols("marks", symbol="cross", labels=[])
+    show(1)
+    factory.update_symbols("marks", size=None, orientations=np.zeros((0, 3)))
+    show(2)
+    plus, cross, upward = [
+        np.array(s) - [1, 2, 3] for _, s in saved("marks", "LineStrips3D:strips")
+    ]
+    assert not np.allclose(plus, cross)
+    assert np.allclose(np.linalg.norm(cross, axis=2), 0.5)
+    assert np.allclose(upward[:, :, 2], 0, atol=1e-6)
+    assert saved("marks/labels", "Points3D:labels") == [(0, ["here"]), (1, [])]
+
+
+def test_changed_looks_of_a_wireframe(scene):
+    factory, show, saved = scene
+    factory.add_mesh("plate", SQUARE, CELLS, color="#00ff00")
+    show(0)
+    factory.update_mesh("plate", wireframe=True)
+    show(1)
+    factory.update_mesh("plate", size=0.25)
+    show(2)
+    assert saved("plate/edges", "LineStrips3D:colors") == [(1, [0x00FF00FF])]
+    assert saved("plate/edges", "LineStrips3D:radii")[-1] == (2, [0.25])
+
+
+def test_a_body_that_is_shown_again_is_where_it_was(scene):
+    factory, show, saved = scene
+    factory.add_box("crate", [1, 2, 3], position=[1, 0, 0], label="crate")
+    show(0)
+    factory.update_box("crate", position=[2, 0, 0])
+    factory.update_box("crate", visible=False)
+    show(1)
+    factory.update_box("crate", visible=True, label=None)
+    show(2)
+    places = [place for _, (place,) in saved("tf", "Transform3D:translation")]
+    assert places[-1] == [2, 0, 0]
+    assert saved("crate", "Boxes3D:labels")[-1] == (2, [])
+
+
+def test_what_lies_below_an_object_stays_when_it_is_hidden(scene):
+    factory, show, saved = scene
+    factory.add_mesh("foot", SQUARE, CELLS, wireframe=True)
+    factory.add_points("foot/contacts", SQUARE)
+    show(0)
+    factory.update_mesh("foot", visible=False)
+    show(1)
+    assert saved("foot", "Clear:is_recursive") == [(1, [False])]
+    assert saved("foot/edges", "Clear:is_recursive") == [(1, [False])]
+    assert saved("foot/contacts", "Clear:is_recursive") == []
+
+
+def test_of_several_changes_in_a_step_the_last_one_counts(opened):
+    visualizer, factory = opened(), Factory()
+    factory.add_points("cloud", SQUARE, color="red")
+    for step, colors in enumerate([["blue"], ["lime", "white"]]):
+        for number, color in enumerate(colors):
+            look = {"color": color} if number != 0 or step == 0 else {"color": color, "size": 1}
+            factory.update_points("cloud", **look)
+        visualizer.events(1, step, factory.take_events())
+    factory.update_points("cloud", visible=False)
+    factory.update_points("cloud", visible=True)
+    visualizer.events(1, 2, factory.take_events())
+    visualizer.close()
+    rows = []  # in the order that decides between rows of one step
+    for chunk in rr.chunk.RrdReader(visualizer.file).stream().filter(content="/env_1/cloud"):
+        batch = chunk.to_record_batch()
+        found = set(batch.schema.names) & {"Points3D:colors", "Clear:is_recursive"}
+        for name in found:
+            steps, values = batch.column("step").to_pylist(), batch.column(name).to_pylist()
+            rows += [(step, name, value) for step, value in zip(steps, values, strict=True)]
+    assert [value for step, _, value in rows if step == 1] == [[0x00FF00FF], [0xFFFFFFFF]]
+    assert [value for step, _, value in rows if step == 2] == [[True], [0xFFFFFFFF]]
+
+
 def test_height_field(scene):
     factory, show, saved = scene
     heights = np.array([[0, 1, 2], [3, 4, 5]])
@@ -220,6 +299,25 @@ def test_height_field(scene):
     assert saved("hills", "Mesh3D:vertex_normals")[0][1][0][2] > 0
     assert len(saved("hills", "Mesh3D:vertex_colors")[-1][1]) == 6
     assert saved("tf", "Transform3D:translation") == [(0, [[1, 0, 0]])]
+
+
+def test_grids_are_drawn_anew_only_when_their_size_changes(scene):
+    factory, show, saved = scene
+    factory.add_height_field("hills", np.zeros((2, 3)), [1, 1])
+    factory.add_slice("cut", np.zeros((2, 3)), [1, 1])
+    show(0)
+    factory.update_height_field("hills", heights=np.ones((2, 3)))
+    factory.update_slice("cut", values=np.ones((2, 3)))
+    show(1)
+    factory.update_height_field("hills", heights=np.ones((3, 3)))
+    factory.update_slice("cut", values=np.ones((3, 3)))
+    show(2)
+    for name in ("hills", "cut"):
+        cells = saved(name, "Mesh3D:triangle_indices")
+        assert [(step, len(rows)) for step, rows in cells] == [(0, 4), (2, 8)]
+    points = {name: saved(name, "Mesh3D:vertex_positions") for name in ("hills", "cut")}
+    assert [step for step, _ in points["hills"]] == [0, 1, 2]
+    assert [(step, len(rows)) for step, rows in points["cut"]] == [(0, 6), (2, 9)]
 
 
 def test_slice_with_limits_and_a_color_bar(scene):

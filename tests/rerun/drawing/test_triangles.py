@@ -11,19 +11,22 @@ WAVES = 60
 DOCUMENT = """<?xml version="1.0"?>
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
 <asset><unit meter="0.5"/><up_axis>Z_UP</up_axis></asset>
-<library_effects><effect id="paint"><profile_COMMON><technique><phong>
+<library_effects><effect id="paint"><profile_COMMON><technique sid="common"><phong>
 <diffuse>{diffuse}</diffuse></phong></technique></profile_COMMON></effect></library_effects>
 <library_materials><material id="red"><instance_effect url="#paint"/></material></library_materials>
 <library_geometries><geometry id="shape"><mesh>
-<source id="points"><float_array>{points}</float_array></source>
+<source id="points"><float_array id="numbers">{points}</float_array><technique_common>
+<accessor source="#numbers" count="1891" stride="3"><param name="X"/><param name="Y"/>
+<param name="Z"/></accessor></technique_common></source>
 <vertices id="corners"><input semantic="POSITION" source="#points"/></vertices>
 <polylist material="paint">
 <input semantic="VERTEX" source="#corners" offset="0"/><vcount>{counts}</vcount><p>{cells}</p>
 </polylist></mesh></geometry></library_geometries>
-<library_visual_scenes><visual_scene><node><translate>0 0 2</translate>
+<library_visual_scenes><visual_scene id="scene"><node id="plate"><translate>0 0 2</translate>
 <rotate>0 0 1 90</rotate><instance_geometry url="#shape"><bind_material><technique_common>
 <instance_material symbol="paint" target="#red"/></technique_common></bind_material>
 </instance_geometry></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#scene"/></scene>
 </COLLADA>"""
 
 
@@ -91,6 +94,19 @@ def test_a_document_is_placed_and_colored_as_it_says(tmp_path):
     edges = np.diff(mesh.positions[mesh.cells], axis=1)
     areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     assert areas.sum() / 2 == pytest.approx(0.5, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("", ""), ("Z_UP", "Y_UP"), ("instance_material", "extra")]
+)
+def test_documents_can_be_read_completely(old, new, tmp_path):
+    path = collada(tmp_path / "plate.dae")
+    path.write_text(path.read_text().replace(old, new))
+    mesh = simple_mesh(path, None)
+    assert mesh.cells.shape == (2 * 60 * 30, 3)
+    corners = [mesh.positions.min(axis=0), mesh.positions.max(axis=0)]
+    assert np.allclose(corners, [[-0.5, 0, 1], [0, 1, 1]], atol=1e-6)
+    assert len(simple_mesh(path, 0.1).cells) < 2 * 60 * 30 / 4
 
 
 def test_other_files_are_left_to_the_viewer(tmp_path):

@@ -75,6 +75,18 @@ def test_without_a_driver_the_remedy_is_named(recording, tmp_path, monkeypatch):
     assert children() == before
 
 
+@pytest.mark.usefixtures("vulkan")
+@pytest.mark.parametrize(("title", "glyph"), [("温度", "温.*U\\+6E29"), ("🤖", "🤖.*U\\+1F916")])
+def test_a_title_that_the_viewers_font_cannot_show_is_named(title, glyph, opened, tmp_path):
+    visualizer, factory = opened(mode="headless", picture_size=(64, 64)), Factory()
+    factory.set_view(title)
+    factory.add_sphere("ball", radius=0.1)
+    visualizer.events(1, 0, factory.take_events())
+    with pytest.raises(VisualizerError, match=f"no glyph for .{glyph}.*Use other characters"):
+        visualizer.close()
+    assert visualizer.outputs()[0].startswith(f"recording: {tmp_path / 'run.rrd'}")
+
+
 def test_no_recording(tmp_path):
     with pytest.raises(VisualizerError, match=r"no recording .*none\.rrd"):
         render_picture(tmp_path / "none.rrd", tmp_path / "a.png")

@@ -5,20 +5,21 @@ from __future__ import annotations
 import threading
 from typing import IO
 
-_BYTES = 8192
-_LINES = 60
+_BYTES = 8192  # of one read
+_LINE_BYTES = 140  # kept for each line
 
 
 class OutputTail:
     """Reads what a process writes to a pipe, and keeps the last lines of it."""
 
-    def __init__(self, stream: IO[bytes]) -> None:
+    def __init__(self, stream: IO[bytes], lines: int = 60) -> None:
         """Begin to read.
 
         Args:
             stream: The pipe; closed at its end.
+            lines: How many lines to keep.
         """
-        self._bytes = b""
+        self._bytes, self._lines = b"", lines
         self._reader = threading.Thread(target=self._read, args=(stream,), daemon=True)
         self._reader.start()
 
@@ -30,9 +31,9 @@ class OutputTail:
         """
         self._reader.join(patience)
         lines = self._bytes.decode(errors="replace").splitlines()
-        return "\n".join(lines[-_LINES:])
+        return "\n".join(lines[-self._lines :])
 
     def _read(self, stream: IO[bytes]) -> None:
         with stream:
             while chunk := stream.read(_BYTES):
-                self._bytes = (self._bytes + chunk)[-_BYTES:]
+                self._bytes = (self._bytes + chunk)[-self._lines * _LINE_BYTES :]

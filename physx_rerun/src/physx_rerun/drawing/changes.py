@@ -6,6 +6,8 @@ from collections.abc import Iterable
 
 from physx_core.components import Event
 
+_POSE = {"position", "orientation"}
+
 
 class Changes:
     """Collects the events of several steps, of which only the last values are kept.
@@ -16,7 +18,9 @@ class Changes:
 
     def __init__(self) -> None:
         self.step = 0
-        self._events: dict[tuple[str, ...], Event] = {}
+        self._events: list[Event] = []
+        self._moves: dict[tuple[str, ...], Event] = {}
+        self._looks: dict[str, Event] = {}
 
     def add(self, step: int, events: Iterable[Event]) -> bool:
         """Add the events of a step.
@@ -26,13 +30,30 @@ class Changes:
         """
         self.step, can_wait = step, True
         for event in events:
-            can_wait &= event.action == "update"
-            key = (event.action, event.kind, *event.names, "", *sorted(event.values))
-            self._events.pop(key, None)  # the later one has its own place in the order
-            self._events[key] = event
+            if event.action == "update":
+                self._join(event)
+            else:  # what was before stays before
+                self._events = [*self.pop(), event]
+                can_wait = False
         return can_wait
+
+    def _join(self, event: Event) -> None:
+        """Join a change with those of the same objects."""
+        moves = {option: event.values[option] for option in _POSE & event.values.keys()}
+        looks = {option: event.values[option] for option in event.values.keys() - moves.keys()}
+        if moves:
+            key = (*event.names, "", *sorted(moves))
+            self._moves.pop(key, None)  # the later one has its own place in the order
+            self._moves[key] = Event("update", event.kind, event.names, moves)
+        for one in Event("update", event.kind, event.names, looks).each() if looks else ():
+            before = self._looks.pop(one.name, None)
+            known = {} if before is None else dict(before.values)
+            if "color" in looks:
+                known.pop("scalar_field", None)  # which the color replaces
+            self._looks[one.name] = Event("update", one.kind, one.names, {**known, **one.values})
 
     def pop(self) -> list[Event]:
         """Return and forget the events."""
-        events, self._events = list(self._events.values()), {}
+        events = [*self._events, *self._moves.values(), *self._looks.values()]
+        self._events, self._moves, self._looks = [], {}, {}
         return events

@@ -79,6 +79,8 @@ class ChunkBuilder:
         self._frames = map("".join, _short_words())
         self._whole: list[Chunk] = []
         self._blocks: dict[tuple[Any, ...], _Block] = {}
+        self._at: Times = {}
+        self._keys_at: dict[str, list[tuple[Any, ...]]] = {}  # of the blocks of each entity
 
     def add_static(self, entity: str, *archetypes: Any) -> None:
         """Add components that are valid at all times.
@@ -104,6 +106,8 @@ class ChunkBuilder:
             values: The archetype's fields: arrays or lists whose first axis is that of instances.
         """
         key = (entity, archetype, tuple(values), tuple(times))
+        if archetype is not rr.Scalars:  # of which all rows are alike
+            self._keep_order(key, times)
         block = self._blocks.get(key)
         if block is None:
             block = self._blocks[key] = _Block({name: [] for name in values})
@@ -111,6 +115,30 @@ class ChunkBuilder:
         for name, value in values.items():
             block.values[name].append(value)
             self.nbytes += value.nbytes if isinstance(value, np.ndarray) else 50 * len(value)
+
+    def _keep_order(self, key: tuple[Any, ...], times: Times) -> None:
+        """End blocks to which a row must not be added: of rows at one time the last one counts."""
+        if times is not self._at:
+            self._at = times
+            self._keys_at.clear()
+        entity, archetype, names, _ = key
+        before = self._keys_at.setdefault(entity, [])
+        if archetype is rr.Clear:
+            inner = f"{entity}/"
+            for other in list(self._blocks):
+                if other[0] == entity or other[0].startswith(inner):
+                    self._end(other)
+        for other in before:
+            if other != key and not set(names).isdisjoint(other[2]):
+                self._end(key)
+                break
+        before.append(key)
+
+    def _end(self, key: tuple[Any, ...]) -> None:
+        """Make a chunk of a block, so that later rows come after it."""
+        block = self._blocks.pop(key, None)
+        if block is not None:
+            self._whole.append(_chunk_of(key, block))
 
     def next_frame(self) -> str:
         """Return a name for another frame, as short as can be: each row of a pose contains it."""
@@ -121,17 +149,21 @@ class ChunkBuilder:
         chunks, self._whole = self._whole, []
         blocks, self._blocks = self._blocks, {}
         self.nbytes = 0
-        for (entity, archetype, _, _), block in blocks.items():
-            columns = [
-                column
-                for name, values in block.values.items()
-                for column in _columns(archetype, name, values)
-            ]
-            indexes = indexes_of(block.times, [1] * len(block.times))
-            chunks.append(Chunk.of(entity, indexes, columns))
+        chunks += [_chunk_of(key, block) for key, block in blocks.items()]
+        chunks.sort(key=lambda chunk: not chunk.is_static)
         for source in self.sources:
             chunks += source()
         return chunks
+
+
+def _chunk_of(key: tuple[Any, ...], block: _Block) -> Chunk:
+    entity, archetype, _, _ = key
+    columns = [
+        column
+        for name, values in block.values.items()
+        for column in _columns(archetype, name, values)
+    ]
+    return Chunk.of(entity, indexes_of(block.times, [1] * len(block.times)), columns)
 
 
 def _short_words() -> Iterator[tuple[str, ...]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from physx_rerun.drawing import colors, surfaces
 from physx_rerun.drawing.bodies import Bodies
 from physx_rerun.drawing.chunks import Chunk, ChunkBuilder, Times
 from physx_rerun.drawing.framing import RIGHT, extremes
+from physx_rerun.drawing.items import Item
 from physx_rerun.drawing.robot import corners_of, draw_robot, place_shapes, tint_robot
 from physx_rerun.drawing.windows import WindowLayout
 
@@ -30,9 +30,10 @@ _BAR_PARTS = 64
 _DENSITY = 4.0  # of a volume: how much light its largest values take on their way through
 _MOVES = {"position", "orientation"}
 _RIGID = {"box", "sphere", "capsule", "cylinder", "height_field", "slice", "volume"}
-_GRID_VALUES = {"heights", "values"}
-_SHAPING = {"positions", "cells", "spacing", *_GRID_VALUES}
 _COLORING = {"color", "alpha", "scalar_field", "values", "colormap", "vmin", "vmax"}
+_COLORING |= {"wireframe", "symbol"}  # which need them in another form
+_PARTS = ("/color_bar", "/color_bar/values", "/edges", "/labels", "/slices")
+"""What an object can consist of besides its own entity."""
 _VOLUME_MAPS = {
     "gray": rr.components.Colormap.Grayscale,
     "inferno": rr.components.Colormap.Inferno,
@@ -43,69 +44,6 @@ _VOLUME_MAPS = {
     "twilight": rr.components.Colormap.Twilight,
     "viridis": rr.components.Colormap.Viridis,
 }
-
-
-@dataclass
-class Item:
-    """A drawn object.
-
-    Attributes:
-        kind: Kind of the object.
-        name: Its name.
-        entity: Path of its entity.
-        frame: Name of its frame; None: it is not drawn yet.
-        values: All options set so far.
-        is_new: Whether all of it is to be drawn.
-        bodies: Places of its bodies among those of the instance.
-        limits: Smallest and largest value of its scalar field so far.
-        barred: Limits that its color bar shows.
-        edges: Pairs of vertices of a wireframe mesh, shape (edges, 2).
-        seen: Points that it had since the last flush.
-        shapes: Shapes of a robot.
-    """
-
-    kind: str
-    name: str
-    entity: str = ""
-    frame: str | None = None
-    values: dict[str, Any] = field(default_factory=dict)
-    is_new: bool = True
-    bodies: Array = field(default_factory=lambda: np.zeros(0, np.int64))
-    limits: tuple[float, float] = (np.inf, -np.inf)
-    barred: tuple[float, float] | None = None
-    edges: Array | None = None
-    seen: list[Array] = field(default_factory=list)
-    shapes: list[Any] = field(default_factory=list)
-
-    @property
-    def is_hidden(self) -> bool:
-        """Whether it is not to be seen."""
-        return self.values.get("visible") is False
-
-    @property
-    def in_view(self) -> bool:
-        """Whether the camera shows it."""
-        return self.values.get("in_view") is not False
-
-    @property
-    def alpha(self) -> float:
-        """Its opacity."""
-        alpha = self.values.get("alpha")
-        return 1.0 if alpha is None else alpha
-
-    @property
-    def colormap(self) -> str:
-        """Name of its colormap."""
-        return self.values.get("colormap") or "viridis"
-
-    def widen(self, shown: Array) -> tuple[float, float]:
-        """Return the limits of its colors: those that are set, else the extremes so far."""
-        self.limits = (
-            min(self.limits[0], float(shown.min())),
-            max(self.limits[1], float(shown.max())),
-        )
-        low, high = self.values.get("vmin"), self.values.get("vmax")
-        return self.limits[0] if low is None else low, self.limits[1] if high is None else high
 
 
 class Drawing:
@@ -224,16 +162,15 @@ class Drawing:
         drawn.values.update(changes)
         if "color" in changes and "scalar_field" not in changes:
             drawn.values.pop("scalar_field", None)
+        moves = {name: changes[name] for name in _MOVES & changes.keys()}
         if is_first:
             self._register(drawn)
         elif drawn.is_hidden and not was_hidden:
             self._hide(drawn, times)
         elif was_hidden and not drawn.is_hidden:
             drawn.is_new, drawn.barred, changes = True, None, dict(drawn.values)
-        if drawn.kind in _RIGID:
-            moves = {name: changes[name] for name in _MOVES & changes.keys()}
-            if moves or is_first:
-                self._bodies.move(drawn.bodies, times, moves)
+        if drawn.kind in _RIGID and (moves or is_first):
+            self._bodies.move(drawn.bodies, times, moves)
         if drawn.kind == "robot" or not drawn.is_hidden:
             self._draw_kind[drawn.kind](drawn, changes, times)
             drawn.is_new = False
@@ -242,7 +179,12 @@ class Drawing:
         if drawn.kind == "robot":
             place_shapes(self._rows, drawn.shapes, times, is_visible=False)
         else:
-            self._rows.add(drawn.entity, rr.Clear, times, is_recursive=[True])
+            inner = f"{drawn.entity}/"
+            if not any(other.entity.startswith(inner) for other in self._drawn.values()):
+                self._rows.add(drawn.entity, rr.Clear, times, is_recursive=[True])
+                return
+            for part in ("", *_PARTS):  # other objects lie below it
+                self._rows.add(f"{drawn.entity}{part}", rr.Clear, times, is_recursive=[False])
 
     def _follow(self) -> None:
         """Let the camera follow the configured object, once it is drawn."""
@@ -355,8 +297,8 @@ class Drawing:
             look["fill_mode"] = [mode]
         if "size" in changes:
             look["line_radii"] = _radius(changes["size"], _SCREEN_LINES)
-        if changes.get("label") is not None:
-            look["labels"] = [changes["label"]]
+        if "label" in changes:
+            look["labels"] = [] if changes["label"] is None else [changes["label"]]
         return look
 
     def _add(self, drawn: Item, archetype: type[Any], times: Times, look: dict[str, Any]) -> None:
@@ -368,15 +310,20 @@ class Drawing:
     def _mesh(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
         look: dict[str, Any] = {}
         values, wireframe = drawn.values, bool(drawn.values.get("wireframe"))
-        moved = drawn.is_new or bool(changes.keys() & _SHAPING)
-        if moved or "wireframe" in changes:
+        heights = values.get("heights", values.get("values"))
+        grid = () if heights is None else heights.shape
+        reshaped = drawn.is_new or grid != drawn.grid
+        reshaped = reshaped or bool(changes.keys() & {"cells", "spacing", "wireframe"})
+        drawn.grid = grid
+        has_other_lines = wireframe and "size" in changes
+        if reshaped or has_other_lines or changes.keys() & {"positions", "heights"}:
             positions, cells = surfaces.mesh_of(drawn.kind, values)
             self._see(drawn, positions)
             shown = positions[:0] if wireframe else positions
             look["vertex_positions"] = shown
             if drawn.kind != "slice":  # without normals its colors are not shaded
                 look["vertex_normals"] = vertex_normals(shown, cells)
-            if drawn.is_new or changes.keys() & {"cells", "spacing", "wireframe", *_GRID_VALUES}:
+            if reshaped:
                 look["triangle_indices"] = cells[:0] if wireframe else cells
                 drawn.edges = None
             if wireframe or "wireframe" in changes:
@@ -466,11 +413,11 @@ class Drawing:
     def _symbols(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
         values = drawn.values
         look: dict[str, Any] = {}
-        if drawn.is_new and values.get("size") is None:
+        if values.get("size") is None:
             size = max(self._layout.frame(self._id).size, _size(values["positions"]))
             values["size"] = _SYMBOL_SIZE * size or 0.05
         name, positions = values.get("symbol", "circle"), values["positions"]
-        if drawn.is_new or changes.keys() & {"positions", "orientations", "size"}:
+        if drawn.is_new or changes.keys() & {"positions", "orientations", "size", "symbol"}:
             self._see(drawn, positions)
             look["strips"] = surfaces.symbol_lines(
                 name, positions, values.get("orientations"), values["size"]
@@ -482,13 +429,11 @@ class Drawing:
         if drawn.is_new:
             look["radii"] = _radius(None, _SCREEN_LINES)
         self._add(drawn, rr.LineStrips3D, times, look)
-        labels = values.get("labels")
-        if labels and changes.keys() & {"labels", "positions"}:
-            entity = f"{drawn.entity}/labels"
-            none = np.zeros(1, np.float32)
-            self._rows.add(
-                entity, rr.Points3D, times, positions=positions, labels=labels, radii=none
-            )
+        labels = values.get("labels") or []
+        if "labels" in changes or (labels and "positions" in changes):
+            look = {"labels": labels, "radii": np.zeros(1, np.float32)}
+            look["positions"] = positions if labels else positions[:0]
+            self._rows.add(f"{drawn.entity}/labels", rr.Points3D, times, **look)
 
     def _stroke(
         self, drawn: Item, changes: dict[str, Any], times: Times, default: float

@@ -1,23 +1,32 @@
-"""Extents of mesh files, so that the camera shows all of them."""
+"""Mesh files: their extents, so that the camera shows all of them, and their parts."""
 
 from __future__ import annotations
 
 import functools
+import io
 import json
 import struct
+from collections.abc import Iterator
 from pathlib import Path
-from xml.etree import ElementTree
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from physx_core.files import read_content
+from physx_core.rotations import rotate_rows
 from physx_core.typing import Array
 from physx_rerun.drawing.framing import extremes
 
-_LARGEST = 2**26
+if TYPE_CHECKING:
+    from collada import Collada
+
+LARGEST = 2**26
 """Bytes of a mesh file; of larger ones only the origin is shown for certain."""
+_MOST = 2**24  # points of a document, which can repeat its shapes without end
+_MOST_NODES = 2**14
+_MOST_ITEMS = 2**20  # tags, or items of JSON, which take many times as much memory as their text
 _NOTHING = np.zeros((1, 3))
-PLACEMENTS = ("matrix", "translate", "scale", "rotate")
-"""Steps of the placement of a node of COLLADA."""
+_SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
 
 @functools.lru_cache(maxsize=256)
@@ -27,99 +36,110 @@ def corners_of_mesh(path: Path) -> Array:
     The origin alone, shape (1, 3), stands for a file that cannot be read: the viewer will say so.
     """
     try:
-        if path.stat().st_size > _LARGEST:
-            return _NOTHING
-        points = _READERS[path.suffix.lower()](path)
-    except (OSError, ValueError, KeyError, TypeError, IndexError, struct.error, SyntaxError):
+        found = [_NOTHING[:0]]
+        for points in _READERS[path.suffix.lower()](read_content(path, LARGEST)):
+            finite = points[np.isfinite(points).all(axis=1)]
+            found += [np.stack(extremes(finite))] if len(finite) else []
+        corners = np.concatenate(found)
+        return np.stack(extremes(corners)) if len(corners) else _NOTHING
+    except Exception:  # strangers' files fail in any way
         return _NOTHING
-    points = points[np.isfinite(points).all(axis=1)]
-    return np.stack(extremes(points)) if len(points) else _NOTHING
 
 
-def _stl(path: Path) -> Array:
-    content = path.read_bytes()
-    count = int.from_bytes(content[80:84], "little")
-    if len(content) == 84 + 50 * count:
-        kind = np.dtype([("numbers", "<f4", (4, 3)), ("attribute", "<u2")])
-        facets = np.frombuffer(content, kind, offset=84)
-        return np.asarray(facets["numbers"][:, 1:].reshape(-1, 3), np.float64)
-    return _rows(content, b"vertex")
+def facets_of(content: bytes) -> Array | None:
+    """Return the corners of the triangles of a binary STL file, shape (n, 3, 3); None: a text."""
+    if len(content) != 84 + 50 * int.from_bytes(content[80:84], "little"):
+        return None
+    kind = np.dtype([("numbers", "<f4", (4, 3)), ("attribute", "<u2")])
+    return np.asarray(np.frombuffer(content, kind, offset=84)["numbers"][:, 1:], np.float64)
 
 
-def _obj(path: Path) -> Array:
-    return _rows(path.read_bytes(), b"v")
+def read_document(content: bytes) -> Collada:
+    """Return a COLLADA document without the parts that are damaged, which are in its ``errors``.
+
+    Raises:
+        ValueError: If it is packed, or may expand to something much larger than it is.
+    """
+    # A zero byte is in every zip file, which pycollada would unpack, and in UTF-16.
+    bombs = b"\0", b"<!DOCTYPE", b"instance_node"
+    if content.count(b"<") > _MOST_ITEMS or any(word in content for word in bombs):
+        raise ValueError("a document that may be a bomb")
+    import collada  # only documents need it
+
+    return collada.Collada(io.BytesIO(content), ignore=[collada.DaeError])
 
 
-def _rows(content: bytes, word: bytes) -> Array:
-    """Return the three numbers after a word at the beginning of lines."""
-    lines = (line.split() for line in content.splitlines())
-    return np.array([row[1:4] for row in lines if row[:1] == [word]], np.float64).reshape(-1, 3)
+def placed(document: Collada) -> list[Any]:
+    """Return the parts of the shapes in a document's scenes, placed, in its unit of length."""
+    found, count = [], 0
+    for scene in document.scenes:
+        for shape in scene.objects("geometry"):
+            for part in shape.primitives():
+                found.append(part)
+                count += len(part.vertex)
+                if count > _MOST:
+                    raise ValueError(f"a document of more than {_MOST} points")
+    return found
 
 
-def _gltf(path: Path) -> Array:
-    content = path.read_bytes()
+def _stl(content: bytes) -> Iterator[Array]:
+    facets = facets_of(content)
+    return _rows(content, b"vertex") if facets is None else iter([facets.reshape(-1, 3)])
+
+
+def _obj(content: bytes) -> Iterator[Array]:
+    return _rows(content, b"v")
+
+
+def _rows(content: bytes, word: bytes) -> Iterator[Array]:
+    """Yield the three numbers after a word at the beginning of lines, in small blocks."""
+    file = io.BytesIO(content)
+    while lines := file.readlines(2**20):
+        rows = [line[:256].split(None, 4) for line in lines]
+        found = [row[1:4] for row in rows if row[:1] == [word]]
+        yield np.array(found, np.float64).reshape(-1, 3)
+
+
+def _dae(content: bytes) -> Iterator[Array]:
+    document = read_document(content)
+    meter = document.assetInfo.unitmeter or 1.0
+    # Damaged materials leave shapes without place.
+    for part in placed(document) or [
+        part for each in document.geometries for part in each.primitives
+    ]:
+        yield meter * part.vertex
+
+
+def _gltf(content: bytes) -> Iterator[Array]:
     if content[:4] == b"glTF":
         (length,) = struct.unpack_from("<I", content, 12)
         content = content[20 : 20 + length]
-    scene = json.loads(content)
-    places = {
-        primitive["attributes"]["POSITION"]
-        for mesh in scene["meshes"]
-        for primitive in mesh["primitives"]
-    }
-    found = [scene["accessors"][place][end] for place in places for end in ("min", "max")]
-    return np.array(found, np.float64).reshape(-1, 3)
+    if content.count(b",") > _MOST_ITEMS:
+        raise ValueError("a document of too many items")
+    document = json.loads(content)
+    places = [(root, np.eye(4)) for scene in document["scenes"] for root in scene["nodes"]]
+    for number, pose in places:
+        node = document["nodes"][number]
+        pose = pose @ _pose(node)
+        mesh = document["meshes"][node["mesh"]] if "mesh" in node else {"primitives": ()}
+        for part in mesh["primitives"]:
+            box = document["accessors"][part["attributes"]["POSITION"]]
+            corners = np.where(_SIGNS > 0, box["max"], box["min"])
+            yield corners @ pose[:3, :3].T + pose[:3, 3]
+        places += [(child, pose) for child in node.get("children", ())]
+        if len(places) > _MOST_NODES:
+            raise ValueError("a document whose nodes are no tree, or too many")
 
 
-def _dae(path: Path) -> Array:
-    content = path.read_bytes()
-    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
-        return _NOTHING
-    root = ElementTree.fromstring(content)
-    tag = root.tag.removesuffix("COLLADA")
-    unit = root.find(f"{tag}asset/{tag}unit")
-    meter = 1.0 if unit is None else float(unit.get("meter", "1"))
-    meshes = {each.get("id"): _positions(each, tag) for each in root.iter(f"{tag}geometry")}
-    found = [_NOTHING[:0]]
-    nodes = [(node, np.eye(4)) for node in root.iterfind(f".//{tag}visual_scene/{tag}node")]
-    while nodes:
-        node, pose = nodes.pop()
-        for part in node:
-            kind = part.tag.removeprefix(tag)
-            if kind in PLACEMENTS:
-                pose = pose @ placement(kind, np.array((part.text or "").split(), np.float64))
-            elif kind == "node":
-                nodes.append((part, pose))
-            elif kind == "instance_geometry":
-                points = meshes.get(part.get("url", "").removeprefix("#"), _NOTHING[:0])
-                found.append(points @ pose[:3, :3].T + pose[:3, 3])
-    return meter * np.concatenate(found)
-
-
-def placement(kind: str, numbers: Array) -> Array:
-    """Return a step of a node's placement as a homogeneous matrix (4, 4)."""
-    if kind == "matrix":
-        return numbers.reshape(4, 4)
-    matrix = np.eye(4)
-    if kind == "translate":
-        matrix[:3, 3] = numbers
-    elif kind == "scale":
-        matrix[[0, 1, 2], [0, 1, 2]] = numbers
-    else:
-        x, y, z = numbers[:3] / np.linalg.norm(numbers[:3])
-        across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        angle = np.radians(numbers[3])
-        matrix[:3, :3] += np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
-    return matrix
-
-
-def _positions(geometry: ElementTree.Element, tag: str) -> Array:
-    named = {source.get("id"): source for source in geometry.iter(f"{tag}source")}
-    for read in geometry.iterfind(f".//{tag}vertices/{tag}input[@semantic='POSITION']"):
-        numbers = named[read.get("source", "").removeprefix("#")].find(f"{tag}float_array")
-        if numbers is not None:
-            return np.array((numbers.text or "").split(), np.float64).reshape(-1, 3)
-    return _NOTHING[:0]
+def _pose(node: dict[str, Any]) -> Array:
+    """Return the placement of a node of glTF as a homogeneous matrix (4, 4)."""
+    if "matrix" in node:
+        return np.reshape(np.array(node["matrix"], np.float64), (4, 4)).T
+    pose = np.eye(4)
+    turn = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
+    pose[:3, :3] = rotate_rows(turn, np.diag(node.get("scale", (1.0, 1.0, 1.0)))).T
+    pose[:3, 3] = node.get("translation", (0, 0, 0))
+    return pose
 
 
 _READERS = {".stl": _stl, ".obj": _obj, ".dae": _dae, ".glb": _gltf, ".gltf": _gltf}

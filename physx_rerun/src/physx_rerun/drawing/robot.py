@@ -168,9 +168,9 @@ def _center(shape: VisualShape) -> Array:
 def _simplified(shape: VisualShape, detail: float | None) -> SimpleMesh | None:
     """Return a mesh without details; None: it is drawn as it is."""
     factor = max(map(abs, shape.size))
-    if shape.mesh is None or not detail or not factor:
+    if shape.mesh is None or not factor:
         return None
-    return simple_mesh(shape.mesh, detail / factor)
+    return simple_mesh(shape.mesh, detail / factor if detail else None)
 
 
 def _geometry(shape: VisualShape, simple: SimpleMesh | None) -> Any:

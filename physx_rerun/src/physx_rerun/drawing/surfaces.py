@@ -39,7 +39,8 @@ def symbol_lines(symbol: str, positions: Array, normals: Array | None, size: flo
         normals: Directions that the symbols face, shape (n, 3); None: upward.
         size: Radius in m.
     """
-    facing = np.zeros_like(positions) if normals is None else np.array(normals)
+    is_given = normals is not None and len(normals) > 0
+    facing = np.array(normals) if is_given else np.zeros_like(positions)
     facing[~facing.any(axis=1), 2] = 1.0
     facing /= np.linalg.norm(facing, axis=1, keepdims=True)
     helper = np.where(np.abs(facing[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
@@ -57,6 +58,7 @@ def mesh_of(kind: str, values: Mapping[str, Any]) -> tuple[Array, Array]:
     """Return vertices (n, 3) and triangles (m, 3) of a mesh, a height field or a slice."""
     if kind == "mesh":
         return values["positions"], values["cells"]
+    # Rerun's `GridMap` is flat, of square cells, with one color each instead of values at points.
     shape = (values["heights"] if kind == "height_field" else values["values"]).shape
     heights = values["heights"] if kind == "height_field" else np.zeros(shape, np.float32)
     x, y = (spacing * np.arange(n) for spacing, n in zip(values["spacing"], shape, strict=True))

@@ -1,4 +1,8 @@
-"""Visual shapes of a URDF file, and their poses on the robot's bodies."""
+"""Visual shapes of a URDF file, and their poses on the robot's bodies.
+
+Rerun's `UrdfTree` finds packages by environment variables only, leaves out missing meshes without
+an error, and tells no sizes, which the camera needs.
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -14,10 +15,13 @@ from urllib.parse import quote
 import rerun_cli
 
 from physx_core.errors import VisualizerError
-from physx_core.processes import ChildProcess
+from physx_core.processes import ChildProcess, OutputTail
 
-NO_VULKAN_STATUS = 102
-"""Exit status of a viewer without graphics driver."""
+_PANIC_STATUS = 102
+_PANIC = re.compile(r"panicked at '(.*)'")
+_NO_GLYPH = re.compile(r'No glyph for (".*" \(U\+\w+\))')
+_TAIL_SECONDS = 1.0  # to read the rest of it
+_LINES = 400  # of the viewer's output; after the one with its reason it writes its call stack
 NO_VULKAN = (
     "The Rerun viewer found no graphics driver: install a software Vulkan driver, "
     "for example: apt install mesa-vulkan-drivers"
@@ -117,9 +121,11 @@ class Viewer:
             ],
             variables={"RERUN_APP_ONLY": "true", **(environment or {})},
             stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL if lives_on else subprocess.PIPE,
             lives_on=lives_on,
         )
+        stream = self.process.stderr
+        self._tail = None if stream is None else OutputTail(stream, _LINES)
 
     def wait_until_ready(self, timeout: float = 30.0) -> None:
         """Wait until the viewer listens."""
@@ -138,10 +144,22 @@ class Viewer:
             wait: Time in s to wait for its end.
         """
         status = self.process.wait(wait)
-        if status == NO_VULKAN_STATUS:
-            raise VisualizerError(NO_VULKAN)
         if status is not None:
-            raise VisualizerError(f"The Rerun viewer ended with status {status}.")
+            raise VisualizerError(self._describe_end(status))
+
+    def _describe_end(self, status: int) -> str:
+        text = "" if self._tail is None else self._tail.text(_TAIL_SECONDS)
+        panic = _PANIC.search(text)
+        if status == _PANIC_STATUS and (panic is None or "render context" in panic[1]):
+            return NO_VULKAN
+        if panic is None:
+            return f"The Rerun viewer ended with status {status}."
+        if glyph := _NO_GLYPH.search(panic[1]):
+            return (
+                f"The Rerun viewer cannot draw this picture: its font has no glyph for {glyph[1]}. "
+                "Use other characters in titles, names and labels."
+            )
+        return f"The Rerun viewer ended with status {status}: {panic[1]}"
 
     def end(self) -> None:
         """End the process and wait for it."""

@@ -114,6 +114,13 @@ WRONG = [
     ("scalars", {"values": [1.0]}, "values has the length 1, but labels has 2"),
     ("scalars", {"values": [1.0, np.nan]}, "is nan"),
     ("robot", {"poses": np.zeros((3, 7))}, "poses has the length 3, but bodies has 2"),
+    ("robot", {"poses": np.zeros((0, 7))}, "poses has the length 0, but bodies has 2"),
+    ("scalars", {"values": []}, "values has the length 0, but labels has 2"),
+    ("points", {"positions": [["1", "2", "3"]]}, "not an array of numbers"),
+    ("points", {"positions": 1j * SQUARE}, "not an array of numbers"),
+    ("points", {"size": 10**400}, "must be a finite number"),
+    ("points", {"labels": np.array("a")}, "must be a list of texts"),
+    ("symbols", {"symbol": np.array(["plus", "star"])}, "must be one of"),
 ]
 
 
@@ -204,3 +211,54 @@ def test_names_of_removed_objects_can_be_used_again(factory):
         factory.remove("plate")
     with pytest.raises(ConfigError, match='"markers" does not exist'):
         factory.update_markers("markers", indices=[0])
+
+
+def test_changes_of_several_objects_are_made_together_or_not_at_all(factory):
+    factory.add_points("fixed", SQUARE, scalar_field=[1, 2, 3, 4])
+    factory.take_events()
+    with pytest.raises(ConfigError, match='"fixed".*length 4, but positions has 2'):
+        factory.update_many("points", ["points", "fixed"], {"positions": np.zeros((2, 2, 3))})
+    factory.update_points("points", labels=list("abcd"))
+    assert [dict(event.values) for event in factory.take_events()] == [{"labels": list("abcd")}]
+    factory.update_many("points", ["points", "fixed"], {"color": [None, "red"]})
+    assert [event.values["color"] for event in factory.take_events()] == [None, "red"]
+    factory.update_many("markers", ["markers", "markers"], {})
+    assert factory.take_events() == []
+    with pytest.raises(ConfigError, match='"points".*not an array'):
+        factory.update_many("points", ["points", "fixed"], {"positions": [SQUARE, SQUARE[:2]]})
+    with pytest.raises(UnknownOptionError, match='"view"'):
+        factory.update_many("view", ["view"], {"title": ["other"]})
+
+
+def test_marked_vertices_stay(factory):
+    with pytest.raises(ConfigError, match='"plate".*the markers "markers" are on vertex 2'):
+        factory.update_mesh("plate", positions=SQUARE[:2], cells=CELLS[:0])
+    with pytest.raises(ConfigError, match='"markers": indices goes from 9'):
+        factory.update_markers("markers", indices=[9], labels=["one"])
+    factory.update_markers("markers", labels=["one", "two"])
+    factory.update_markers("markers", indices=[0, 1])
+    factory.take_events()
+    factory.update_mesh("plate", positions=SQUARE[:2], cells=CELLS[:0])
+    assert [event.name for event in factory.take_events()] == ["plate", "markers"]
+
+
+def test_markers_stay_where_a_refused_change_of_several_meshes_began(factory):
+    factory.update_mesh("mesh", scalar_field=[1, 2, 3, 4])
+    factory.take_events()
+    with pytest.raises(ConfigError, match='"mesh".*length 4, but positions has 5'):
+        factory.update_many("mesh", ["plate", "mesh"], {"positions": np.ones((2, 5, 3))})
+    factory.update_markers("markers", indices=[1])
+    (markers,) = factory.take_events()
+    assert markers.values["positions"].tolist() == [[1, 0, 0]]
+
+
+def test_large_numbers_need_no_warning(factory):
+    for dtype, large in ((np.float16, 6e4), (np.float32, 1e30), (np.float64, 1e38)):
+        factory.update_points("points", positions=np.full((4, 3), large, dtype))
+
+
+@pytest.mark.parametrize("seconds", [np.nan, np.inf, "now", None])
+def test_simulated_time_is_a_number(factory, seconds):
+    with pytest.raises(ConfigError, match="The simulated time is .* but must be a finite number"):
+        factory.set_time(seconds)
+    assert factory.take_events() == []

@@ -3,112 +3,25 @@
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from physx_core.components.scene.consistency import Known
 from physx_core.components.scene.event import Event
-from physx_core.components.scene.geometry import vertex_normals
-from physx_core.components.scene.kinds import KINDS, RESETTABLE, Kind
-from physx_core.components.scene.options import LARGEST, Check, many
+from physx_core.components.scene.kinds import KINDS, RESETTABLE
+from physx_core.components.scene.markers import MarkedMeshes
+from physx_core.components.scene.moves import POSE, Moves
+from physx_core.components.scene.options import Check, many, number
 from physx_core.errors import ConfigError, UnknownOptionError, listed
 from physx_core.fields import NO_ARRAY
-from physx_core.typing import Array
 
-_POSE = {"position": 3, "orientation": 4}
-"""Options that many objects change in every step: numbers of each."""
-_TURN = _POSE["orientation"]
 _REMEMBERED = 1000  # sets of names
-_LINKED = {"cells", "color", "heights", "scalar_field", "vmin", "vmax"}
-"""Options whose change always needs a look at others."""
-
-
-@dataclass(slots=True)
-class _Object:
-    """What later changes of an object are checked against.
-
-    Attributes:
-        kind: Its kind.
-        lengths: Length of each aligned option that is set.
-        limits: Its ``vmin`` and ``vmax``, as far as they are set.
-        largest: Largest index among a mesh's cells.
-    """
-
-    kind: str
-    lengths: dict[str, Any] = field(default_factory=dict)
-    limits: dict[str, float] = field(default_factory=dict)
-    largest: int = -1
-
-    def fits(self, changes: Mapping[str, Any], spec: Kind) -> bool:
-        """Return whether changes surely fit what is set: they have the same lengths as before."""
-        if not changes.keys().isdisjoint(_LINKED):
-            return False
-        for option in spec.aligned:
-            value = changes.get(option)
-            if value is not None and len(value) != self.lengths.get(option):
-                return False
-        return True
-
-
-class _Moves:
-    """Moves of bodies of one kind in a row, which travel as one event."""
-
-    def __init__(self, kind: str, options: Sequence[str]) -> None:
-        self.kind, self.options = kind, options
-        self._names: list[str] = []
-        self._floats: list[float] = []
-        self._first, self._second = options[0], options[1] if len(options) == 2 else None
-        self._count = sum(_POSE[option] for option in options)
-
-    def add(self, name: str, changes: Mapping[str, Array]) -> bool:
-        """Add a move, in few operations; return False if it is not one of these options."""
-        if len(changes) != len(self.options):
-            return False
-        try:
-            row = changes[self._first].tolist()
-            if self._second is not None:
-                more = changes[self._second].tolist()
-                if len(more) != _TURN:
-                    return False
-                row += more
-            if len(row) != self._count or not math.hypot(*row) < LARGEST:
-                return False
-        except (KeyError, AttributeError, TypeError, OverflowError):
-            return False
-        self._names.append(name)
-        self._floats += row
-        return True
-
-    def event(self) -> Event:
-        """Return one event of all moves."""
-        count, begin = len(self._names), 0
-        packed = struct.pack(f"{len(self._floats)}f", *self._floats)  # 3 times as fast as NumPy
-        rows = np.frombuffer(packed, np.float32).reshape(count, -1)
-        values: dict[str, Any] = {}
-        for option in self.options:
-            end = begin + _POSE[option]
-            values[option] = rows[0, begin:end] if count == 1 else rows[:, begin:end]
-            begin = end
-        return Event("update", self.kind, tuple(self._names), values)
-
-
-@dataclass(slots=True)
-class _Marked:
-    """A mesh with markers on it.
-
-    Attributes:
-        positions: Its vertices.
-        cells: Its triangles.
-        indices: The marked vertices, by the markers' names.
-    """
-
-    positions: Array
-    cells: Array
-    indices: dict[str, Array] = field(default_factory=dict)
+_SECONDS = number(-math.inf)
+_SEEN_AS = {"markers": "symbols"}
+"""Kinds that reach viewers as another one."""
 
 
 class Factory:
@@ -125,10 +38,10 @@ class Factory:
     """
 
     def __init__(self) -> None:
-        self._objects: dict[str, _Object] = {}
-        self._meshes: dict[str, _Marked] = {}
+        self._objects: dict[str, Known] = {}
+        self._meshes = MarkedMeshes()
         self._events: list[Event] = []
-        self._moves: _Moves | None = None
+        self._moves: Moves | None = None
         self._known_names: dict[tuple[str, ...], str] = {}
 
     def __bool__(self) -> bool:
@@ -378,7 +291,11 @@ class Factory:
         Viewers play what is drawn in this time; call it before the first object is added, too. With
         `Environment.step_time` this is done.
         """
-        self._events.append(Event("update", "time", ("time",), {"seconds": float(seconds)}))
+        try:
+            plain = {"seconds": _SECONDS(seconds)}
+        except ConfigError as error:
+            raise ConfigError(f"The simulated time {error}.") from error
+        self._events.append(Event("update", "time", ("time",), plain))
 
     # Any objects -----------------------------------------------------------------------------
 
@@ -398,11 +315,21 @@ class Factory:
             option: self._checked_rows(kind, chosen, option, value)
             for option, value in values.items()
         }
-        if len(chosen) > 1 and plain.keys() <= _POSE.keys():
+        if not plain:
+            return
+        if len(chosen) > 1 and plain.keys() <= POSE.keys():
             self._events.append(Event("update", kind, chosen, plain))
             return
-        for row, name in enumerate(chosen):
-            self._update(kind, name, {option: value[row] for option, value in plain.items()})
+        objects = {name: self._objects[name] for name in chosen}
+        meshes, count = self._meshes.copy(), len(self._events)
+        try:
+            for row, name in enumerate(chosen):
+                self._update(kind, name, {option: value[row] for option, value in plain.items()})
+        except ConfigError:  # then none of them is changed
+            self._objects |= objects
+            self._meshes = meshes
+            del self._events[count:]
+            raise
 
     def remove(self, *names: str) -> None:
         """Remove objects; their names can be used again."""
@@ -413,13 +340,10 @@ class Factory:
         self._end_moves()
         self._known_names.clear()
         for name in names:
-            markers = self._meshes.pop(name, None)
-            for each in (*(markers.indices if markers else ()), name):
+            for each in (*self._meshes.remove(name), name):
                 known = self._objects.pop(each, None)
-                for mesh in self._meshes.values():
-                    mesh.indices.pop(each, None)
                 if known is not None:
-                    kind = "symbols" if known.kind == "markers" else known.kind
+                    kind = _SEEN_AS.get(known.kind, known.kind)
                     self._events.append(Event("remove", kind, (each,), {}))
 
     # How -------------------------------------------------------------------------------------
@@ -427,7 +351,7 @@ class Factory:
     def _list(self) -> str:
         return f"Objects: {listed(self._objects)}."
 
-    def _known(self, kind: str, name: str) -> _Object:
+    def _known(self, kind: str, name: str) -> Known:
         known = self._objects.get(name)
         if known is None or known.kind != kind:
             what = f"is a {known.kind}, not a {kind}" if known else "does not exist"
@@ -452,16 +376,16 @@ class Factory:
         }
         unknown = values.keys() - spec.options.keys()
         if unknown:
-            raise UnknownOptionError(f"add_{kind}", unknown, list(spec.options))
-        new = _Object(kind)
-        plain = self._plain(new, name, spec, spec.options, values)
-        self._end_moves()
+            raise UnknownOptionError(f'add_{kind} of "{name}"', unknown, spec.options)
+        plain = _plain(name, spec.options, values)
+        new = Known(kind).after(name, plain)
         if kind == "markers":
-            kind, plain = "symbols", self._mark(name, plain)
+            plain = self._meshes.mark(name, plain)
         elif kind == "mesh":
-            self._meshes[name] = _Marked(plain["positions"], plain["cells"])
+            self._meshes.add(name, plain["positions"], plain["cells"])
+        self._end_moves()
         self._objects[name] = new
-        self._events.append(Event("add", kind, (name,), plain))
+        self._events.append(Event("add", _SEEN_AS.get(kind, kind), (name,), plain))
         return name
 
     def _update(self, kind: str, name: str, changes: Mapping[str, Any]) -> None:
@@ -470,28 +394,31 @@ class Factory:
             known = self._known(kind, name)
         if moves is not None and moves.kind == kind and moves.add(name, changes):
             return
-        if changes.keys() <= _POSE.keys() and self._move(kind, name, changes):
+        if changes.keys() <= POSE.keys() and self._move(kind, name, changes):
             return
         spec = KINDS[kind]
         if not changes.keys() <= spec.changeable.keys():
             unknown = changes.keys() - spec.changeable.keys()
-            raise UnknownOptionError(f"update_{kind}", unknown, list(spec.changeable))
-        plain = self._plain(known, name, spec, spec.changeable, changes)
-        self._end_moves()
+            raise UnknownOptionError(f'update_{kind} of "{name}"', unknown, spec.changeable)
+        plain = _plain(name, spec.changeable, changes)
+        after, followers = known.after(name, plain), []
         if kind == "markers":
-            kind, plain = "symbols", self._mark(name, plain)
-        self._events.append(Event("update", kind, (name,), plain))
-        if kind == "mesh":
-            self._move_markers(name, plain)
+            plain = self._meshes.mark(name, plain)
+        elif kind == "mesh":
+            followers = self._meshes.change(name, plain)
+        self._end_moves()
+        self._objects[name] = after
+        self._events.append(Event("update", _SEEN_AS.get(kind, kind), (name,), plain))
+        self._events += followers
 
     def _move(self, kind: str, name: str, changes: Mapping[str, Any]) -> bool:
         """Add to the moves in a row, or begin others, unless the numbers need a closer look."""
-        options = [option for option in _POSE if option in changes]
+        options = [option for option in POSE if option in changes]
         if not options or "position" not in KINDS[kind].options:
             return False
         moves = self._moves
         if moves is None or moves.kind != kind or moves.options != options:
-            moves = _Moves(kind, options)
+            moves = Moves(kind, options)
         try:
             arrays = {option: np.asarray(value) for option, value in changes.items()}
         except NO_ARRAY:
@@ -507,8 +434,8 @@ class Factory:
         """Check that objects are of a kind; what was found is remembered."""
         if self._known_names.get(names) == kind:
             return
-        if kind not in KINDS:
-            raise UnknownOptionError("update_many", [kind], list(KINDS))
+        if kind not in KINDS or kind == "view":
+            raise UnknownOptionError("update_many", [kind], KINDS.keys() - {"view"})
         for name in names:
             self._known(kind, name)
         if len(self._known_names) >= _REMEMBERED:
@@ -522,76 +449,11 @@ class Factory:
             known = list(KINDS[kind].changeable)
             raise UnknownOptionError(f"update_many of {kind}", [option], known)
         try:
-            return many(check, value, len(names))
+            return many(check, value, len(names), resettable=option in RESETTABLE)
         except ConfigError as error:
-            if np.shape(value)[:1] == (len(names),):
-                for name, entry in zip(names, value, strict=True):
-                    try:
-                        check(entry)
-                    except ConfigError as wrong:
-                        raise _told(name, option, wrong) from wrong
+            for name, entry in zip(names, value if np.iterable(value) else (), strict=False):
+                _plain(name, {option: check}, {option: entry})
             raise _told(" ".join(names[:1]), option, error) from error
-
-    def _plain(
-        self,
-        known: _Object,
-        name: str,
-        spec: Kind,
-        checks: Mapping[str, Check],
-        values: Mapping[str, Any],
-    ) -> dict[str, Any]:
-        """Return the plain values of options, if they fit each other and those set before."""
-        plain: dict[str, Any] = {}
-        for option, value in values.items():
-            try:
-                is_reset = value is None and option in RESETTABLE
-                plain[option] = None if is_reset else checks[option](value)
-            except ConfigError as error:
-                raise _told(name, option, error) from error
-        if known.fits(plain, spec):
-            return plain
-        after = _Object(known.kind, {**known.lengths}, {**known.limits}, known.largest)
-        _align(after, name, spec, plain)
-        _check_cells(after, name, plain)
-        _check_limits(after, name, plain)
-        known.lengths, known.limits = after.lengths, after.limits
-        known.largest = after.largest
-        return plain
-
-    # Markers ---------------------------------------------------------------------------------
-
-    def _mark(self, name: str, changes: dict[str, Any]) -> dict[str, Any]:
-        """Return the changes of markers as those of symbols on the mesh's vertices."""
-        if "mesh" in changes:
-            mesh = changes.pop("mesh")
-            if mesh not in self._meshes:
-                raise ConfigError(
-                    f'Object "{name}": there is no mesh "{mesh}" to mark. '
-                    f"Meshes: {listed(self._meshes)}."
-                )
-        else:
-            mesh = next(each for each, marked in self._meshes.items() if name in marked.indices)
-        marked = self._meshes[mesh]
-        if "indices" in changes:
-            indices = changes.pop("indices")
-            if len(indices) and not 0 <= indices.min() <= indices.max() < len(marked.positions):
-                raise ConfigError(
-                    f'Object "{name}": indices goes from {indices.min()} to {indices.max()}, but '
-                    f'the mesh "{mesh}" has the vertices 0 to {len(marked.positions) - 1}.'
-                )
-            marked.indices[name] = indices
-            changes |= _places(marked, indices)
-        return changes
-
-    def _move_markers(self, mesh: str, changes: Mapping[str, Any]) -> None:
-        """Keep what markers need of a mesh, and move them with it."""
-        marked = self._meshes[mesh]
-        marked.positions = changes.get("positions", marked.positions)
-        marked.cells = changes.get("cells", marked.cells)
-        if changes.keys() & {"positions", "cells"}:
-            for name, indices in marked.indices.items():
-                event = Event("update", "symbols", (name,), _places(marked, indices))
-                self._events.append(event)
 
 
 class NullFactory(Factory):
@@ -623,59 +485,13 @@ def _told(name: str, option: str, error: ConfigError) -> ConfigError:
     return ConfigError(f'Object "{name}": {option} {text}{"" if text.endswith(".") else "."}')
 
 
-def _align(after: _Object, name: str, spec: Kind, plain: Mapping[str, Any]) -> None:
-    """Check that options that belong together have the same length."""
-    if "color" in plain and "scalar_field" not in plain:
-        after.lengths.pop("scalar_field", None)
-    changed = False
-    for option in spec.aligned:
-        if option not in plain:
-            continue
-        value, changed = plain[option], True
-        if option not in spec.required and (value is None or not len(value)):
-            after.lengths.pop(option, None)
-        else:
-            is_grid = after.kind == "height_field"
-            after.lengths[option] = value.shape if is_grid else len(value)
-    if not changed or len(set(after.lengths.values())) < 2:
-        return
-    first, *rest = after.lengths
-    other = next(option for option in rest if after.lengths[option] != after.lengths[first])
-    raise ConfigError(
-        f'Object "{name}": {other} has the length {after.lengths[other]}, but {first} has '
-        f"{after.lengths[first]}. Give both, of one length."
-    )
-
-
-def _check_cells(after: _Object, name: str, plain: Mapping[str, Any]) -> None:
-    """Check that a mesh's cells are of its vertices."""
-    if after.kind != "mesh" or not plain.keys() & {"positions", "cells"}:
-        return
-    if "cells" in plain:
-        cells = plain["cells"]
-        after.largest = int(cells.max()) if cells.size else -1
-        if cells.size and cells.min() < 0:
-            raise ConfigError(f'Object "{name}": cells has the negative index {cells.min()}.')
-    count = after.lengths["positions"]
-    if after.largest >= count:
-        raise ConfigError(
-            f'Object "{name}": cells has the index {after.largest}, but positions only the '
-            f"{count} vertices 0 to {count - 1}."
-        )
-
-
-def _check_limits(after: _Object, name: str, plain: Mapping[str, Any]) -> None:
-    """Check that the limits of a colormap are a range."""
-    for option in ("vmin", "vmax"):
-        if option in plain:
-            after.limits[option] = plain[option]
-    low, high = after.limits.get("vmin"), after.limits.get("vmax")
-    if low is not None and high is not None and low >= high:
-        raise ConfigError(f'Object "{name}": vmin is {low:g} but must be less than vmax, {high:g}.')
-
-
-def _places(marked: _Marked, indices: Array) -> dict[str, Any]:
-    """Return positions and normals of the marked vertices."""
-    around = marked.cells[np.isin(marked.cells, indices).any(axis=1)]
-    normals = vertex_normals(marked.positions, around)
-    return {"positions": marked.positions[indices], "orientations": normals[indices]}
+def _plain(name: str, checks: Mapping[str, Check], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the plain values of an object's options."""
+    plain: dict[str, Any] = {}
+    for option, value in values.items():
+        try:
+            is_reset = value is None and option in RESETTABLE
+            plain[option] = None if is_reset else checks[option](value)
+        except ConfigError as error:
+            raise _told(name, option, error) from error
+    return plain

@@ -75,6 +75,9 @@ class Kind:
 RESETTABLE = frozenset({"alpha", "color", "label", "scalar_field", "size", "vmax", "vmin"})
 """Options whose value None is their default."""
 
+EMPTY_IS_UNSET = frozenset({"labels", "orientations", "scalar_field"})
+"""Options that an empty value unsets, where they are not required."""
+
 KINDS: dict[str, Kind] = {
     "mesh": Kind(
         {"positions": _POINTS, "cells": Numbers((None, 3), np.int32)},

@@ -50,11 +50,15 @@ class Numbers:
             and (raw.shape == shape or _fits(raw.shape, shape))
         ):
             flat = raw.ravel()
+            if raw.itemsize < 8:  # their squares may be too large
+                flat = flat.astype(np.float64)
             if float(flat.dot(flat)) < LARGEST**2:
                 return raw.astype(self.dtype)
         if not _fits(raw.shape, shape):
             wanted = str(shape).replace("None", "n")
             raise ConfigError(f"has shape {raw.shape}, expected {wanted}")
+        if raw.dtype.kind not in "biufO":
+            raise ConfigError(f"is not an array of numbers, but of {raw.dtype}")
         try:
             with np.errstate(over="ignore", invalid="ignore"):
                 array: Array = raw.astype(self.dtype)
@@ -85,19 +89,20 @@ def _as_array(value: Any) -> Array:
         raise ConfigError(f"is not an array of numbers: {error}") from error
 
 
-def many(check: Check, value: Any, count: int) -> Any:
+def many(check: Check, value: Any, count: int, *, resettable: bool = False) -> Any:
     """Return the plain values of an option of several objects.
 
     Args:
         check: The option's check.
         value: One entry for each object; of arrays, one array with this leading axis.
         count: Number of objects.
+        resettable: Whether an entry may be None.
     """
     if isinstance(check, Numbers):
         return check(value, count)
     if isinstance(value, str) or not hasattr(value, "__len__") or len(value) != count:
         raise ConfigError(f"must have {count} entries, one for each object")
-    return [check(entry) for entry in value]
+    return [None if resettable and entry is None else check(entry) for entry in value]
 
 
 def number(low: float, *, or_equal: bool = False, high: float = math.inf) -> Check:
@@ -106,9 +111,9 @@ def number(low: float, *, or_equal: bool = False, high: float = math.inf) -> Che
     def check(value: Any) -> float:
         try:
             found = float(value)
-        except (TypeError, ValueError):
+        except NO_ARRAY:
             found = math.nan
-        if isinstance(value, (str, bytes, bool)) or not (
+        if isinstance(value, (str, bytes, bool, np.bool_)) or not (
             low < found <= high or (or_equal and found == low)
         ):
             relation = "at least" if or_equal else "greater than"
@@ -155,7 +160,7 @@ def text(value: Any) -> str:
 
 def texts(value: Any) -> list[str]:
     """Convert a sequence to texts."""
-    if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):
+    if isinstance(value, (str, bytes)) or not np.iterable(value):
         raise ConfigError(f"is {value!r} but must be a list of texts")
     return [str(entry) for entry in value]
 
@@ -171,7 +176,7 @@ def choice(*known: str) -> Check:
     """Return the check of one of some words."""
 
     def check(value: Any) -> str:
-        if value not in known:
+        if not isinstance(value, str) or value not in known:
             raise ConfigError(f"is {value!r} but must be one of {listed(known)}")
         return str(value)
 
