@@ -193,7 +193,10 @@ class Drawing:
         drawn = self._drawn.get(self._followed)
         if drawn is not None:
             # The first shape of a robot belongs to its root link, if that has any.
-            self._layout.follow(self._id, drawn.shapes[0][0] if drawn.shapes else drawn.entity)
+            entity, place = drawn.shapes[0][0] if drawn.shapes else drawn.entity, None
+            if len(drawn.bodies):
+                (place,) = self._bodies.in_world(int(drawn.bodies[0]), np.zeros((1, 3)))
+            self._layout.follow(self._id, entity, place)
             self._followed = None
 
     def _pop(self) -> list[Chunk]:

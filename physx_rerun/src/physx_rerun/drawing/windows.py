@@ -57,9 +57,11 @@ class WindowLayout:
         self._kinds.add(("view", title))
         self.changed = True
 
-    def follow(self, instance_id: int, entity: str) -> None:
-        """Let the camera of an instance follow an entity."""
+    def follow(self, instance_id: int, entity: str, place: Array | None) -> None:
+        """Let the camera of an instance follow an entity, which is at a place now, shape (3,)."""
         self._followed[instance_id] = entity
+        if place is not None:  # the viewer looks there, whatever the target
+            self._cameras[instance_id] = {"target": place, **self._cameras.get(instance_id, {})}
         self._kinds.add(("follow", entity))
         self.changed = True
 
