@@ -1,12 +1,14 @@
 """Each wheel is built and installed into an empty environment, as a user would do it."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
 import venv
 from pathlib import Path
 
+import filelock
 import pytest
 
 pytestmark = pytest.mark.slow
@@ -28,8 +30,16 @@ with connect("{}:{}".format(*service.address), token=service.token) as env:
 
 @pytest.fixture(scope="module")
 def wheels(tmp_path_factory, request):
-    root = request.config.rootpath
-    folder = tmp_path_factory.mktemp("wheels")
+    """Folder of the wheels, built once for all processes that run tests."""
+    root, own = request.config.rootpath, tmp_path_factory.getbasetemp()
+    folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "wheels"
+    with filelock.FileLock(folder.with_suffix(".lock")):
+        if not folder.exists():
+            build_wheels(root, own / "building").rename(folder)
+    return folder
+
+
+def build_wheels(root, folder):
     for name in PACKAGES:
         source = shutil.copytree(root / name, folder / "src" / name)
         command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "-o", folder, source]

@@ -46,11 +46,8 @@ from physx_torch import StoredDataset
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def revealed(tmp_path_factory):
-    """Text to the type that mypy reveals of it, for all public names and for `CALLS`."""
-
-    folder = tmp_path_factory.mktemp("user")
+def reveal(folder):
+    """Return text to the type that mypy reveals of it, for all public names and for `CALLS`."""
     sources = [ROOT / f"physx_{name}" / "src" for name in PACKAGES]
     lines, texts = [], []
     for source, package in zip(sources, PACKAGES, strict=True):
@@ -82,10 +79,8 @@ def revealed(tmp_path_factory):
     return {text: re.sub(r"\b(\w+\.)+(?=\w)", "", kind) for text, kind in revealed.items()}
 
 
-def test_no_public_name_is_any(revealed):
+def test_no_public_name_is_any_and_calls_have_the_types_of_their_results(tmp_path):
+    revealed = reveal(tmp_path)
     assert len(revealed) > 100
     assert [text for text, kind in revealed.items() if kind == "Any"] == []
-
-
-def test_calls_have_the_types_of_their_results(revealed):
     assert {text: revealed[text] for text in CALLS} == CALLS
