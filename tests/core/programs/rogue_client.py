@@ -195,7 +195,10 @@ def attack(address, instance, rng, most):
                 connection.sendall(frame)
                 sent += 1
                 if reader is not None and sent == 1:
-                    wait_for_credit(connection, reader)
+                    # Not for long: the first frame may be wrong.
+                    wait_for(Kind.CREDIT, connection, reader, 0.005)
+                elif reader is not None and rng.random() < 0.03:
+                    wait_for(Kind.ANSWER, connection, reader, 0.02)
             if rng.random() < 0.9:  # let the server read it all before the connection is cut
                 connection.shutdown(socket.SHUT_WR)
                 while connection.recv(1 << 16):
@@ -203,11 +206,11 @@ def attack(address, instance, rng, most):
     return sent
 
 
-def wait_for_credit(connection, reader):
-    """Wait until the server lets rows be made, but not for long: the first frame may be wrong."""
-    connection.settimeout(0.005)
+def wait_for(kind, connection, reader, seconds):
+    """Read what the server sends until a frame of a kind comes, or nothing for some seconds."""
+    connection.settimeout(seconds)
     with contextlib.suppress(EOFError):  # as a timeout is told too
-        while (frame := reader.read(connection)) and frame.kind is not Kind.CREDIT:
+        while (frame := reader.read(connection)) and frame.kind is not kind:
             pass
     connection.settimeout(20)
 

@@ -157,7 +157,7 @@ class Attacked:
             if peer.closed or peer.failure or peer.finished:
                 self.lose(number, peer)
             elif peer.fields and peer.granted - peer.received < 5:
-                peer.granted = peer.received + 20
+                peer.granted = peer.wanted = peer.received + 20  # it waits for every row
                 peer.send(pack(Kind.CREDIT, number=peer.granted))
 
     def take_rows(self, number, peer):
