@@ -1,4 +1,4 @@
-"""What is remembered of drawn objects."""
+"""Item: a drawn object, with what its later changes are drawn from."""
 
 from __future__ import annotations
 
