@@ -2,7 +2,7 @@
 
 import re
 
-PACKAGES = ("core", "dart", "torch", "rerun", "gym", "remote")
+PACKAGES = ("core", "dart", "torch", "rerun", "gym", "remote", "cluster")
 
 
 def test_every_file_on_the_ways_exists(root):

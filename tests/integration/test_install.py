@@ -13,7 +13,10 @@ import pytest
 
 pytestmark = pytest.mark.slow
 
-PACKAGES = ("physx_core", "physx_dart", "physx_torch", "physx_rerun", "physx_gym", "physx_remote")
+PACKAGES = (
+    *("physx_core", "physx_dart", "physx_torch", "physx_rerun", "physx_gym", "physx_remote"),
+    "physx_cluster",
+)
 PHYSX = ("-m", "physx_core")
 GENERATE = "--batch-nb 2 --batch-size 10"
 SERVE = """

@@ -11,7 +11,7 @@ for library in ("mypy", "torch", "rerun", "gymnasium"):
     pytest.importorskip(library)
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("core", "dart", "torch", "rerun", "gym", "remote")
+PACKAGES = ("core", "dart", "torch", "rerun", "gym", "remote", "cluster")
 CALLS = {
     'connect("host:1")': "PhysxEnv",
     'connect("host:1", "godot-gym", repeat_action=2)': "GodotGymEnv",

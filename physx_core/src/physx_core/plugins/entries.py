@@ -20,6 +20,8 @@ COMMANDS = "physx.commands"
 """Entry-point group of the commands: command name to a module with ``run(words)``."""
 
 OFFICIAL = {
+    (PLUGINS, "cluster"): "physx-cluster",
+    (COMMANDS, "sweep"): "physx-cluster",
     (PLUGINS, "dart"): "physx-dart",
     (PLUGINS, "pinocchio"): "physx-dart",
     (COMMANDS, "robots"): "physx-dart",

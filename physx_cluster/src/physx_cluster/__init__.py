@@ -1,0 +1,10 @@
+"""The physx plugin ``cluster``: clients of a run on Ray and on Slurm.
+
+The public names are imported on first use, so that discovering the plugin imports no cluster.
+"""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,1 @@
+"""Launchers: clients as actors of Ray, and as jobs of Slurm."""

@@ -1,0 +1,16 @@
+"""RayLauncher: clients on the nodes of a Ray cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from physx_core.components import ClientHandle, Launcher
+from physx_core.errors import ClientError
+
+
+class RayLauncher(Launcher):
+    """Starts each client on a node of a Ray cluster."""
+
+    def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
+        """Start the clients: see `Launcher.launch`."""
+        raise ClientError(instances[0], "cannot be started on Ray by this version.")
