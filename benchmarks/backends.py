@@ -21,7 +21,7 @@ import pinocchio
 from measure import claim, finish, rates, report
 
 from physx_core import Ground, Robot, World, plugins
-from physx_dart.models.robot_files import EXAMPLE_DATA, example_data_dir, example_robot
+from physx_core.engines import EXAMPLE_DATA, example_data_dir, example_robot
 
 ROUNDS, STEPS, PERIODS = 15, 10, 100
 STAND = np.tile([0.0, 0.8, -1.6], 4)

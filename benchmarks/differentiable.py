@@ -18,7 +18,7 @@ import torch
 from measure import finish, rates, report
 
 from physx_core import Robot, World, plugins
-from physx_dart.shared.algorithms import Algorithms
+from physx_dart.pinocchio.algorithms import PinocchioAlgorithms
 from physx_torch import ForwardDynamics
 
 STATES, ROUNDS, REPEATS = 256, 25, 4
@@ -64,7 +64,7 @@ def main() -> None:
     torch.set_num_threads(1)
     world = World([Robot("a1/a1", fixed_base=False)])
     simulation = plugins.resolve("backend", "pinocchio").build(world)
-    model = Algorithms.of(world).movers[0].model
+    model = PinocchioAlgorithms.of(world).movers[0].model
     rng = np.random.default_rng(0)
     neutral, moves = pinocchio.neutral(model), rng.normal(size=(STATES, model.nv))
     drawn = [pinocchio.integrate(model, neutral, move) for move in moves]

@@ -19,9 +19,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from physx_core import PhysxError, Robot, Simulation, World, plugins
+from physx_core.engines import find_robot, read_robot
 from physx_core.simulation import RobotInfo
-from physx_dart.models.robot_files import find_robot
-from physx_dart.models.urdf import read_robot
 
 ENGINES = ("dart", "pinocchio")
 STATES, STEPS, LOADS, TIMEOUT, NEGLIGIBLE = 20, 200, 5, 300, 1e-6

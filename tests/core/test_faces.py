@@ -10,6 +10,7 @@ LAZY = [
     "",
     ".cli",
     ".components",
+    ".engines",
     ".net",
     ".pipelines",
     ".plugins",

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from physx_core import Robot, World, plugins
-from physx_dart.models.robot_files import example_data_dir, example_robot
+from physx_core.engines import example_data_dir, example_robot
 
 BACKENDS = ("dart", "pinocchio")
 

@@ -7,8 +7,8 @@ import pinocchio as pin
 import pytest
 
 from physx_core import rotations
+from physx_core.engines import find_robot
 from physx_core.errors import ComponentNotFoundError, ConfigError, FeatureNotSupportedError
-from physx_dart.models.robot_files import find_robot
 from physx_gym import RobotEnv, Simulator
 from physx_gym.env.layers.composed import ComposedEnv
 from physx_gym.tasks.quantities import (

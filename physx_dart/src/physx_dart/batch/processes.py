@@ -10,10 +10,10 @@ import os
 import socket
 import sys
 import weakref
+from collections.abc import Sequence
 
 import numpy as np
 
-from physx_core import Closeable
 from physx_core.errors import SimulationError
 from physx_core.processes import ChildProcess, anonymous_file, describe_exit, worker_variables
 from physx_core.typing import Vector
@@ -26,7 +26,7 @@ from physx_dart.batch.worker import (
     compute,
     describe_models,
 )
-from physx_dart.shared.algorithms import Algorithms
+from physx_dart.pinocchio.algorithms import MoverAlgorithms, PinocchioAlgorithms
 
 _LEAST_ROWS = 16
 """Least number of rows for which using a process pays off."""
@@ -34,41 +34,49 @@ _PATIENCE = 5.0
 """Time in s that a process which closed its connection may take to exit."""
 
 
-class ParallelDynamics(Closeable):
-    """Batches of which this process computes some rows and other processes the rest.
+class ParallelAlgorithms(PinocchioAlgorithms):
+    """Algorithms with batches of which this process computes some rows and others the rest.
 
     The other processes start when they are first needed. They end when this is closed or garbage
     collected, and when this process ends, even if it is killed. A process forked from this one
     computes all rows itself.
     """
 
-    def __init__(self, algorithms: Algorithms) -> None:
-        self._algorithms = algorithms
+    def __init__(self, movers: Sequence[MoverAlgorithms], statics: Vector) -> None:
+        """Combine movers with static things, whose poses have the shape (statics, 7)."""
+        super().__init__(movers, statics)
         self._owner = os.getpid()
         self._workers: list[_Worker] = []
         self._memory: SharedRows | None = None
         self._held = contextlib.ExitStack()
         weakref.finalize(self, _end_processes, self._held, self._owner)
 
-    def forward(self, q: Vector, v: Vector, tau: Vector, *, processes: int) -> Vector:
-        """Return the accelerations, shape (n, nv)."""
-        return self._compute(FORWARD, (q, v, tau), processes)
+    def forward_batch(self, q: Vector, v: Vector, tau: Vector, processes: int = 1) -> Vector:
+        """Return `forward_dynamics` of many states, shape (n, nv)."""
+        shares = self._shares(processes, len(q))
+        if shares < 2:
+            return super().forward_batch(q, v, tau)
+        return self._compute(FORWARD, (q, v, tau), shares)
 
-    def gradients(
-        self, q: Vector, v: Vector, a: Vector, weights: Vector, *, processes: int
+    def gradients_batch(
+        self, q: Vector, v: Vector, a: Vector, weights: Vector, processes: int = 1
     ) -> Vector:
-        """Return the gradients of weighted sums of the accelerations, shape (3, n, nv)."""
-        return self._compute(GRADIENTS, (q, v, a, weights), processes)
+        """Return gradients of weighted sums of the accelerations, shape (3, n, nv)."""
+        shares = self._shares(processes, len(q))
+        if shares < 2:
+            return super().gradients_batch(q, v, a, weights)
+        return self._compute(GRADIENTS, (q, v, a, weights), shares)
 
     def close(self) -> None:
         """End the other processes; the next batch that needs them starts new ones."""
         self._workers, self._memory = [], None
         _end_processes(self._held, self._owner)
 
-    def _compute(self, kind: int, states: tuple[Vector, ...], processes: int) -> Vector:
-        shares = min(processes, len(states[0]) // _LEAST_ROWS)
-        if shares < 2 or os.getpid() != self._owner:
-            return compute(self._algorithms, kind, states)
+    def _shares(self, processes: int, rows: int) -> int:
+        """Return the number of processes among which rows are shared."""
+        return min(processes, rows // _LEAST_ROWS) if os.getpid() == self._owner else 1
+
+    def _compute(self, kind: int, states: tuple[Vector, ...], shares: int) -> Vector:
         try:
             return self._compute_shared(kind, states, shares)
         except BaseException:  # there may be pending replies that nobody waits for
@@ -87,7 +95,7 @@ class ParallelDynamics(Closeable):
         for worker, begin, end in zip(workers, ends[:-1], ends[1:], strict=True):
             worker.ask(REQUEST.pack(kind, rows, begin, end))
         found = np.empty(results.shape)
-        found[..., :mine, :] = compute(self._algorithms, kind, tuple(x[:mine] for x in states))
+        found[..., :mine, :] = compute(self, kind, tuple(x[:mine] for x in states))
         for worker in workers:
             worker.wait()
         found[..., mine:, :] = results[..., mine:, :]
@@ -97,10 +105,10 @@ class ParallelDynamics(Closeable):
         """Return `count` other processes, and the memory that they share."""
         if self._memory is None:
             file = self._held.enter_context(anonymous_file("physx_batches"))
-            self._memory = SharedRows(file.fileno(), self._algorithms.nq, self._algorithms.nv)
+            self._memory = SharedRows(file.fileno(), self.nq, self.nv)
         new = [_Worker(self._memory.file, self._held) for _ in range(count - len(self._workers))]
         for worker in new:
-            worker.ask(describe_models(self._algorithms))
+            worker.ask(describe_models(self))
         self._workers += new
         return self._workers[:count], self._memory
 

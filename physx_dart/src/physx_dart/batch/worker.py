@@ -17,9 +17,9 @@ import sys
 import numpy as np
 import pinocchio
 
+from physx_core.engines import Resistance
 from physx_core.typing import Vector
-from physx_dart.shared.algorithms import Algorithms, MoverAlgorithms
-from physx_dart.shared.resistance import Resistance
+from physx_dart.pinocchio.algorithms import MoverAlgorithms, PinocchioAlgorithms
 
 FORWARD, GRADIENTS = range(2)
 REQUEST = struct.Struct("<4q")
@@ -61,13 +61,16 @@ class SharedRows:
         return (positions, *others[:3]), others[3:]
 
 
-def compute(algorithms: Algorithms, kind: int, states: tuple[Vector, ...]) -> Vector:
+def compute(algorithms: PinocchioAlgorithms, kind: int, states: tuple[Vector, ...]) -> Vector:
     """Return the accelerations, shape (n, nv), or the gradients, shape (3, n, nv), of states."""
-    call = algorithms.forward_batch if kind == FORWARD else algorithms.gradients_batch
-    return call(*states)
+    if kind == FORWARD:
+        q, v, tau = states
+        return algorithms.forward_batch(q, v, tau)
+    q, v, a, weights = states
+    return algorithms.gradients_batch(q, v, a, weights)
 
 
-def describe_models(algorithms: Algorithms) -> bytes:
+def describe_models(algorithms: PinocchioAlgorithms) -> bytes:
     """Return a line of text from which `algorithms_of` rebuilds them; it contains no code."""
     movers = [
         (each.model.saveToString(), each.resistance.table.tolist()) for each in algorithms.movers
@@ -75,14 +78,14 @@ def describe_models(algorithms: Algorithms) -> bytes:
     return json.dumps(movers).encode("ascii") + b"\n"
 
 
-def algorithms_of(line: bytes) -> Algorithms:
+def algorithms_of(line: bytes) -> PinocchioAlgorithms:
     """Return the algorithms, without bodies, that a line of `describe_models` describes."""
     movers = []
     for text, table in json.loads(line):
         model = pinocchio.Model()
         model.loadFromString(text)
         movers.append(MoverAlgorithms(model, Resistance(np.array(table).reshape(5, model.nv))))
-    return Algorithms(movers, np.zeros((0, 7)))
+    return PinocchioAlgorithms(movers, np.zeros((0, 7)))
 
 
 def serve(link: socket.socket, file: int) -> None:

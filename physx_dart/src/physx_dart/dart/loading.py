@@ -13,13 +13,11 @@ from typing import Any
 import numpy as np
 from dartpy import dynamics, utils
 
+from physx_core.engines import CollisionShape, Mover, Static, geometry_file
 from physx_core.errors import ModelError
 from physx_core.rotations import to_matrix
 from physx_core.simulation import Ground, HeightField, Stairs
 from physx_core.typing import Vector
-from physx_dart.models.meshes import geometry_file
-from physx_dart.models.parts import Mover, Static
-from physx_dart.models.shapes import CollisionShape
 
 WORLD = "world"
 ROOT = "physx root"

@@ -7,8 +7,6 @@ position and velocity limits, servos, and Coulomb friction are constraints of it
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, ClassVar
 
 import dartpy
@@ -16,17 +14,22 @@ import numpy as np
 from dartpy import constraint
 from dartpy.simulation import CollisionDetectorType
 
+from physx_core.engines import (
+    RK4_LACKS,
+    Algorithms,
+    CollisionShape,
+    Parts,
+    RobotBackend,
+    RobotSimulation,
+    check_rk4,
+    read_parts,
+)
 from physx_core.errors import FeatureNotSupportedError, SimulationError, UnknownOptionError
-from physx_core.simulation import FEATURES, Backend, RobotInfo, Simulation, World, finite_rows
+from physx_core.simulation import FEATURES, Simulation, World, finite_rows
 from physx_core.typing import Records, Vector
 from physx_dart.dart.contacts import ContactReader
 from physx_dart.dart.loading import attach_shapes, static_skeleton
 from physx_dart.dart.skeleton import DartRobot
-from physx_dart.models import catalog, robot_files
-from physx_dart.models.parts import Parts, read_parts
-from physx_dart.models.shapes import CollisionShape
-from physx_dart.shared import rk4
-from physx_dart.shared.robot_simulation import RobotSimulation
 
 _DETECTORS = {
     "dart": CollisionDetectorType.DART,
@@ -45,7 +48,7 @@ impulses of the last step, so that more of them mostly sharpen impacts (docs/con
 _RAYS = ("dart", "bullet")
 
 
-class DartBackend(Backend):
+class DartBackend(RobotBackend):
     """DART, a simulator of articulated bodies.
 
     Contact solvers: ``nsgs`` (default) and ``fbf`` with Coulomb's law, by iterations; ``dantzig``,
@@ -64,14 +67,6 @@ class DartBackend(Backend):
             UnknownOptionError: If there is no detector or solver of that name.
         """
         return DartSimulation(world)
-
-    def robots(self) -> Sequence[RobotInfo]:
-        """Return the robots of this package and of ``example-robot-data``."""
-        return catalog.robots()
-
-    def robot_path(self, name: str) -> Path | None:
-        """Return the URDF file of the robot of a name, None if there is none."""
-        return robot_files.robot_path(name)
 
 
 class DartSimulation(RobotSimulation[DartRobot]):
@@ -112,13 +107,13 @@ class DartSimulation(RobotSimulation[DartRobot]):
         lacks = [] if solver in _ISOTROPIC else ["isotropic_friction"]
         lacks += ["exact_restore"] if detector == "dart" and not self._stateless else []
         lacks += [] if detector in _RAYS else ["raycast"]
-        lacks += rk4.LACKS if self._rk4 else []
+        lacks += RK4_LACKS if self._rk4 else []
         super().__init__(parts, robots, lacks)
 
     def _check_features(self, parts: Parts, detector: str) -> None:
         features = frozenset(FEATURES) - self.lacks
         if parts.world.integrator == "rk4":
-            rk4.check(parts, self.engine, features)
+            check_rk4(parts, self.engine, features)
         if any(joint.settings.armature for each in parts.movers for joint in each.model.joints):
             raise FeatureNotSupportedError(self.engine, "armature", features)
         shapes = [shape for each in parts.movers for shape in each.model.shapes]
@@ -136,6 +131,12 @@ class DartSimulation(RobotSimulation[DartRobot]):
             robot.skeleton.enableSelfCollisionCheck()
         self._world.addSkeleton(robot.skeleton)
         return robot
+
+    def make_algorithms(self) -> Algorithms:
+        """Return Pinocchio's algorithms."""
+        from physx_dart.batch.processes import ParallelAlgorithms  # its library loads slowly
+
+        return ParallelAlgorithms.of_parts(self.parts)
 
     def advance(self, n: int) -> None:
         """Simulate n physics steps."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from dartpy import dynamics
 
+from physx_core.engines import Joint, Mover, RobotEngine, base_accelerations, rk4_step
 from physx_core.rotations import (
     from_rotation_vector,
     multiply,
@@ -18,10 +19,6 @@ from physx_core.rotations import (
 )
 from physx_core.typing import Vector
 from physx_dart.dart.loading import link_name, load_skeleton
-from physx_dart.models.parts import Mover
-from physx_dart.models.urdf import Joint
-from physx_dart.shared import rk4
-from physx_dart.shared.engine import RobotEngine, base_accelerations
 
 _ACTUATORS = {
     "force": dynamics.ActuatorType.FORCE,
@@ -158,7 +155,7 @@ class DartRobot(RobotEngine):
         torques = np.concatenate([np.zeros(self.base), self._commands])
         for _ in range(n):
             q, twist = self.positions(), self.velocities()
-            q, v = rk4.step(
+            q, v = rk4_step(
                 q,
                 self._with_world(q, twist),
                 period,

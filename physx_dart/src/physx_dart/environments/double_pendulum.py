@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from physx_core import Field, plugins
 from physx_core.components import Environment
+from physx_core.engines import OWN_ROBOTS
 from physx_core.errors import ConfigError
 from physx_core.simulation import Robot, Simulation, World
 from physx_dart.environments.trajectories import SmoothTrajectory
 
-URDF = Path(__file__).parents[1] / "robots" / "double_pendulum.urdf"
+URDF = OWN_ROBOTS / "double_pendulum.urdf"
 """Two links of 1 kg and 0.5 m, which hang down at zero."""
 
 

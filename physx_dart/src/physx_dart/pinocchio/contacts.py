@@ -14,11 +14,10 @@ import numpy as np
 import pinocchio
 from numpy.typing import NDArray
 
+from physx_core.engines import CollisionShape, Mover, Static
 from physx_core.errors import FeatureNotSupportedError
 from physx_core.simulation import CONTACT
 from physx_core.typing import Records, Vector
-from physx_dart.models.parts import Mover, Static
-from physx_dart.models.shapes import CollisionShape
 from physx_dart.pinocchio.surfaces import Plane, surface_of
 
 MARGIN = 1e-4

@@ -9,8 +9,8 @@ import eigenpy
 import numpy as np
 from numpy.typing import NDArray
 
+from physx_core.engines import Joint
 from physx_core.typing import Vector
-from physx_dart.models.urdf import Joint
 from physx_dart.pinocchio.contact_problem import regularized, unit
 
 _FASTEST_RETURN = 10.0

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pinocchio
 
+from physx_core.engines import Mover
 from physx_core.errors import ModelError
 from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
-from physx_dart.models.parts import Mover
 
 _TRANSLATION, _ROTATION = "physx translation", "physx rotation"
 _LINK = "physx link "

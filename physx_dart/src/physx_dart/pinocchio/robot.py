@@ -16,17 +16,15 @@ import numpy as np
 import pinocchio
 from numpy import add, multiply
 
+from physx_core.engines import Mover, RobotEngine, Static, base_accelerations, rk4_step
 from physx_core.rotations import rotate, rotate_back, to_matrix
 from physx_core.simulation import CONTACT, World
 from physx_core.typing import Records, Vector
-from physx_dart.models.parts import Mover, Static
 from physx_dart.pinocchio.constraints import Constraints, Warmth, constrained, limited
 from physx_dart.pinocchio.contacts import ContactFinder
 from physx_dart.pinocchio.limits import JointConstraints
 from physx_dart.pinocchio.models import frames_of, load_stepping_model
 from physx_dart.pinocchio.solver import ImpulseSolver
-from physx_dart.shared import rk4
-from physx_dart.shared.engine import RobotEngine, base_accelerations
 
 _UNSEEN = 10
 """Steps between two checks whether a limit might have acted."""
@@ -219,7 +217,7 @@ class PinocchioRobot(RobotEngine):
         integrate = functools.partial(pinocchio.integrate, self._model)
         state = self._positions, self._velocities
         self._earlier, self._before = state
-        found = rk4.step(*state, self._period, self._acceleration, integrate)
+        found = rk4_step(*state, self._period, self._acceleration, integrate)
         self._positions, self._velocities = found
 
     def _acceleration(self, q: Vector, v: Vector) -> Vector:

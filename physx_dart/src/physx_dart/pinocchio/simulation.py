@@ -1,30 +1,33 @@
 """The engine Pinocchio: its algorithms and constraint solvers, stepped by `PinocchioRobot`.
 
-All calls of pinocchio are in `physx_dart.pinocchio`, `physx_dart.batch`, and
-`physx_dart.shared.algorithms`.
+All calls of pinocchio are in `physx_dart.pinocchio` and `physx_dart.batch`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
+from physx_core.engines import (
+    RK4_LACKS,
+    Algorithms,
+    Parts,
+    RobotBackend,
+    RobotSimulation,
+    check_rk4,
+    read_parts,
+)
 from physx_core.errors import FeatureNotSupportedError
-from physx_core.simulation import FEATURES, Backend, RobotInfo, Simulation, World
+from physx_core.simulation import FEATURES, Simulation, World
 from physx_core.typing import Records
-from physx_dart.models import catalog, robot_files
-from physx_dart.models.parts import Parts, read_parts
+from physx_dart.batch.processes import ParallelAlgorithms
 from physx_dart.pinocchio.coupling import Coupling
 from physx_dart.pinocchio.robot import PinocchioRobot
 from physx_dart.pinocchio.solver import ImpulseSolver
-from physx_dart.shared import rk4
-from physx_dart.shared.robot_simulation import RobotSimulation
 
 
-class PinocchioBackend(Backend):
+class PinocchioBackend(RobotBackend):
     """Pinocchio, a library of rigid-body algorithms.
 
     Contact solvers: ``pgs`` (default) and ``admm``, both with a friction cone, for problems that
@@ -43,14 +46,6 @@ class PinocchioBackend(Backend):
         """
         return PinocchioSimulation(world)
 
-    def robots(self) -> Sequence[RobotInfo]:
-        """Return the robots of this package and of ``example-robot-data``."""
-        return catalog.robots()
-
-    def robot_path(self, name: str) -> Path | None:
-        """Return the URDF file of the robot of a name, None if there is none."""
-        return robot_files.robot_path(name)
-
 
 class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
     """A world of Pinocchio."""
@@ -67,14 +62,18 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
         features = sorted(frozenset(FEATURES) - self.lacks)
         robots = [PinocchioRobot(mover, world, statics, solver, features) for mover in parts.movers]
         self._coupling = Coupling(parts, robots, solver, features)
-        super().__init__(parts, robots, () if world.integrator == "euler" else rk4.LACKS)
+        super().__init__(parts, robots, () if world.integrator == "euler" else RK4_LACKS)
 
     def _check_features(self, parts: Parts) -> None:
         world, features = parts.world, frozenset(FEATURES) - self.lacks
         if world.detector is not None:
             raise FeatureNotSupportedError(self.engine, f"detector {world.detector}", features)
         if world.integrator == "rk4":
-            rk4.check(parts, self.engine, features)
+            check_rk4(parts, self.engine, features)
+
+    def make_algorithms(self) -> Algorithms:
+        """Return Pinocchio's algorithms."""
+        return ParallelAlgorithms.of_parts(self.parts)
 
     def advance(self, n: int) -> None:
         """Simulate n physics steps."""

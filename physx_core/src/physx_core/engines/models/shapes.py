@@ -1,4 +1,4 @@
-"""Collision shapes of robots and objects, the same for both engines."""
+"""Collision shapes of robots and objects, the same for all engines."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from physx_core.engines.models.meshes import bounding_box, bounding_capsule, read_vertices
+from physx_core.engines.models.robot_files import mesh_path
 from physx_core.errors import ModelError, listed, nearest
 from physx_core.simulation import Box, Capsule, Cylinder, Mesh, Robot, Sphere, UrdfTree, WorldObject
 from physx_core.typing import Vector
-from physx_dart.models.meshes import bounding_box, bounding_capsule, read_vertices
-from physx_dart.models.robot_files import mesh_path
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,8 @@ def _moments(shape: CollisionShape, mass: float) -> Vector:
     else:
         size = np.array(shape.size)
     squares = size**2
-    return mass / 12 * (squares.sum() - squares)
+    found: Vector = mass / 12 * (squares.sum() - squares)
+    return found
 
 
 def _round_moments(shape: CollisionShape, mass: float) -> tuple[float, float, float]:

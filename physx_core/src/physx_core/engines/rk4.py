@@ -6,11 +6,11 @@ from collections.abc import Callable, Collection
 
 import numpy as np
 
+from physx_core.engines.models.parts import Parts
 from physx_core.errors import FeatureNotSupportedError
 from physx_core.typing import Vector
-from physx_dart.models.parts import Parts
 
-LACKS = (
+RK4_LACKS = (
     "actuators",
     "contacts",
     "body_contacts",
@@ -23,7 +23,7 @@ LACKS = (
 """Features that a simulation does not have with this integrator."""
 
 
-def check(parts: Parts, engine: str, features: Collection[str]) -> None:
+def check_rk4(parts: Parts, engine: str, features: Collection[str]) -> None:
     """Raise an error if a world needs constraints."""
     advice = 'Use World(integrator="euler").'
     solid = sum(bool(mover.model.shapes) for mover in parts.movers) + len(parts.statics)
@@ -41,7 +41,7 @@ def check(parts: Parts, engine: str, features: Collection[str]) -> None:
                 raise FeatureNotSupportedError(engine, what, features, advice)
 
 
-def step(
+def rk4_step(
     q: Vector,
     v: Vector,
     period: float,

@@ -22,8 +22,8 @@ from physx_core import (
     World,
     Wrench,
 )
+from physx_core.engines import bounding_box, bounding_capsule
 from physx_core.errors import ConfigError, FeatureNotSupportedError, ModelError
-from physx_dart.models.meshes import bounding_box, bounding_capsule
 
 MESH_ROBOT = """
 <robot name="r"><link name="body">

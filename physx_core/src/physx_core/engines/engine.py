@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from physx_core.engines.models.parts import Mover
+from physx_core.engines.resistance import Resistance
 from physx_core.rotations import Triple, cross, rotate_back
 from physx_core.typing import Vector
-from physx_dart.models.parts import Mover
-from physx_dart.shared.resistance import Resistance
 
 
 class RobotEngine(ABC):

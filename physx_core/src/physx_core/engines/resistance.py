@@ -6,8 +6,8 @@ from typing import Self
 
 import numpy as np
 
+from physx_core.engines.models.parts import Mover
 from physx_core.typing import Vector
-from physx_dart.models.parts import Mover
 
 
 class Resistance:
@@ -47,11 +47,14 @@ class Resistance:
         """Return the torques against a motion, shape (..., nv), or 0 if there are none."""
         if not self._any:
             return 0.0
-        return self.smooth(positions, velocities) + self.friction * np.sign(velocities)
+        found: Vector = self.smooth(positions, velocities) + self.friction * np.sign(velocities)
+        return found
 
     def smooth(self, positions: Vector, velocities: Vector) -> Vector | float:
         """Return the torques of damping and springs alone, likewise."""
         if not self._smooth:
             return 0.0
         stretch = positions[..., positions.shape[-1] - velocities.shape[-1] :] - self.rest
-        return self.damping * velocities + np.where(self.stiffness, self.stiffness * stretch, 0.0)
+        springs = np.where(self.stiffness, self.stiffness * stretch, 0.0)
+        found: Vector = self.damping * velocities + springs
+        return found

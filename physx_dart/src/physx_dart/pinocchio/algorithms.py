@@ -12,11 +12,10 @@ from typing import Any, Self
 import numpy as np
 import pinocchio
 
+from physx_core.engines import Algorithms, Mover, Parts, Resistance, read_parts, static_poses
 from physx_core.simulation import World
 from physx_core.typing import Vector
-from physx_dart.models.parts import Mover, Parts, read_parts, static_poses
 from physx_dart.pinocchio.models import frames_of, load_model
-from physx_dart.shared.resistance import Resistance
 
 _WORLD_AXES = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
 _velocity, _acceleration = pinocchio.getFrameVelocity, pinocchio.getFrameClassicalAcceleration
@@ -158,15 +157,13 @@ class MoverAlgorithms:
         return found
 
 
-class Algorithms:
+class PinocchioAlgorithms(Algorithms):
     """Pinocchio's algorithms for a world; arrays are not validated.
 
-    Create one with ``Algorithms.of(world)``. Quaternions in positions must have length 1.
+    Create one with ``PinocchioAlgorithms.of(world)``. Quaternions in positions must have length 1.
 
     Attributes:
         movers: Algorithms of each robot, then of each moving object.
-        nq: Length of the positions.
-        nv: Length of the velocities.
     """
 
     def __init__(self, movers: Sequence[MoverAlgorithms], statics: Vector) -> None:
@@ -287,12 +284,14 @@ class Algorithms:
         by_q, by_v, by_tau = (self._diagonal(blocks) for blocks in zip(*found, strict=True))
         return by_q, by_v, by_tau
 
-    def forward_batch(self, q: Vector, v: Vector, tau: Vector) -> Vector:
-        """Return `forward_dynamics` of many states, shape (n, nv); each row is a state."""
+    def forward_batch(self, q: Vector, v: Vector, tau: Vector, processes: int = 1) -> Vector:
+        """Return `forward_dynamics` of many states, shape (n, nv), computed in this process."""
         found = [x.forward_batch(q[:, a], v[:, b], tau[:, b]) for x, a, b in self._slices]
         return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
 
-    def gradients_batch(self, q: Vector, v: Vector, a: Vector, weights: Vector) -> Vector:
+    def gradients_batch(
+        self, q: Vector, v: Vector, a: Vector, weights: Vector, processes: int = 1
+    ) -> Vector:
         """Return gradients of weighted sums of the accelerations, shape (3, n, nv)."""
         found = np.empty((3, *weights.shape))
         for each, i, j in self._slices:

@@ -7,16 +7,16 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from physx_core import PhysxError
+from physx_core.engines.models.robot_files import mesh_path, named_robots
+from physx_core.engines.models.urdf import read_robot
+from physx_core.errors import PhysxError
 from physx_core.simulation import Robot, RobotInfo, parse_urdf
-from physx_dart.models.robot_files import mesh_path, named_robots
-from physx_dart.models.urdf import read_robot
 
 _NO_DIRS: Mapping[str, str | Path] = {}
 
 
 def robots() -> tuple[RobotInfo, ...]:
-    """Return the robots of this package, then those of ``example-robot-data`` if installed."""
+    """Return the robots of physx, then those of ``example-robot-data`` if installed."""
     return tuple(describe(name, path) for name, path in named_robots().items())
 
 

@@ -1,9 +1,10 @@
 """Robot models from URDF files: names, joints, collision shapes, and a text for the engines.
 
-Both engines load the same text, rebuilt from the file: links with their inertia, joints with their
-origin and axis. Everything else is read here, so that it has the same meaning in both:
+All engines load the same text, rebuilt from the file: links with their inertia, joints with their
+origin and axis. Everything else is read here, so that it has the same meaning in each:
 
-- Shapes are omitted; `physx_dart.models.shapes` reads those for collisions. All meshes must exist.
+- Shapes are omitted; `physx_core.engines.models.shapes` reads those for collisions. All meshes must
+  exist.
 - A link without inertia, or of mass 0, gets 1e-9 kg and 1e-12 kg m².
 - Mimic joints are joints like any other.
 - A position limit whose ends are equal or absent, and a velocity or effort limit that is 0 or
@@ -19,6 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
+from physx_core.engines.models.robot_files import check_meshes, find_robot
+from physx_core.engines.models.shapes import CollisionShape, shapes_of_robot
 from physx_core.errors import ModelError, listed, nearest
 from physx_core.simulation import (
     JointSettings,
@@ -28,8 +31,6 @@ from physx_core.simulation import (
     numbers_of,
     parse_urdf,
 )
-from physx_dart.models.robot_files import check_meshes, find_robot
-from physx_dart.models.shapes import CollisionShape, shapes_of_robot
 
 _MOVING = ("revolute", "continuous", "prismatic")
 _UNLIMITED = '<limit lower="-1e9" upper="1e9" effort="1e9" velocity="1e9"/>'

@@ -14,14 +14,14 @@ from physx_core.origin import install_hint
 EXAMPLE_DATA = "example-robot-data"
 """Distribution with many robots; also the package that their mesh names begin with."""
 OWN_ROBOTS = Path(__file__).parents[1] / "robots"
-"""Folder of the robots of this package."""
+"""Folder of physx's own robots."""
 
 
 def find_robot(urdf: str | Path) -> Path:
     """Return the URDF file of a robot.
 
     Args:
-        urdf: A path; or the name of a robot of this package, as in ``"cartpole"``, or of
+        urdf: A path; or the name of a robot of physx, as in ``"cartpole"``, or of
             ``example-robot-data``, as in ``"a1/a1"``; ``physx robots`` lists the names.
     """
     path = Path(urdf).absolute()
@@ -46,7 +46,7 @@ def robot_path(name: str) -> Path | None:
 
 
 def named_robots() -> dict[str, Path]:
-    """Return the files of all robots with a name: those of this package, then installed ones."""
+    """Return the files of all robots with a name: those of physx, then installed ones."""
     own = {path.stem: path for path in sorted(OWN_ROBOTS.glob("*.urdf"))}
     return own | _installed()
 
@@ -89,7 +89,7 @@ def example_robot(name: str) -> Path:
     if folder is None:
         raise ModelError(
             f'The robot "{name}" comes with the package {EXAMPLE_DATA}, which is not installed. '
-            f"{install_hint('physx-dart', 'robots')}"
+            f"{install_hint('physx-core', 'robots')}"
         )
     path = folder / "robots" / name
     if not path.is_file():

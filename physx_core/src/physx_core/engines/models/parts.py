@@ -1,4 +1,4 @@
-"""Parts of a world as the engines load them: movers as robot models, and static things."""
+"""Parts of a world as engines load them: movers as robot models, and static things."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from physx_core.engines.models.shapes import CollisionShape, moments, shape_of_object
+from physx_core.engines.models.urdf import Joint, RobotModel, read_robot
 from physx_core.errors import ModelError
 from physx_core.simulation import Ground, HeightField, Layout, Part, Stairs, World, WorldObject
-from physx_dart.models.shapes import CollisionShape, moments, shape_of_object
-from physx_dart.models.urdf import Joint, RobotModel, read_robot
 
 _OBJECT = (
     '<robot name="robot"><link name="body"><inertial><mass value="{mass!r}"/><inertia '

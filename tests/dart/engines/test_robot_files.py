@@ -7,8 +7,8 @@ import importlib.metadata
 import pytest
 
 from physx_core import Robot, World
+from physx_core.engines import example_robot
 from physx_core.errors import ConfigError, MissingMeshesError, ModelError
-from physx_dart.models.robot_files import example_robot
 
 LINK = '<link name="{}"/>'
 JOINT = '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/>{}</joint>'
@@ -159,7 +159,7 @@ def test_a_missing_package_of_robots_is_named_with_its_pip_line(monkeypatch):
         raise importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(importlib.metadata, "distribution", missing)
-    with pytest.raises(ModelError, match=r'pip install .*physx.dart\[robots\]"'):
+    with pytest.raises(ModelError, match=r'pip install .*physx.core\[robots\]"'):
         example_robot("panda_description/urdf/panda.urdf")
 
 

@@ -1,17 +1,23 @@
 """Simulation of a world whose robots and objects are stepped by an engine.
 
-An engine implements `RobotEngine` for one robot, and `RobotSimulation.advance` and
-`RobotSimulation.read_contacts` for its world.
+An engine implements `RobotEngine` for one robot, `Algorithms` for any state of a world, and the
+abstract methods of `RobotSimulation` for its steps.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
+from physx_core.engines.algorithms import Algorithms
+from physx_core.engines.checks import LayoutChecks, integer
+from physx_core.engines.engine import RobotEngine
+from physx_core.engines.influences import Hooks, Wrenches
+from physx_core.engines.models.parts import Parts, layout_of
+from physx_core.engines.models.reach import Reach
 from physx_core.errors import SimulationError, listed
 from physx_core.rotations import cross, to_matrix
 from physx_core.simulation import (
@@ -25,15 +31,6 @@ from physx_core.simulation import (
     finite_vector,
 )
 from physx_core.typing import Records, Vector
-from physx_dart.models.parts import Parts, layout_of
-from physx_dart.models.reach import Reach
-from physx_dart.shared.checks import LayoutChecks, integer
-from physx_dart.shared.engine import RobotEngine
-from physx_dart.shared.influences import Hooks, Wrenches
-
-if TYPE_CHECKING:
-    from physx_dart.batch.processes import ParallelDynamics
-    from physx_dart.shared.algorithms import Algorithms
 
 _FASTEST = 1e8
 """Speed, in m/s or rad/s, beyond which a state counts as no longer finite."""
@@ -76,7 +73,6 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._joints = [place.joints for place in places]
         self._links = [(robot, link) for robot in robots for link in range(len(robot.model.links))]
         self._made_algorithms: Algorithms | None = None
-        self._made_batches: ParallelDynamics | None = None
         self._reaches: dict[int, Reach] = {}
         for robot in robots:
             robot.write(robot.neutral(), np.zeros(robot.nv))
@@ -115,6 +111,10 @@ class RobotSimulation(Simulation, Generic[Engine]):
     @abstractmethod
     def advance(self, n: int) -> None:
         """Simulate n physics steps."""
+
+    @abstractmethod
+    def make_algorithms(self) -> Algorithms:
+        """Return the algorithms for any state of the world; called when they are first needed."""
 
     def forget(self) -> None:
         """Forget what the engine remembers of earlier steps: the state determines what follows."""
@@ -492,11 +492,11 @@ class RobotSimulation(Simulation, Generic[Engine]):
     def forward_dynamics_batch(
         self, positions: Vector, velocities: Vector, torques: Vector, *, processes: int = 1
     ) -> Vector:
-        """Return `forward_dynamics` of many states, shape (n, nv), by Pinocchio's algorithms."""
+        """Return `forward_dynamics` of many states, shape (n, nv)."""
         self._check_open()
         processes = integer("processes", processes, 1)
         q, v, tau = self._checks.rows(positions, velocities=velocities, torques=torques)
-        return self._batches.forward(q, v, tau, processes=processes)
+        return self._algorithms.forward_batch(q, v, tau, processes)
 
     def forward_dynamics_gradients_batch(
         self,
@@ -513,7 +513,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         q, v, a, w = self._checks.rows(
             positions, velocities=velocities, accelerations=accelerations, weights=weights
         )
-        return self._batches.gradients(q, v, a, w, processes=processes)
+        return self._algorithms.gradients_batch(q, v, a, w, processes)
 
     def _checked_state(
         self, positions: Any, velocities: Any, **third: Any
@@ -525,19 +525,9 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return q, check("velocities", velocities), check(name, values)
 
     @property
-    def _batches(self) -> ParallelDynamics:
-        if self._made_batches is None:
-            from physx_dart.batch.processes import ParallelDynamics
-
-            self._made_batches = ParallelDynamics(self._algorithms)
-        return self._made_batches
-
-    @property
     def _algorithms(self) -> Algorithms:
         if self._made_algorithms is None:
-            from physx_dart.shared.algorithms import Algorithms  # its library loads slowly
-
-            self._made_algorithms = Algorithms.of_parts(self.parts)
+            self._made_algorithms = self.make_algorithms()
         return self._made_algorithms
 
     def _check_open(self) -> None:
@@ -550,9 +540,9 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._robots, self._only = (), None
         self._links, self._slices = [], []
         self._hooks.clear()
-        if self._made_batches is not None:
-            self._made_batches.close()
-        self._made_algorithms = self._made_batches = None
+        if self._made_algorithms is not None:
+            self._made_algorithms.close()
+        self._made_algorithms = None
 
 
 def _join(parts: Sequence[Vector]) -> Vector:

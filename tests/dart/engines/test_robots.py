@@ -7,8 +7,8 @@ import pytest
 
 from physx_core import Ground, Robot, World, plugins
 from physx_core.cli import main
+from physx_core.engines import find_robot, named_robots
 from physx_core.errors import ModelError
-from physx_dart.models.robot_files import find_robot, named_robots
 
 OWN = {
     "acrobot": (2, "primitives"),

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
+from physx_core import files
 from physx_core.errors import ModelError
+from physx_core.origin import install_hint
+from physx_core.processes import TemporaryFolder
 from physx_core.typing import Vector
 
 _FORMATS = (".stl", ".obj", ".dae")
@@ -31,8 +33,13 @@ def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
         raise ModelError(f"The mesh {path} is not in one of the formats {', '.join(_FORMATS)}.")
     if path.stat().st_size > _LARGEST:
         raise ModelError(f"The mesh {path} has more than {_LARGEST} bytes: simplify it.")
-    import coal  # only worlds with meshes need it
-
+    try:
+        import coal  # only worlds with meshes need it
+    except ImportError as error:
+        raise ModelError(
+            f"The mesh {path} is read with the package coal, which cannot be imported: {error}. "
+            f"{install_hint('physx-core', 'meshes')}"
+        ) from error
     try:
         with geometry_file(path) as bare:
             mesh = coal.MeshLoader().load(str(bare), np.array(scale, np.float64))
@@ -55,9 +62,10 @@ def geometry_file(path: Path) -> Iterator[Path]:
         return
     content = path.read_bytes().replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
     lines = content.splitlines(keepends=True)
-    with tempfile.TemporaryDirectory() as folder:
-        bare = Path(folder, path.name)
-        bare.write_bytes(b"".join(line for line in lines if line.split(None, 1)[:1] in _GEOMETRY))
+    kept = b"".join(line for line in lines if line.split(None, 1)[:1] in _GEOMETRY)
+    with TemporaryFolder("mesh-") as folder:
+        bare = folder.path / path.name
+        files.replace(bare, kept, wait=False)
         yield bare
 
 

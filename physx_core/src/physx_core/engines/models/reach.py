@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
+from physx_core.engines.models.meshes import read_vertices
+from physx_core.engines.models.parts import Mover
+from physx_core.engines.models.shapes import CollisionShape
 from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
-from physx_dart.models.meshes import read_vertices
-from physx_dart.models.parts import Mover
-from physx_dart.models.shapes import CollisionShape
 
 
 class Reach:
@@ -47,7 +47,8 @@ def _corners(shape: CollisionShape) -> Vector | None:
         return read_vertices(shape.mesh, shape.size)
     if shape.kind == "box":
         signs = np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T
-        return signs * np.array(shape.size)
+        corners: Vector = signs * np.array(shape.size)
+        return corners
     return None
 
 

@@ -1,0 +1,11 @@
+"""What engines of articulated bodies share: models of robots, and the simulation around them.
+
+An engine implements `RobotEngine` for one robot or object, `Algorithms` for a world in any state,
+and `RobotSimulation.advance` for the steps.
+"""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,31 @@
+"""What engines of articulated bodies share: models of robots, and the simulation around them."""
+
+from .algorithms import Algorithms as Algorithms
+from .backend import RobotBackend as RobotBackend
+from .engine import RobotEngine as RobotEngine
+from .engine import base_accelerations as base_accelerations
+from .models.meshes import bounding_box as bounding_box
+from .models.meshes import bounding_capsule as bounding_capsule
+from .models.meshes import geometry_file as geometry_file
+from .models.meshes import read_vertices as read_vertices
+from .models.parts import Mover as Mover
+from .models.parts import Parts as Parts
+from .models.parts import Static as Static
+from .models.parts import layout_of as layout_of
+from .models.parts import read_parts as read_parts
+from .models.parts import static_poses as static_poses
+from .models.robot_files import EXAMPLE_DATA as EXAMPLE_DATA
+from .models.robot_files import OWN_ROBOTS as OWN_ROBOTS
+from .models.robot_files import example_data_dir as example_data_dir
+from .models.robot_files import example_robot as example_robot
+from .models.robot_files import find_robot as find_robot
+from .models.robot_files import named_robots as named_robots
+from .models.shapes import CollisionShape as CollisionShape
+from .models.urdf import Joint as Joint
+from .models.urdf import RobotModel as RobotModel
+from .models.urdf import read_robot as read_robot
+from .resistance import Resistance as Resistance
+from .rk4 import RK4_LACKS as RK4_LACKS
+from .rk4 import check_rk4 as check_rk4
+from .rk4 import rk4_step as rk4_step
+from .robot_simulation import RobotSimulation as RobotSimulation

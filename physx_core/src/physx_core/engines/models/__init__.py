@@ -1,0 +1,1 @@
+"""Robots and objects as engines load them: files, shapes, meshes."""

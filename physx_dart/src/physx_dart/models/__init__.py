@@ -1,1 +1,0 @@
-"""Robots and objects as the engines load them: files, shapes, meshes."""

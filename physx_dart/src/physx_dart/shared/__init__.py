@@ -1,1 +1,0 @@
-"""Models, shapes, algorithms, and the simulation that both engines share."""
