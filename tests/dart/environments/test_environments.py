@@ -238,7 +238,7 @@ def test_without_the_robots_the_arm_names_the_package_to_install(monkeypatch):
         raise importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(importlib.metadata, "distribution", missing)
-    with pytest.raises(ModelError, match=r'pip install .*physx.dart\[robots\]"'):
+    with pytest.raises(ModelError, match=r'pip install .*physx.core\[robots\]"'):
         DartArm().create()
 
 
