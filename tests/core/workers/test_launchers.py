@@ -67,6 +67,49 @@ class CommandLauncher(Launcher):
         )
 
 
+class FarLauncher(CommandLauncher):
+    """Starts clients that reach this machine at another address than the loopback one."""
+
+    elsewhere = True
+
+    def open(self):
+        return "127.0.0.2"
+
+    def launch(self, instances, address, token):
+        (self.notes / "address").write_text(address)
+        return super().launch(instances, address, token)
+
+    def close(self):
+        ended = [(self.notes / f"{number}.out").read_text() for number in (1, 2)]
+        (self.notes / "closed").write_text("".join(text.splitlines()[-1] for text in ended))
+
+
+class IdleHandle(ClientHandle):
+    """A client that waits for something forever."""
+
+    def __init__(self, instance_id):
+        self.instance_id, self.over = instance_id, False
+
+    def exit_status(self):
+        return 1 if self.over else None
+
+    def terminate(self):
+        self.over = True
+
+    def kill(self):
+        self.over = True
+
+    def state(self):
+        return "pending (Resources)"
+
+
+class IdleLauncher(Launcher):
+    """Starts clients that never come."""
+
+    def launch(self, instances, address, token):
+        return [IdleHandle(number) for number in instances]
+
+
 class ForgetfulLauncher(Launcher):
     """Returns no handles, but does not say that people start the clients."""
 
@@ -117,6 +160,22 @@ def test_a_launcher_of_ones_own_starts_a_client_again(clients, notes):
         assert source.batch(20)["step"].tolist() == [step // 2 for step in range(20)]
     launches = [file.read_text() for file in sorted(notes.glob("*.launch"))]
     assert launches == ["[1, 2]", "[2]"]
+
+
+@pytest.mark.parametrize("ip_address", ["127.0.0.1", "127.0.0.2", "0.0.0.0"])
+def test_the_server_listens_where_clients_elsewhere_reach_it(clients, notes, ip_address):
+    settings = {"launcher": FarLauncher, "launcher_kwargs": {"notes": str(notes)}}
+    with clients(num_clients=2, ip_address=ip_address, **settings) as source:
+        assert source.batch(2)["env_id"].tolist() == [1, 2]
+        assert (notes / "address").read_text().startswith("127.0.0.2:")
+        assert not (notes / "closed").exists()
+    assert (notes / "closed").read_text().count("the run has ended") == 2
+
+
+def test_the_run_says_what_an_absent_client_waits_for(clients):
+    error = r"(?s)did not connect for 0\.5 s while the server waited for it: pending \(Resources\)"
+    with pytest.raises(ClientError, match=error), clients(launcher=IdleLauncher, timeout=0.5):
+        pass
 
 
 def test_a_launcher_that_forgets_its_handles_is_named(clients):

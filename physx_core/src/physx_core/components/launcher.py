@@ -34,6 +34,10 @@ class ClientHandle(ABC):
         """Return the last lines of the client's standard error, for messages."""
         return ""
 
+    def state(self) -> str:
+        """Return what a client that has not connected waits for, for messages; empty: unknown."""
+        return ""
+
     def wait(self, until: float) -> bool:
         """Wait for the client to end; return whether it did before `until`, in monotonic s."""
         while self.exit_status() is None:
@@ -54,9 +58,28 @@ class Launcher(ABC):
     Attributes:
         by_hand: Whether the user starts the clients. Then the token is one that the user knows, and
             clients may leave and be replaced at any time.
+        elsewhere: Whether clients may run on other machines, to which the launcher brings the
+            token. Then the server listens at the address that `open` returns, unless
+            `EnvironmentConfig.ip_address` is another one than the loopback address.
     """
 
     by_hand: bool = False
+    elsewhere: bool = False
+
+    def open(self) -> str | None:
+        """Reach what starts the clients; called once, before the server listens.
+
+        Returns:
+            Address of this machine at which clients can reach the server; None: any that the
+            configuration says.
+
+        Raises:
+            ConfigError: If it cannot be reached.
+        """
+        return None
+
+    def close(self) -> None:
+        """End everything that the launcher started; called after the clients have ended."""
 
     @abstractmethod
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
@@ -67,7 +90,7 @@ class Launcher(ABC):
         Args:
             instances: Numbers of the instances, from 1.
             address: ``HOST:PORT`` of the server. If the server listens at all addresses of its
-                machine, the host is the loopback address: clients elsewhere need the machine's own.
+                machine, the host is the one that `open` returned, or else the loopback address.
             token: Secret of the run.
 
         Returns:

@@ -50,12 +50,13 @@ def check_token(token: str, place: str) -> str:
     return token
 
 
-def choose_token(config: EnvironmentConfig, by_hand: bool) -> str:
+def choose_token(config: EnvironmentConfig, by_hand: bool, elsewhere: bool = False) -> str:
     """Return the token of a run: the one that the user gave, or a random one.
 
     Args:
         config: Where the server listens, and the file with the token, if there is one.
         by_hand: Whether clients are started by hand, by somebody who has to know the token.
+        elsewhere: Whether clients are started on other machines, and get the token there.
     """
     token = find_token(config.token_file)
     if token is not None:
@@ -67,7 +68,7 @@ def choose_token(config: EnvironmentConfig, by_hand: bool) -> str:
     )
     if by_hand:
         raise ConfigError(f"Clients that are started by hand need a secret: {how}")
-    if not _is_loopback(config.ip_address):
+    if not (elsewhere or is_loopback(config.ip_address)):
         raise ConfigError(
             f"Others can reach the server at {config.ip_address}, so its clients need a secret: "
             f"{how}"
@@ -90,7 +91,7 @@ def _read(token_file: str) -> str:
     return text.strip()
 
 
-def _is_loopback(host: str) -> bool:
+def is_loopback(host: str) -> bool:
     """Return whether only its own machine can reach a server at this address."""
     try:
         found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)

@@ -57,7 +57,8 @@ def timeout_error(
         handle: Its process; None if it was started by hand.
         timeout: How long the server waited, in s.
     """
-    waited = f"for {timeout:g} s while the server waited for it"
+    state = "" if handle is None else handle.state()
+    waited = f"for {timeout:g} s while the server waited for it" + (state and f": {state}")
     if peer is None:
         how = f"did not connect {waited}. If its start takes"
     elif peer.vacant:

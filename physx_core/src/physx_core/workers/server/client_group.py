@@ -21,8 +21,9 @@ from physx_core.errors import (
     PhysxError,
     ProgramError,
 )
+from physx_core.net.addresses import format_address, parse_address
 from physx_core.net.handshake import TOKEN_VARIABLE
-from physx_core.net.tokens import choose_token
+from physx_core.net.tokens import choose_token, is_loopback
 from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate
@@ -33,6 +34,7 @@ from physx_core.workers.server.client_errors import exit_error, timeout_error
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.server import Server
 
+_ALL = ("", "0.0.0.0", "::")  # all addresses of this machine
 _TICK = 0.1
 _GRACE = 1.0
 _EXIT_TIME = 5.0
@@ -79,13 +81,14 @@ class ClientGroup:
         self._restarts: Counter[int] = Counter()
         self._checked = self._served = self._said = 0.0
         self._closing = False
+        self._host: str | None = None
         self.server = Server(
             config.ip_address,
             config.port,
             config.num_clients,
             services,
             self._encode_setup,
-            choose_token(config, self._launcher.by_hand),
+            choose_token(config, self._launcher.by_hand, self._launcher.elsewhere),
             sets,
             self._replaces,
             skip,
@@ -94,7 +97,8 @@ class ClientGroup:
     def open(self) -> None:
         """Start the clients and wait until their environments are ready."""
         self._encode(1)  # an argument that cannot be sent is an error before anything is started
-        self.server.open()
+        self._host = self._launcher.open()
+        self.server.open(self._host if is_loopback(self.config.ip_address) else None)
         numbers = list(self._numbers)
         self._launch(numbers)
         if self._launcher.by_hand:
@@ -155,6 +159,7 @@ class ClientGroup:
             stop(self._handles.values(), patience)
             self._handles = {}
             self.server.close()
+            self._launcher.close()
 
     @property
     def _numbers(self) -> range:
@@ -162,7 +167,7 @@ class ClientGroup:
 
     def _launch(self, numbers: Sequence[int]) -> None:
         now = time.monotonic()
-        started = self._launcher.launch(numbers, self.server.address, self.server.token)
+        started = self._launcher.launch(numbers, self._address(), self.server.token)
         handles = {handle.instance_id: handle for handle in started}
         self._handles.update(handles)
         self._launched.update(dict.fromkeys(numbers, now))
@@ -174,10 +179,16 @@ class ClientGroup:
                 "for it. A launcher that starts nothing says by_hand = True.",
             )
 
+    def _address(self) -> str:
+        """Return ``HOST:PORT`` as the clients that the launcher starts reach it."""
+        if self._host is None or self.config.ip_address not in _ALL:
+            return self.server.address
+        return format_address(self._host, parse_address(self.server.address)[1])
+
     def _public_address(self) -> str:
         """Return ``HOST:PORT`` as other machines reach it."""
-        if self.config.ip_address not in ("", "0.0.0.0", "::"):
-            return self.server.address
+        if self._host is not None or self.config.ip_address not in _ALL:
+            return self._address()
         return f"{socket.gethostname()}:{self.server.address.rpartition(':')[2]}"
 
     def _serve(self, timeout: float) -> None:
@@ -332,13 +343,21 @@ class ClientGroup:
         if absent:
             self._said = now
             _LOG.warning(
-                "The run waits for a client to run instance %s, since %.0f s, at %s. "
+                "The run waits for a client to run instance %s, since %.0f s, at %s%s. "
                 "It waits no longer than %g s.",
                 ", ".join(map(str, absent)),
                 max(times[number] for number in absent),
                 self._public_address(),
+                self._describe_states(absent),
                 self.config.timeout,
             )
+
+    def _describe_states(self, numbers: Sequence[int]) -> str:
+        """Return what absent clients wait for, as far as their launcher knows."""
+        handles = (self._handles.get(number) for number in numbers)
+        found = Counter(handle.state() for handle in handles if handle is not None)
+        del found[""]
+        return "".join(f"; {count} of them: {state}" for state, count in found.items())
 
     def _heard(self, number: int) -> float:
         peer = self.server.peers.get(number)

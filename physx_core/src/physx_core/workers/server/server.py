@@ -100,13 +100,14 @@ class Server:
             **dict.fromkeys(_REQUESTS, self._requests.take),
         }
 
-    def open(self) -> None:
-        """Start to listen."""
+    def open(self, host: str | None = None) -> None:
+        """Start to listen, at another address than that of the constructor if one is given."""
+        host = host or self._ip_address
         try:
-            self._listener.listen(self._ip_address, self._port)
+            self._listener.listen(host, self._port)
         except OSError as error:
             raise ConfigError(
-                f"The server cannot listen at {self._ip_address} port {self._port}: {error}. "
+                f"The server cannot listen at {host} port {self._port}: {error}. "
                 "Choose EnvironmentConfig.port=0 for any free port, or an ip_address of this "
                 "machine; ports below 1024 need privileges, and another run may use this one."
             ) from error
