@@ -78,7 +78,7 @@ class Launcher(ABC):
         """
         return None
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - most have nothing to end
         """End everything that the launcher started; called after the clients have ended."""
 
     @abstractmethod
