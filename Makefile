@@ -1,6 +1,7 @@
 # make demo    install into .venv and run the main job: examples/arm_dynamics
 # make test    install into .venv and run the tests; PYTEST_ARGS are handed on
 # make lint    ruff, mypy and import-linter
+# make docs    build the site: docs/_build/docs/index.html
 # make bench   print the measured ratios of benchmarks/
 # make clean   remove .venv and everything that was built
 
@@ -11,7 +12,7 @@ BIN := .venv/bin
 PACKAGES := -e ./physx_core -e "./physx_dart[robots]" -e ./physx_torch -e ./physx_rerun -e ./physx_gym -e ./physx_remote -e ./physx_cluster
 PROJECTS := $(wildcard physx_*/pyproject.toml) constraints.txt
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint docs bench clean
 
 demo: .venv/packages
 	$(BIN)/python examples/arm_dynamics/run.py $(DEMO_ARGS)
@@ -24,6 +25,10 @@ lint: .venv/tools
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: .venv/tools
+	$(BIN)/python -m sphinx -q -W --keep-going -b html -c docs . docs/_build
+	@echo docs/_build/docs/index.html
 
 bench: .venv/packages
 	$(BIN)/python benchmarks/generation.py
@@ -43,7 +48,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/viewer.py
 
 clean:
-	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf docs/_build .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +
 
 .venv/packages: $(PROJECTS)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 __all__ = ["Array", "Batch", "Color", "Records", "Sample", "Tensors", "Vector"]
 
 Array: TypeAlias = NDArray[Any]
+"""An array of any shape and type of number."""
 Sample: TypeAlias = dict[str, Array]
 """One step: field name to array of the field's shape."""
 Batch: TypeAlias = dict[str, Array]
@@ -18,6 +19,7 @@ Batch: TypeAlias = dict[str, Array]
 Tensors: TypeAlias = dict[str, Any]
 """Field name to a tensor of the network's library, with a leading sample axis."""
 Vector: TypeAlias = NDArray[np.float64]
+"""An array of float64, for example positions, shape (nq,)."""
 Index: TypeAlias = NDArray[np.intp]
 """Numbers of rows."""
 Records: TypeAlias = NDArray[np.void]

@@ -42,9 +42,12 @@ class DataGeneration(NewSessionPipeline):
     """
 
     environment_config: EnvironmentConfig
+    """The environment, and where its instances run."""
     dataset_config: DatasetConfig | None = None
+    """How the samples are stored; None: `DatasetConfig()`."""
     _: KW_ONLY
     session_name: str = "data_generation"
+    """Name of the new session."""
     batch_nb: int = at_least(1)
     """Number of batches to generate."""
     batch_size: int = at_least(1)

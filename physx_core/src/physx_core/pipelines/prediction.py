@@ -61,8 +61,11 @@ class Prediction(Pipeline):
     """
 
     network_config: NetworkConfig
+    """The network; `NetworkConfig()` takes everything from the session's checkpoint."""
     environment_config: EnvironmentConfig
+    """The environment, and where its instances run."""
     dataset_config: DatasetConfig | None = None
+    """The stored samples that are replayed, and how samples are recorded; None: the session's."""
     _: KW_ONLY
     session_name: str = "training"
     """Name of the session whose network predicts."""

@@ -47,10 +47,12 @@ class Replay(NewSessionPipeline):
     """
 
     dataset_config: DatasetConfig
+    """The stored samples: ``existing_dir`` is required."""
     environment_config: EnvironmentConfig | None = None
     """The environment; None: the one that the dataset was generated with."""
     _: KW_ONLY
     session_name: str = "replay"
+    """Name of the new session."""
     step_nb: int | None = at_least(-1, None)
     """Number of steps, starting over after the last sample; None: until each sample was shown once;
     -1: until Ctrl-C."""

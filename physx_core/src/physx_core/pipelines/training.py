@@ -91,8 +91,11 @@ class Training(NewSessionPipeline):
     """
 
     network_config: NetworkConfig
+    """The network, its transformation and its optimization."""
     dataset_config: DatasetConfig | None = None
+    """The stored samples, and how they are read; None: those of the session itself."""
     environment_config: EnvironmentConfig | None = None
+    """The environment that generates samples, or replays stored ones; None: no environment."""
     _: KW_ONLY
     epoch_nb: int = at_least(1)
     """Number of epochs."""

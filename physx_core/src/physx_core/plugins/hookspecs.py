@@ -20,11 +20,14 @@ import pluggy
 from physx_core.plugins.entries import PLUGINS
 
 Components = dict[str, type[Any] | Callable[..., Any] | str]
+"""What a hook returns: name to class, to a function that makes the component, or to its reference
+``"package.module:Class"``, which is imported when it is requested."""
 
 _NAME = r"\w[\w.-]*"
 
 hookspec = pluggy.HookspecMarker(PLUGINS)
 hookimpl = pluggy.HookimplMarker(PLUGINS)
+"""Marks a function of a plugin as the implementation of the hook of its name."""
 
 KINDS = {
     "environment": "physx_environments",

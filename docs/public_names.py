@@ -1,0 +1,177 @@
+"""The public names of all packages, and whether each is documented: what the reference shows."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import importlib
+import inspect
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import FunctionType, ModuleType
+from typing import Any
+
+from sphinx.pycode import ModuleAnalyzer
+
+# The faces, in the reference's order: a name is described where it comes first.
+FACES = {
+    "physx_core": (
+        "",
+        *("components", "config", "dataset", "pipelines", "plugins", "simulation", "rotations"),
+        *("errors", "fields", "typing", "testing", "checks", "parsing", "rows", "sources"),
+        *("workers", "net", "processes", "files", "origin", "cli"),
+    ),
+    "physx_dart": ("",),
+    "physx_torch": ("",),
+    "physx_rerun": ("",),
+    "physx_gym": (
+        "",
+        *("blocks", "tasks.quantities", "tasks.rewards", "tasks.terminations"),
+        "tasks.randomizations",
+    ),
+    "physx_remote": ("",),
+    "physx_cluster": ("",),
+}
+MODULES = [f"{root}.{name}".rstrip(".") for root, names in FACES.items() for name in names]
+
+
+@dataclass(frozen=True)
+class Name:
+    """A public name.
+
+    Attributes:
+        module: The face that offers it.
+        name: The name.
+        value: What it is.
+        home: The module that defines it.
+    """
+
+    module: str
+    name: str
+    value: Any
+    home: str
+
+    @property
+    def kind(self) -> str:
+        """The directive of autodoc that describes it."""
+        if inspect.isclass(self.value):
+            return "exception" if issubclass(self.value, BaseException) else "class"
+        if isinstance(self.value, FunctionType):
+            return "function"
+        return "module" if isinstance(self.value, ModuleType) else "data"
+
+    @property
+    def text(self) -> str:
+        """What is written about a constant or a type below its definition."""
+        found: dict[tuple[str, str], list[str]] = ModuleAnalyzer.for_module(
+            self.home
+        ).find_attr_docs()
+        return "\n".join(found.get(("", self.name), []))
+
+
+@cache
+def names_of(module: str) -> tuple[Name, ...]:
+    """Return the names that a face offers."""
+    face = importlib.import_module(module)
+    listed = getattr(face, "__all__", None)
+    if listed is None:
+        listed = [
+            name
+            for name, value in vars(face).items()
+            if not name.startswith("_") and getattr(value, "__module__", None) == module
+        ]
+    return tuple(
+        Name(module, name, value, home(module, name, value))
+        for name in listed
+        if not name.startswith("_") and not isinstance(value := getattr(face, name), ModuleType)
+    )
+
+
+def home(module: str, name: str, value: Any) -> str:
+    """Return the name of the module that defines what a face offers."""
+    if inspect.isclass(value) or isinstance(value, FunctionType):
+        return str(value.__module__)
+    face = importlib.import_module(module)
+    path = Path(str(face.__file__))
+    for source in (path.with_suffix(".pyi"), path):
+        if not source.is_file():
+            continue
+        for node in ast.parse(source.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ImportFrom) and name in {
+                each.asname or each.name for each in node.names
+            }:
+                inner = f"{module}.{node.module}" if node.level else str(node.module)
+                return home(inner, name, value)
+    return module
+
+
+def described() -> Iterator[Name]:
+    """Return all public names, each where it is described: in the first face that offers it."""
+    seen: set[tuple[str, str]] = set()
+    for module in MODULES:
+        for each in names_of(module):
+            if (key := (each.home, each.name)) not in seen:
+                seen.add(key)
+                yield each
+
+
+def reference(module: str) -> str:
+    """Return the description of a face as reStructuredText with autodoc's directives."""
+    here = [each for each in described() if each.module == module]
+    others = sorted({each.name for each in names_of(module)} - {each.name for each in here})
+    lines = [f".. automodule:: {module}", "   :no-members:", ""]
+    for each in here:
+        if each.kind == "data":
+            lines += [f".. py:data:: {module}.{each.name}", ""]
+            lines += [f"   {escaped(line)}" for line in each.text.splitlines()] + [""]
+            continue
+        lines += [f".. auto{each.kind}:: {module}.{each.name}"]
+        if each.kind != "function":
+            lines += ["   :members:", "   :show-inheritance:"]
+        lines += [""]
+    if others:
+        lines += ["Described above: " + ", ".join(f"``{name}``" for name in others) + ".", ""]
+    return "\n".join(lines)
+
+
+def escaped(line: str) -> str:
+    """Return a line of a docstring in which (samples, *shape) and np.bool_ mean themselves."""
+    if line.startswith(":vartype"):
+        return line.replace("_]", r"\_]")
+    return re.sub(r"(?<![*`\w])\*(?=\w)", r"\*", line)
+
+
+def undocumented() -> list[str]:
+    """Return what has no text: modules, names, methods, properties, fields of dataclasses."""
+    missing = [name for name in MODULES if not inspect.getdoc(importlib.import_module(name))]
+    for each in described():
+        name = f"{each.home}.{each.name}"
+        if each.kind == "data":
+            missing += [] if each.text else [name]
+        elif not (each.value.__doc__ or "").replace(f"{each.name}(", "", 1).strip():
+            missing.append(name)
+        elif inspect.isclass(each.value):
+            missing += [f"{name}.{member}" for member in _silent_members(each.value, each.home)]
+    return missing
+
+
+def _silent_members(kind: type, module: str) -> Iterator[str]:
+    for name, value in vars(kind).items():
+        if name.startswith("_"):
+            continue
+        function = getattr(value, "__func__", value)
+        if isinstance(function, FunctionType | property) and not inspect.getdoc(
+            getattr(kind, name)
+        ):
+            yield name
+    if dataclasses.is_dataclass(kind):
+        below = ModuleAnalyzer.for_module(module).find_attr_docs()
+        text = "\n".join(base.__doc__ or "" for base in kind.__mro__)
+        own = vars(kind).get("__annotations__", {})
+        for name in [each.name for each in dataclasses.fields(kind) if each.name in own]:
+            told = (kind.__qualname__, name) in below
+            if not (told or name.startswith("_") or re.search(rf"^\s+{name}:", text, re.MULTILINE)):
+                yield name

@@ -1,0 +1,110 @@
+"""README.md and the pages in docs/: their code runs, and what they claim to be complete is."""
+
+import re
+
+import public_names
+import pytest
+import run_pages
+
+from physx_core import checkpoint
+
+pytestmark = pytest.mark.slow
+
+pytest.importorskip("torch")
+
+
+@pytest.mark.parametrize(
+    "page", run_pages.PAGES, ids=[str(page.relative_to(run_pages.ROOT)) for page in run_pages.PAGES]
+)
+def test_the_code_of_a_page_runs(page, tmp_path):
+    run_pages.run(page, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("```python\n1 / 0\n```", "line 1: .*ZeroDivisionError"),
+        ("```sh\nfalse\necho\n```", "exit status 1"),
+        ("<!-- fails -->\n```sh\ntrue\n```", "exit status 0"),
+        ("```console\n$ echo one\ntwo\n```", "prints\none\n\nand not\ntwo"),
+        ("```\nphysx info\n```", "commands are sh or console"),
+        ("```c\nmain(){}\n```", "c is not run"),
+        ("<!-- file: a.py -->\n```python\n1\n```", "names a.py"),
+        ("<!-- tested by tests/none.py -->\n```sh\nrm\n```", "does not exist"),
+        ("<!-- tested by tests/conftest.py::test_no -->\n```sh\nrm\n```", "has no test_no"),
+    ],
+)
+def test_a_page_that_says_what_is_not_so(text, error, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_pages, "ROOT", tmp_path)
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests/conftest.py").touch()
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "page.md").write_text(text)
+    with pytest.raises(run_pages.PageError, match=f"(?s){error}"):
+        run_pages.run(tmp_path / "page.md", tmp_path / "folder")
+
+
+def test_blocks_of_all_kinds(tmp_path, monkeypatch):
+    monkeypatch.setattr(run_pages, "ROOT", tmp_path)
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "page.md").write_text(
+        "<!-- file: a.txt -->\n```toml\none = 1\n```\n"
+        "<!-- file: a.txt -->\n```toml\ntwo = 2\n```\n"
+        "```python\nx = open('a.txt').read()\n```\n\n```python\nopen('b.txt', 'w').write(x)\n```\n"
+        "```console\n$ cat b.txt\none...\ntwo = 2\n$ echo \\\n  end\nend\n```\n"
+        "<!-- not run: not ours -->\n```sh\nfalse\n```\n```text\n1\n```\n```{note}\nmore\n```\n"
+    )
+    assert run_pages.run(tmp_path / "page.md", tmp_path / "folder") == 5
+
+
+@pytest.mark.parametrize(
+    ("page", "field", "network"),
+    [("README.md", "state", "pendulum_network"), ("docs/migration.md", "input", "training")],
+)
+def test_a_new_user_starts_the_program_three_times(page, field, network, root, run, tmp_path):
+    """The first time with a mistake, the last time with another simulation."""
+    script, sessions = tmp_path / "pendulum.py", tmp_path / "sessions"
+    [code] = [each.text for each in run_pages.read(root / page) if each.file == "pendulum.py"]
+    code = re.sub("batch_nb=[0-9]+, batch_size=[0-9]+", "batch_nb=4, batch_size=25", code)
+    code = re.sub("epoch_nb=[0-9]+", "epoch_nb=1", code)
+
+    def learned(run_name):
+        """Mean of what the network was trained on."""
+        found = checkpoint.find(sessions / run_name, None, -1)
+        return found.normalization[field].mean[0]
+
+    script.write_text(code.replace(f"{field}=before", f"{field}s=before"))
+    failed = run(script, ok=False).stderr
+    assert f'Did you mean "{field}"?' in failed
+    assert "session: sessions/pendulum is removed, as the run kept nothing in it" in failed
+    assert list(sessions.iterdir()) == []
+
+    script.write_text(code)
+    said = run(script).stderr
+    assert "session: sessions/pendulum\n" in said and f"session: sessions/{network}\n" in said
+    assert said.count("samples: 100 training in sessions/pendulum/dataset") == 2
+    assert f"checkpoint: sessions/{network}/network/network_0" in said
+    assert abs(learned(network)) < 10
+
+    script.write_text(code.replace("self.rng.uniform(", "100 + self.rng.uniform("))
+    said = run(script).stderr
+    assert 'session: sessions/pendulum_1 ("pendulum" exists)' in said
+    assert f'session: sessions/{network}_1 ("{network}" exists)' in said
+    assert said.count("samples: 100 training in sessions/pendulum_1/dataset") == 2
+    assert learned(f"{network}_1") > 50
+
+
+def test_every_public_name_is_documented():
+    assert public_names.undocumented() == []
+
+
+def test_the_reference_shows_every_face(root):
+    pages = [root / f"docs/reference/{name}.md" for name in public_names.FACES]
+    shown = "".join(page.read_text() for page in pages)
+    assert re.findall(r"^\.\. face:: ([\w.]+)$", shown, re.MULTILINE) == public_names.MODULES
+    text = (root / "docs/architecture.md").read_text()
+    paragraph = re.sub(r"\s+", " ", text.split("**Faces.**")[1].split("\n\n")[0])
+    for name in re.findall(r"`(?:physx_core)?\.(\w+)`", paragraph.split("Everything below")[0]):
+        assert f"physx_core.{name}" in public_names.MODULES
+    packages = {path.parent.name for path in root.glob("physx_*/pyproject.toml")}
+    assert set(public_names.FACES) == packages
