@@ -1,0 +1,67 @@
+"""Agent: starts and follows the clients of a run on one node of a Ray cluster."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+
+from physx_core.workers import ClientProcess
+
+
+class Agent:
+    """An actor of Ray; its clients are child processes, which end with it, however it ends.
+
+    All methods are coroutines, so Ray runs any number of their calls at a time, in one thread.
+    """
+
+    def __init__(self) -> None:
+        """Start without clients."""
+        self._clients: dict[int, ClientProcess] = {}
+
+    async def answer(self) -> None:
+        """Do nothing, but answer."""
+
+    async def start(self, instance: int, address: str, token: str) -> None:
+        """Start the client of an instance.
+
+        Args:
+            instance: Number of the instance, from 1.
+            address: ``HOST:PORT`` of the run's server.
+            token: Secret of the run; the client gets it in its environment.
+        """
+        client = ClientProcess(instance, address, token)
+        client.start()
+        self._clients[instance] = client
+
+    async def follow(self, instance: int) -> tuple[int, str]:
+        """Wait for the end of a client.
+
+        Returns:
+            Its exit status, negative for a signal, and the last lines of its standard error.
+        """
+        client = self._clients[instance]
+        with contextlib.suppress(ProcessLookupError):
+            await _ends(client)
+        while (status := client.exit_status()) is None:  # not yet waited for
+            await asyncio.sleep(0.01)
+        return status, client.stderr()
+
+    async def signal(self, instance: int, number: int) -> None:
+        """Ask a client and its processes to end, or kill them."""
+        client = self._clients[instance]
+        client.kill() if number == signal.SIGKILL else client.terminate()
+
+
+async def _ends(client: ClientProcess) -> None:
+    """Wait for the end of a process without looking at it again and again."""
+    loop = asyncio.get_running_loop()
+    over = asyncio.Event()
+    descriptor = os.pidfd_open(client.pid or 0)
+    loop.add_reader(descriptor, over.set)
+    try:
+        await over.wait()
+    finally:
+        loop.remove_reader(descriptor)
+        os.close(descriptor)

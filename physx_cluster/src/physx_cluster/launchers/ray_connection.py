@@ -1,0 +1,92 @@
+"""Connection to a Ray cluster: one that runs, or one that is started here for this process."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from typing import Any
+
+import ray
+from ray import exceptions as ray_errors
+
+from physx_cluster.placement.address import address_towards
+from physx_core.errors import ConfigError
+
+_FAILURES = (ray_errors.RayError, ConnectionError, RuntimeError, ValueError, OSError, TimeoutError)
+_ADDRESS = "RAY_ADDRESS"
+
+
+class RayConnection:
+    """This process as a driver of Ray.
+
+    Attributes:
+        host: Address of this machine that all nodes reach; None: all nodes are on this machine.
+    """
+
+    def __init__(self, address: str | None) -> None:
+        """Connect, unless this process is connected already.
+
+        Args:
+            address: ``HOST:PORT`` of Ray's head node, "auto" for the one that runs here, "local" to
+                start one; None: the environment variable ``RAY_ADDRESS``, or else the one that runs
+                here, or else one that is started and ends with the run.
+
+        Raises:
+            ConfigError: If there is no such cluster.
+        """
+        self._is_own = not ray.is_initialized()
+        self.host: str | None = None
+        if self._is_own:
+            _silence()
+            self._connect(address or os.environ.get(_ADDRESS))
+        context = ray.get_runtime_context()
+        if self._is_own and self._is_local:
+            return
+        self.host = address_towards(context.gcs_address.rpartition(":")[0])
+
+    def nodes(self) -> list[dict[str, float]]:
+        """Return the resources of each node that is alive."""
+        return [dict(node["Resources"]) for node in ray.nodes() if node["Alive"]]
+
+    def close(self) -> None:
+        """Disconnect, and end the cluster if it was started here."""
+        if self._is_own and ray.is_initialized():
+            ray.shutdown()
+
+    def _connect(self, address: str | None) -> None:
+        self._is_local = address == "local"
+        if address is not None and address.startswith("ray://"):
+            raise ConfigError(
+                f"{address} is the address of a Ray client, which only passes on calls. Start the "
+                'run on a node of the cluster, with launcher_kwargs={"address": "auto"}.'
+            )
+        try:
+            if address is None:
+                try:
+                    _init("auto")
+                except ConnectionError:
+                    self._is_local = True
+                    _init("local")
+            else:
+                _init(address)
+        except _FAILURES as error:
+            reason = " ".join(str(error).split())
+            raise ConfigError(
+                f"Ray does not answer at {address or 'this machine'}: {reason} Start it with "
+                '"ray start --head" on one node and "ray start --address HOST:6379" on the others, '
+                f"this one too; or leave out the address and {_ADDRESS}, and the run starts a Ray "
+                "of its own."
+            ) from error
+
+
+def _init(address: str) -> None:
+    options: dict[str, Any] = {} if address != "local" else {"include_dashboard": False}
+    ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **options)
+
+
+def _silence() -> None:
+    """Keep Ray from printing what its daemons log, which it has no option for."""
+    worker: Any = sys.modules["ray._private.worker"]
+    if hasattr(worker, "print_to_stdstream"):
+        worker.print_to_stdstream = lambda *arguments, **options: None

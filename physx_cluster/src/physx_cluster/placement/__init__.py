@@ -1,0 +1,1 @@
+"""Where clients run, and where they reach the run's server."""
