@@ -155,6 +155,13 @@ class EnvironmentConfig:
     """Run each instance in a process of its own; otherwise all in this process."""
     num_clients: int = at_least(1, 1)
     """Number of instances. The same seed and number generate the same samples, in any process."""
+    min_clients: int | None = at_least(1, None)
+    """Makes the run elastic: clients may join and leave while it runs, and each runs several
+    instances if there are fewer of them. It begins with this many and waits when there are fewer.
+    None: 1 if `max_clients` is set; otherwise each instance has a client of its own."""
+    max_clients: int | None = at_least(1, None)
+    """Makes the run elastic: at most this many clients run it. None: as many as `num_clients`, or
+    `min_clients` if that is more."""
     ip_address: str = "127.0.0.1"
     """Address of the server."""
     port: int = field(default=0, metadata={"minimum": 0, "maximum": 65535})
@@ -204,6 +211,11 @@ class EnvironmentConfig:
     token_file: str | None = None
     """File with the secret token of the clients, readable by its owner only; None: the environment
     variable PHYSX_TOKEN, or else a random token for clients that are started here."""
+
+    @property
+    def is_elastic(self) -> bool:
+        """Whether clients may join and leave during a run."""
+        return self.min_clients is not None or self.max_clients is not None
 
 
 @configuration

@@ -88,7 +88,8 @@ class Launcher(ABC):
         Called again, with a single instance, to restart a client.
 
         Args:
-            instances: Numbers of the instances, from 1.
+            instances: Numbers of the instances, from 1. In an elastic run those of the clients,
+                which are as many as `EnvironmentConfig.max_clients`; some may come later or never.
             address: ``HOST:PORT`` of the server. If the server listens at all addresses of its
                 machine, the host is the one that `open` returned, or else the loopback address.
             token: Secret of the run.

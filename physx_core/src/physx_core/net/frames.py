@@ -29,7 +29,7 @@ class Kind(enum.IntEnum):
     CHALLENGE = 2
     """Server: magic, version, challenge, proof."""
     PROOF = 3
-    """Client: proof [number of the instance to run, 0: any]."""
+    """Client: proof [number of the instance to run or ticket for it, 0: any]."""
     SETUP = 4
     """Server: the arguments of the instance."""
     READY = 5
@@ -57,7 +57,7 @@ class Kind(enum.IntEnum):
     ERROR = 16
     """Either: an error that ends the client [row that could not be made, 0: no row]."""
     CLOSE = 17
-    """Server: order to close the environment and exit."""
+    """Server: order to close the environment and exit [for HOST: time for it, in ms]."""
     BYE = 18
     """Client: the environment is closed."""
     STORED = 19
@@ -78,6 +78,16 @@ class Kind(enum.IntEnum):
     """Client, before READY: the parameters that its environment defines, if any."""
     CHOOSE = 27
     """Client: request for the parameters of an episode [number of the request]."""
+    HOST = 28
+    """Server: run workers as told, not an instance of its own. Client: the name of its machine."""
+    START = 29
+    """Server: start a worker [its ticket]."""
+    STOP = 30
+    """Server: end a worker; at once if the payload is not empty [its ticket]."""
+    ENDED = 31
+    """Client: exit status and last words of a worker that ended [its ticket]."""
+    PING = 32
+    """Server: are you there? Client: the same back."""
 
 
 _KINDS = {int(kind): kind for kind in Kind}

@@ -70,7 +70,7 @@ class ClientSource(Source):
         self.instance_nb = config.num_clients
         self.sets = ParameterSets(config, seed, skip)
         self._group = ClientGroup(
-            config, services, seed, self.sets, accept_all=accept_all, skip=skip
+            config, services, seed, self.sets, accept_all=accept_all, skip=skip, total=total
         )
         self._rejections = 0
         if config.record_wrong_samples:
@@ -243,6 +243,7 @@ class ClientSource(Source):
                 peer.granted = allowed
                 peer.rejected_limit = allowed * self._rejections
                 peer.send(pack(Kind.CREDIT, number=allowed))
+                peer.pace.go_on()
 
     def _without_table(self) -> list[int]:
         """Return the first instance until its fields are known; it generates the first row."""

@@ -10,7 +10,7 @@ from typing import Any
 
 from physx_core.components.environment import Services
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import PhysxError, UsageError
+from physx_core.errors import ConfigError, PhysxError, UsageError
 from physx_core.fields import Field
 from physx_core.rows import ROW_FIELDS, RowBuffer, concatenate, copy_row, infer_shapes
 from physx_core.sources.source import Source, check_stored
@@ -42,6 +42,12 @@ class LocalSource(Source):
             accept_all: Whether samples that `check_sample` rejects count like the others.
             skip: The rows that an earlier run has had: they are generated again, but not returned.
         """
+        if config.is_elastic:
+            raise ConfigError(
+                "EnvironmentConfig.min_clients and max_clients are for clients, but the "
+                "environment runs in this process, because of as_tcp_ip_client=False "
+                "or as the only one of a prediction: leave them out."
+            )
         self.instance_nb = config.num_clients
         self._services = services
         self._config = config

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from physx_core.components.launcher import ClientHandle, Launcher
@@ -34,6 +35,7 @@ class ClientProcess(ClientHandle):
         address: str,
         token: str,
         core: int | None = None,
+        ticket: int | None = None,
     ) -> None:
         """Keep the arguments of the process.
 
@@ -42,12 +44,14 @@ class ClientProcess(ClientHandle):
             address: The server's ``HOST:PORT``.
             token: Token of the run.
             core: The only processor core that it may use; None: all that this process may use.
+            ticket: What it shows to run the instance in an elastic run.
         """
         self.instance_id = instance_id
         self._core = core
         self._command = [
             *(sys.executable, "-P", "-m", "physx_core.workers"),
             *("--connect", address, "--instance", str(instance_id)),
+            *(() if ticket is None else ("--ticket", str(ticket))),
         ]
         self._variables = {TOKEN_VARIABLE: token, **worker_variables()}
         self._process: ChildProcess | None = None
@@ -139,6 +143,13 @@ class ManualLauncher(Launcher):
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
         """Start nothing; the server tells where clients can connect."""
         return []
+
+
+def describe_states(clients: Iterable[ClientHandle]) -> str:
+    """Return what absent clients wait for, as far as their launcher knows."""
+    found = Counter(client.state() for client in clients)
+    del found[""]
+    return "".join(f"; {count} of them: {state}" for state, count in found.items())
 
 
 def stop(clients: Iterable[ClientHandle], patience: float) -> None:

@@ -23,7 +23,7 @@ _PAUSE = 0.2
 
 def join(
     address: str, token: str, instance: int, patience: float = PATIENCE
-) -> tuple[WorkerLink, dict[str, Any]]:
+) -> tuple[WorkerLink, dict[str, Any] | None]:
     """Connect to a server and receive what to run.
 
     It tries again if nothing listens, and if the server ends the connection during the handshake,
@@ -32,20 +32,22 @@ def join(
     Args:
         address: ``HOST:PORT``.
         token: Token of the run.
-        instance: Number of the instance to run, 0 for any that is free.
+        instance: Number of the instance to run or a ticket for it, 0 for any that is free.
         patience: Time in s for which to try again.
 
     Returns:
-        The connection, and the arguments of the instance.
+        The connection, and the arguments of the instance; None: the server wants workers.
     """
 
-    def attempt(seconds: float) -> tuple[WorkerLink, dict[str, Any]]:
+    def attempt(seconds: float) -> tuple[WorkerLink, dict[str, Any] | None]:
         return _try_to_join(address, token, instance)
 
     return retry(attempt, patience, _PAUSE, UnansweredError)
 
 
-def _try_to_join(address: str, token: str, instance: int) -> tuple[WorkerLink, dict[str, Any]]:
+def _try_to_join(
+    address: str, token: str, instance: int
+) -> tuple[WorkerLink, dict[str, Any] | None]:
     connection = _connect(address)
     try:
         prepare_connection(connection)
@@ -73,13 +75,15 @@ def _connect(address: str) -> socket.socket:
         raise UnansweredError(f"{what}: {error}. {advice}") from error
 
 
-def _receive_setup(link: WorkerLink) -> dict[str, Any]:
+def _receive_setup(link: WorkerLink) -> dict[str, Any] | None:
     try:
         frame = link.receive()
     except RunEnded:
         raise UnansweredError("The server ended the connection.") from None
     if frame.kind is Kind.ERROR:
         raise decode_error(frame.payload)
+    if frame.kind is Kind.HOST:
+        return None
     if frame.kind is not Kind.SETUP:
         raise ConnectionRefusedByPeerError(f"The server started with {frame.kind.name}.")
     setup: dict[str, Any] = decode(frame.payload)

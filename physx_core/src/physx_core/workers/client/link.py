@@ -94,9 +94,15 @@ class WorkerLink:
         """Have `receive` return a message again that arrived too early."""
         self._postponed.appendleft(frame)
 
-    def has_message(self) -> bool:
-        """Return whether `receive` would find a message at once."""
-        return bool(self._postponed or self._reader.has_buffered or self._poll.poll(0))
+    def has_message(self, seconds: float = 0.0) -> bool:
+        """Return whether `receive` would find a message at once.
+
+        Args:
+            seconds: How long to wait for one, in s.
+        """
+        if self._postponed or self._reader.has_buffered:
+            return True
+        return bool(self._poll.poll(1000 * seconds))
 
     def ask(self, kind: Kind, value: Any, what: str) -> Any:
         """Send a request and wait for the answer.

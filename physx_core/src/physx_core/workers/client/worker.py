@@ -17,6 +17,7 @@ from physx_core.net.spin_wait import has_core_for_each
 from physx_core.net.values import encode
 from physx_core.processes import CLIENT_VARIABLE
 from physx_core.typing import Sample
+from physx_core.workers.client.hosting import host_workers
 from physx_core.workers.client.joining import PATIENCE, join
 from physx_core.workers.client.link import RunEnded, ServerGone, WorkerLink
 from physx_core.workers.client.producer import Producer
@@ -33,10 +34,14 @@ def run_client(
 ) -> int:
     """Run one instance of the environment for a server until it ends the run.
 
+    If the run is elastic, it runs as many instances as the server says, each in a process of its
+    own.
+
     Args:
         address: The server's ``HOST:PORT``.
         token: Token of the run.
-        instance: Number of the instance to run, counted from 1; None: any that is free.
+        instance: Number of the instance to run, counted from 1, or a ticket for it; None: any that
+            is free. If the run is elastic, number of the client.
         patience: Time in s for which to try again if nothing listens.
         say: Called with a description of what happens.
 
@@ -47,6 +52,9 @@ def run_client(
     say(f"looks for the server at {address}")
     link, setup = join(address, token, instance or 0, patience)
     try:
+        if setup is None:
+            host_workers(link, address, token, say)
+            return 0
         return _serve(link, setup, say)
     except RunEnded:
         say("the server is gone")

@@ -15,20 +15,23 @@ _LAST_WORDS_TIME = 0.3  # for a hung client to write where it is
 _LEAVE_TIME = 0.8  # a process that goes on without a connection exits a little later
 
 
-def exit_error(number: int, peer: Peer | None, handle: ClientHandle | None) -> ClientError:
+def exit_error(
+    number: int, peer: Peer | None, handle: ClientHandle | None, place: str = ""
+) -> ClientError:
     """Return the error for a client that is gone.
 
     Args:
         number: Its instance.
         peer: Its connection; None: it has not connected yet.
         handle: Its process; None if it was started by hand.
+        place: In an elastic run, what ran the instance: a client and its machine.
     """
     if peer is not None and peer.offense:
         if handle is not None:
             handle.wait(time.monotonic() + _LINES_TIME)
         stderr = "" if handle is None else handle.stderr()
         what = f"was cut off after {peer.received} rows. {peer.offense}"
-        return ClientError(number, what, stderr=stderr)
+        return ClientError(number, what, stderr=stderr, client=place)
     made = 0 if peer is None else peer.received
     when = "before it connected" if peer is None else f"after {made} rows"
     if peer is not None and peer.has_vanished:
@@ -43,11 +46,16 @@ def exit_error(number: int, peer: Peer | None, handle: ClientHandle | None) -> C
         f"{how} {when}. To see what it does, run with as_tcp_ip_client=False.",
         exit_status=status,
         stderr=handle.stderr(),
+        client=place,
     )
 
 
 def timeout_error(
-    number: int, peer: Peer | None, handle: ClientHandle | None, timeout: float
+    number: int,
+    peer: Peer | None,
+    handle: ClientHandle | None,
+    timeout: float,
+    place: str = "",
 ) -> ClientError:
     """Return the error for a client that kept the server waiting for too long.
 
@@ -56,6 +64,7 @@ def timeout_error(
         peer: Its connection, or the last one that it had; None: it has not connected.
         handle: Its process; None if it was started by hand.
         timeout: How long the server waited, in s.
+        place: In an elastic run, what ran the instance: a client and its machine.
     """
     state = "" if handle is None else handle.state()
     waited = f"for {timeout:g} s while the server waited for it" + (state and f": {state}")
@@ -72,5 +81,6 @@ def timeout_error(
     return ClientError(
         number,
         f"{how} that long, raise EnvironmentConfig.timeout.",
+        client=place,
         stderr="" if handle is None else handle.stderr(),
     )

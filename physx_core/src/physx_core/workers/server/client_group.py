@@ -7,7 +7,7 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +23,16 @@ from physx_core.errors import (
 )
 from physx_core.net.addresses import format_address, parse_address
 from physx_core.net.handshake import TOKEN_VARIABLE
-from physx_core.net.tokens import choose_token, is_loopback
+from physx_core.net.tokens import choose_token, find_token, is_loopback
 from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate
 from physx_core.workers.instance import NOTHING, Skip, instance_arguments
-from physx_core.workers.launchers import stop
+from physx_core.workers.launchers import describe_states, stop
 from physx_core.workers.parameter_sets import ParameterSets, next_step
 from physx_core.workers.server.client_errors import exit_error, timeout_error
+from physx_core.workers.server.client_pool import ClientPool
+from physx_core.workers.server.pace import Laggards
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.server import Server
 
@@ -60,6 +62,7 @@ class ClientGroup:
         *,
         accept_all: bool = False,
         skip: Skip = NOTHING,
+        total: int | None = None,
     ) -> None:
         """Keep the arguments; `open` starts the clients.
 
@@ -70,16 +73,26 @@ class ClientGroup:
             sets: Chooses the instances' parameters.
             accept_all: Whether samples that `check_sample` rejects count like the others.
             skip: What an earlier run has had: clients generate it again, but do not send it.
+            total: Number of rows of the whole run, with those to skip; None: unknown.
         """
         self.config = config
         self._seed, self._sets = list(seed), sets
         self._accepts_all, self._skip = accept_all, skip
-        self._launcher = _make_launcher(config)
+        self._total = total
+        launcher = _make_launcher(config)
+        token = choose_token(config, launcher.by_hand, launcher.elsewhere)
+        self._pool: ClientPool | None = None
+        if config.is_elastic:
+            is_known = find_token(config.token_file) is not None
+            self._pool = ClientPool(config, launcher, is_open=is_known)
+        self._is_by_hand = launcher.by_hand
+        self._launcher: Launcher = self._pool or launcher
+        self._laggards, self._named = Laggards(), set[str]()
         self._handles: dict[int, ClientHandle] = {}
         self._launched: dict[int, float] = {}
         self._exits: dict[int, float] = {}
         self._restarts: Counter[int] = Counter()
-        self._checked = self._served = self._said = 0.0
+        self._checked = self._served = self._said = self._began = self._looked = 0.0
         self._closing = False
         self._host: str | None = None
         self.server = Server(
@@ -88,10 +101,11 @@ class ClientGroup:
             config.num_clients,
             services,
             self._encode_setup,
-            choose_token(config, self._launcher.by_hand, self._launcher.elsewhere),
+            token,
             sets,
             self._replaces,
             skip,
+            self._pool,
         )
 
     def open(self) -> None:
@@ -100,13 +114,18 @@ class ClientGroup:
         self._host = self._launcher.open()
         self.server.open(self._host if is_loopback(self.config.ip_address) else None)
         numbers = list(self._numbers)
+        if self._pool is not None:
+            address, public = self._address(), self._public_address()
+            self._pool.begin(address, public, self.server.token, self.server.pump)
         self._launch(numbers)
-        if self._launcher.by_hand:
+        if self._is_by_hand:
+            count = len(numbers) if self._pool is None else self._pool.least
             _LOG.warning(
-                "The run waits for %d %s. Start each with: physx client --connect %s "
+                "The run waits for %d %s%s. Start each with: physx client --connect %s "
                 "(and the token in %s, or in a file with --token-file)",
-                len(numbers),
-                "clients" if len(numbers) > 1 else "client",
+                count,
+                "clients" if count > 1 else "client",
+                "" if self._pool is None else f" (at most {self._pool.most} may join)",
                 self._public_address(),
                 TOKEN_VARIABLE,
             )
@@ -122,11 +141,12 @@ class ClientGroup:
         Args:
             missing: Returns the instances that are waited for; called after each round.
         """
-        began = time.monotonic()
+        began = self._began = time.monotonic()
         if began - self._served > _TICK / 10:
             self._serve(0.0)
         while waited := missing():
             self._serve(_TICK)
+            self._look_for_laggards(waited)
             if self._served - began < min(_SAY_EVERY, self.config.timeout):
                 continue
             self._report_missing(waited, began)
@@ -134,7 +154,9 @@ class ClientGroup:
                 self._serve(0.0)  # an answer may have arrived while others were served
                 for number in self._find_silent(waited, began):
                     peer, handle = self.server.peers.get(number), self._handles.get(number)
-                    self._lose(number, timeout_error(number, peer, handle, self.config.timeout))
+                    if self._pool is None or not self._pool.suspects(number, began):
+                        place, timeout = self._place(number), self.config.timeout
+                        self._lose(number, timeout_error(number, peer, handle, timeout, place))
 
     def close(self, *, orderly: bool) -> None:
         """Have the clients close their environments, and end them; no process is left behind.
@@ -156,10 +178,15 @@ class ClientGroup:
                 self._wait_a_moment()
                 patience = 0.0 if self._unfinished() else _GRACE
         finally:
-            stop(self._handles.values(), patience)
-            self._handles = {}
-            self.server.close()
-            self._launcher.close()
+            try:
+                if self._pool is not None:
+                    self._pool.end(patience)
+                else:
+                    stop(self._handles.values(), patience)
+            finally:
+                self._handles = {}
+                self.server.close()
+                self._launcher.close()
 
     @property
     def _numbers(self) -> range:
@@ -224,8 +251,11 @@ class ClientGroup:
         return peer is not None and bool(peer.fields)
 
     def _check_ended(self, now: float, listened_since: float) -> None:
+        self._check_clients(now)
         for number in self._numbers:
             handle, peer = self._handles.get(number), self._find_peer(number)
+            if self._pool is not None and self._pool.is_lost(number):
+                continue  # another client starts it at the next check
             if peer is not None and peer.failure is not None:
                 if self._replaces(number, peer.failure):
                     self._lose(number, peer.failure)
@@ -234,18 +264,77 @@ class ClientGroup:
                 continue
             if peer is not None and peer.closed:
                 left = handle is None and not peer.offense
-                self._lose(number, exit_error(number, peer, handle), left=left)
+                if self._pool is not None and peer.has_vanished:
+                    self._pool.cut_off(number)
+                    continue
+                self._lose(number, self._exit_error(number, peer, handle), left=left)
             elif handle is not None and handle.exit_status() is not None:
                 # What it sent before its end may still be on its way, or wait to be read.
                 since = self._exits.setdefault(number, now)
                 if peer is None or (now - since > 2 * _TICK and peer.heard < listened_since):
-                    self._lose(number, exit_error(number, peer, handle))
+                    self._lose(number, self._exit_error(number, peer, handle))
+
+    def _exit_error(
+        self, number: int, peer: Peer | None, handle: ClientHandle | None
+    ) -> ClientError:
+        return exit_error(number, peer, handle, self._place(number))
+
+    # Clients of an elastic run -----------------------------------------------------------
+
+    def _check_clients(self, now: float) -> None:
+        """Have others run the instances of clients that are lost, or that have too many."""
+        if self._pool is None or self._closing:
+            return
+        for number in self._pool.check(now, self._began):
+            self._replace(number, self._handles.pop(number, None))
+        while (moved := self._pool.find_move(self._progress)) is not None:
+            handle = self._handles.pop(moved)
+            handle.kill()
+            self._replace(moved, handle)
+
+    def _progress(self, number: int) -> tuple[int, int | None]:
+        peer = self.server.peers.get(number)
+        made = 0 if peer is None else peer.received
+        if self._total is None:
+            return made, None
+        mine = (self._total - number + self.config.num_clients) // self.config.num_clients
+        return made, mine - made
+
+    def _place(self, number: int) -> str:
+        """Return the client of an instance and its machine; empty if each has one of its own."""
+        return "" if self._pool is None else self._pool.place(number)
+
+    def _look_for_laggards(self, waited: Sequence[int]) -> None:
+        """Name clients that the run waits for because they are much slower than the others."""
+        now = self._served
+        if len(self._numbers) < 2 or now - self._looked < _TICK:
+            return
+        self._looked = now
+        late = self.server.holding_up(waited)
+        self._laggards.note(late if 2 * len(late) <= len(self._numbers) else (), now)
+        peers = self.server.peers
+        paces = {n: peer.pace.per_row for n, peer in peers.items() if peer.pace.per_row}
+        loads = {n: 1 if self._pool is None else self._pool.load(n) for n in self._numbers}
+        for number, per_row, median in self._laggards.find(paces, loads):
+            place = self._place(number) or f"its client at {peers[number].name}"
+            if place in self._named:
+                continue
+            self._named.add(place)
+            _LOG.warning(
+                "The run waits for instance %d: %s takes %.3g ms for a row, %.1f times as long as "
+                "the median of the instances%s.",
+                number,
+                place,
+                1000 * per_row,
+                per_row / median,
+                f", and runs {loads[number]} of them" if loads[number] > 1 else "",
+            )
 
     # Replacing clients -----------------------------------------------------------------
 
     def _replaces(self, number: int, error: PhysxError | None) -> bool:
         """Return whether another client replaces one that failed, or left without an error."""
-        if error is None and (self._launcher.by_hand or self.config.redraw):
+        if error is None and (self._is_by_hand or self.config.redraw or self._pool is not None):
             return True
         return self._restarts_after(number, error) or self._redraws_after(number, error)
 
@@ -276,7 +365,9 @@ class ClientGroup:
             error: How it was lost.
             left: Whether it closed the connection, as clients that were started by hand may.
         """
-        absent = self._launcher.by_hand and self._find_peer(number) is None
+        if self._pool is not None and self._pool.is_lost(number):
+            return  # which was noticed while its error was looked for
+        absent = self._is_by_hand and self._pool is None and self._find_peer(number) is None
         if absent or not self._replaces(number, None if left else error):
             self._sets.fail(number, self._episode(number), error)
             raise error
@@ -287,10 +378,13 @@ class ClientGroup:
         else:
             follows = self._redraw(self.server.peers[number], error)
         _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
-        self.server.vacate(number)
-        handle = self._handles.pop(number, None)
         closes = not isinstance(error, ClientError)  # and needs a moment for it
-        stop([] if handle is None else [handle], _GRACE if closes else 0.0)
+        self._replace(number, self._handles.pop(number, None), _GRACE if closes else 0.0)
+
+    def _replace(self, number: int, former: ClientHandle | None, patience: float = 0.0) -> None:
+        """Have another client run an instance in place of a former one, which is ended."""
+        self.server.vacate(number)
+        stop([] if former is None else [former], patience)
         self._exits.pop(number, None)
         if not self._closing:
             self._launch([number])
@@ -325,7 +419,7 @@ class ClientGroup:
         if self._closing:
             return "The run was at its end, and all its rows are there."
         text = "Another client takes its place."
-        if self._launcher.by_hand:
+        if self._is_by_hand and self._pool is None:
             text = (
                 f"The run waits up to {self.config.timeout:g} s for another client to take its "
                 f"place, at {self._public_address()}."
@@ -338,7 +432,8 @@ class ClientGroup:
         now = time.monotonic()
         if now - max(began, self._said) < _SAY_EVERY:
             return
-        times = {n: now - max(began, self._heard(n)) for n in self.server.holding_up(waited)}
+        numbers = self._with_client(self.server.holding_up(waited))
+        times = {n: now - max(began, self._heard(n)) for n in numbers}
         absent = [n for n in sorted(times) if self._find_peer(n) is None and times[n] > _SAY_EVERY]
         if absent:
             self._said = now
@@ -348,25 +443,25 @@ class ClientGroup:
                 ", ".join(map(str, absent)),
                 max(times[number] for number in absent),
                 self._public_address(),
-                self._describe_states(absent),
+                describe_states([self._handles[n] for n in absent if n in self._handles]),
                 self.config.timeout,
             )
 
-    def _describe_states(self, numbers: Sequence[int]) -> str:
-        """Return what absent clients wait for, as far as their launcher knows."""
-        handles = (self._handles.get(number) for number in numbers)
-        found = Counter(handle.state() for handle in handles if handle is not None)
-        del found[""]
-        return "".join(f"; {count} of them: {state}" for state, count in found.items())
-
     def _heard(self, number: int) -> float:
         peer = self.server.peers.get(number)
-        return max(self._launched.get(number, 0.0), peer.heard if peer is not None else 0.0)
+        started = 0.0 if self._pool is None else self._pool.started(number)
+        launched = max(self._launched.get(number, 0.0), started)
+        return max(launched, peer.heard if peer is not None else 0.0)
+
+    def _with_client(self, numbers: Iterable[int]) -> list[int]:
+        """Return the instances that do not wait for a client, of which the pool speaks."""
+        pool = self._pool
+        return sorted(n for n in numbers if pool is None or not pool.waits(n))
 
     def _find_silent(self, waited: Sequence[int], began: float) -> list[int]:
         """Return the instances that keep the server waiting for too long."""
         limit = time.monotonic() - self.config.timeout
-        numbers = sorted(self.server.holding_up(waited))
+        numbers = self._with_client(self.server.holding_up(waited))
         return [number for number in numbers if max(began, self._heard(number)) < limit]
 
     def _encode_setup(self, peer: Peer) -> bytes:

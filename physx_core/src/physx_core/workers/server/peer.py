@@ -15,6 +15,7 @@ from physx_core.net.frames import FrameReader, Kind, pack
 from physx_core.net.handshake import HANDSHAKE_LIMIT
 from physx_core.workers.row_codec import RejectedRows, RowQueue
 from physx_core.workers.server.journal import Journal
+from physx_core.workers.server.pace import Pace
 
 _PIECE = 1 << 16
 
@@ -43,6 +44,7 @@ class Peer(Connection):
     Attributes:
         reader: Reads its frames.
         instance_id: Number of its instance, counted from 1; 0 while it is a stranger.
+        client: Number of a client that runs workers, counted from 1; 0 for all others.
         fields: The environment's fields; empty before it is ready.
         row_fields: Fields of its rows, all shapes known; empty before the first sample.
         rows: Rows that arrived.
@@ -66,6 +68,7 @@ class Peer(Connection):
         episode: Last episode that it was given parameters for; -1: none.
         origin: Where a client that takes its place begins.
         slow_until: Episode before which that client sends each row at once.
+        pace: How fast this client makes rows.
     """
 
     reader: FrameReader
@@ -78,7 +81,7 @@ class Peer(Connection):
             name: The other side as ``host:port``.
         """
         super().__init__(connected, FrameReader(HANDSHAKE_LIMIT), name)
-        self.instance_id = 0
+        self.instance_id = self.client = 0
         self.fields: list[Field] = []
         self.row_fields: list[Field] = []
         self.rows = RowQueue()
@@ -96,6 +99,7 @@ class Peer(Connection):
         self.episode = -1
         self.origin = Origin()
         self.slow_until = 0
+        self.pace = Pace()
         self._arrived = 0  # of a long frame, when the peer was last heard of
         self._next_order: int | None = None  # of the journal's, for this client; None: it had all
 

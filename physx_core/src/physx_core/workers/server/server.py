@@ -24,6 +24,7 @@ from physx_core.net.strangers import Handshakes
 from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.row_codec import unpack_rows
+from physx_core.workers.server.client_pool import ClientPool
 from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.service_requests import ServiceRequests
@@ -34,6 +35,7 @@ from physx_core.workers.server.validation import (
     parse_fields,
     parse_parameters,
 )
+from physx_core.workers.tickets import is_ticket
 
 _HANDSHAKE_TIME = 5.0
 _SPIN_TIME = 5e-5  # for the next requests of clients that were just answered
@@ -62,6 +64,7 @@ class Server:
         sets: ParameterSets,
         replaces: Callable[[int, PhysxError | None], bool] = lambda number, error: False,
         skip: Skip = NOTHING,
+        pool: ClientPool | None = None,
     ) -> None:
         """Keep the arguments; `open` starts to listen.
 
@@ -76,6 +79,7 @@ class Server:
             replaces: Whether another client takes the place of one that failed with an error, or
                 left without one.
             skip: What an earlier run has had of the instances.
+            pool: The clients, if they run workers for several instances; None: each runs one.
         """
         self.peers: dict[int, Peer] = {}
         self.token = token
@@ -83,6 +87,7 @@ class Server:
         self._spin_time = _SPIN_TIME if has_core_for_each(instance_nb) else 0.0
         self._requests = ServiceRequests(services, sets)
         self._setup, self._replaces, self._skip = setup, replaces, skip
+        self._pool = pool
         self._ending = self._has_news = False
         self._listener = Listener[Peer](self._meet, self._give_up)
         self._strangers = Handshakes[Peer](
@@ -182,6 +187,8 @@ class Server:
             self._drop(peer)
             if peer.journal is not None:
                 peer.journal.close()
+        for peer in self._pool.peers if self._pool is not None else ():
+            self._drop(peer)
         self._strangers.drop_all()
         self._listener.close()
 
@@ -231,7 +238,7 @@ class Server:
             while not peer.closed:
                 turns += 1
                 frame = peer.reader.read(peer.socket)
-                if peer.instance_id:
+                if peer.instance_id or peer.client:
                     peer.hear(whole=frame is not None)
                 if frame is not None:
                     self._take(peer, frame)
@@ -253,7 +260,9 @@ class Server:
             self._drop(peer)
 
     def _take(self, peer: Peer, frame: Frame) -> None:
-        if not peer.instance_id:
+        if peer.client and self._pool is not None:
+            self._pool.take(peer, frame)
+        elif not peer.instance_id:
             self._greet(peer, frame)
         elif frame.kind in self._dispatch:
             self._has_news |= frame.kind is not Kind.PREDICT
@@ -268,6 +277,11 @@ class Server:
         peer.send(answer)
         if wanted is None:
             return
+        if self._pool is not None:
+            if not is_ticket(wanted):
+                self._pool.admit(peer, wanted)
+                return
+            wanted = self._pool.redeem(wanted)
         numbers = range(1, self._instance_nb + 1)
         free = [n for n in numbers if n not in self.peers or self.peers[n].vacant]
         if not free or (wanted and wanted not in free):
@@ -346,6 +360,7 @@ def _take_rows(peer: Peer, frame: Frame) -> None:
     peer.last_step = check_rows(block, peer.row_fields, peer.instance_id, peer.last_step)
     peer.rows.append(block, count)
     peer.received += count
+    peer.pace.rows(count, goes_on=peer.received < peer.granted)
 
 
 def _take_wrong(peer: Peer, frame: Frame) -> None:

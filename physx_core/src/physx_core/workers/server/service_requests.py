@@ -74,6 +74,7 @@ class ServiceRequests:
         A request that the predecessor of this client made gets the same answer.
         """
         if frame.kind is not Kind.SHOW:
+            peer.pace.rest()
             if len(peer.outgoing) > _MOST_UNREAD:
                 raise ConnectionRefusedByPeerError("It asks, but does not read the answers.")
             peer.requests += 1
@@ -82,6 +83,7 @@ class ServiceRequests:
             recorded = peer.journal.answer(frame.number) if peer.journal is not None else None
             if recorded is not None:
                 peer.send_once(recorded)
+                peer.pace.go_on()
                 return
         if frame.kind is Kind.PREDICT:
             self._keep(peer, frame)
@@ -167,6 +169,7 @@ class ServiceRequests:
         except PhysxError as error:
             for peer, number, _ in requests:
                 peer.send(pack(Kind.REFUSAL, encode_error(error), number))
+                peer.pace.go_on()
             return
         except Exception as error:
             numbers = ", ".join(str(peer.instance_id) for peer, _, _ in requests)
@@ -174,6 +177,7 @@ class ServiceRequests:
             raise
         for (peer, _, _), message in zip(requests, messages, strict=True):
             peer.send(message)
+            peer.pace.go_on()
 
     def _predictions(self, requests: list[Request]) -> list[Sample]:
         if self._predict_batch is None or len(requests) == 1:
@@ -204,6 +208,7 @@ class ServiceRequests:
             error.add_note(f"while {what} for instance {peer.instance_id} was made")
             raise
         peer.send(message)
+        peer.pace.go_on()
 
 
 def _signature(sample: Sample) -> Signature:

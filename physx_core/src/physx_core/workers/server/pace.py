@@ -1,0 +1,109 @@
+"""Pace: how fast each client makes rows, and which of them the run has to wait for."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+_HELD = 5.0  # s that the run has waited for an instance before anything is said
+_SLOW = 2.0
+_LONGEST = 0.2  # s, of a wait between two looks; more would be that of somebody else
+
+
+class Pace:
+    """Time that a client takes for its rows, without that in which it waits for the server.
+
+    It counts from the first rows that arrive: what came before may have been made again.
+    """
+
+    def __init__(self) -> None:
+        """Start before the first row."""
+        self._rows, self._seconds = 0, 0.0
+        self._has_begun = False
+        self._since: float | None = None
+
+    @property
+    def per_row(self) -> float | None:
+        """Time for a row in s, None before it is known."""
+        return self._seconds / self._rows if self._rows else None
+
+    def rows(self, count: int, *, goes_on: bool) -> None:
+        """Count rows that arrived.
+
+        Args:
+            count: How many.
+            goes_on: Whether the client makes more now.
+        """
+        if self._since is not None:
+            self._rows += count
+        self.rest()
+        self._has_begun = True
+        if goes_on:
+            self.go_on()
+
+    def rest(self) -> None:
+        """Note that the client waits for the server."""
+        if self._since is not None:
+            self._seconds += time.monotonic() - self._since
+            self._since = None
+
+    def go_on(self) -> None:
+        """Note that the client no longer waits for the server."""
+        if self._has_begun and self._since is None:
+            self._since = time.monotonic()
+
+
+class Laggard(NamedTuple):
+    """An instance that holds up the run.
+
+    Attributes:
+        instance_id: Its number.
+        per_row: Time that it takes for a row, in s.
+        median: Median of that time over the instances, in s.
+    """
+
+    instance_id: int
+    per_row: float
+    median: float
+
+
+class Laggards:
+    """Finds the instances that are much slower than the others, and that the run waits for."""
+
+    def __init__(self) -> None:
+        """Start without any."""
+        self._held: defaultdict[int, float] = defaultdict(float)
+        self._looked = time.monotonic()
+
+    def note(self, waited: Iterable[int], now: float) -> None:
+        """Note which instances the run waits for now, while it does not wait for most of them."""
+        elapsed = min(now - self._looked, _LONGEST)
+        self._looked = now
+        for number in waited:
+            self._held[number] += elapsed
+
+    def find(self, paces: Mapping[int, float], loads: Mapping[int, int]) -> list[Laggard]:
+        """Return those that have held up the run since they were last returned.
+
+        An instance is slow if it takes twice as long as the median, and as many times longer as
+        its client runs more instances than others do.
+
+        Args:
+            paces: Instance to time for a row, in s.
+            loads: Instance to how many instances its client runs.
+        """
+        held = [number for number, seconds in self._held.items() if seconds >= _HELD]
+        if not held or len(paces) < 2:
+            return []
+        median = statistics.median_low(paces.values())
+        usual = statistics.median_low(loads.values())
+        found = []
+        for number in held:
+            fair = max(1.0, loads.get(number, 1) / usual)
+            if paces.get(number, 0.0) >= _SLOW * fair * median:
+                del self._held[number]
+                found.append(Laggard(number, paces[number], median))
+        return found
