@@ -20,6 +20,7 @@ from .config import NetworkConfig as NetworkConfig
 from .dataset import Dataset as Dataset
 from .errors import PhysxError as PhysxError
 from .fields import Field as Field
+from .observers import read_scalars as read_scalars
 from .openmp import limit_openmp_spin as limit_openmp_spin
 from .pipelines import DataGeneration as DataGeneration
 from .pipelines import Prediction as Prediction

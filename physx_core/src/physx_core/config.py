@@ -121,7 +121,7 @@ def _misfit(where: str, value: Any, hint: Any, error: Exception) -> str:
 def _check_range(where: str, value: Any, metadata: Mapping[Any, Any]) -> None:
     minimum, maximum = metadata.get("minimum"), metadata.get("maximum")
     choices = metadata.get("choices")
-    if minimum is not None and value < minimum:
+    if minimum is not None and not isinstance(value, str) and value < minimum:
         raise ConfigError(f"{where} is {value!r} but must be at least {minimum}.")
     if maximum is not None and value > maximum:
         raise ConfigError(f"{where} is {value!r} but must be at most {maximum}.")

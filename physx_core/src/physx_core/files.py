@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import os
 import stat
 from collections.abc import Iterator
@@ -104,6 +105,26 @@ def close(descriptor: int) -> None:
 def size(descriptor: int) -> int:
     """Return how many bytes an open file has."""
     return os.fstat(descriptor).st_size
+
+
+def try_lock(path: Path) -> int | None:
+    """Lock a file, which is made if there is none; return its descriptor, or None if it is locked.
+
+    Closing the descriptor unlocks it, and so does the end of the process, however it ends.
+
+    Raises:
+        OSError: If it cannot be opened or locked.
+    """
+    descriptor = open_regular(path, os.O_RDWR | os.O_CREAT)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        return None
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
 
 
 def is_removed(descriptor: int) -> bool:

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from physx_core import checkpoint
 from physx_core.checkpoint import Progress
@@ -130,9 +130,9 @@ class Training(NewSessionPipeline):
     """Keyword arguments of each observer, by its name; in a command ``rerun={mode="save"}``."""
     histograms_every: int = at_least(0, 0)
     """Number of epochs between histograms of weights and gradients; 0: none."""
-    checkpoint_every: int = at_least(0, 0)
-    """Number of batches between checkpoints within epochs, counted over all epochs; 0: none. The
-    last two of them are kept."""
+    checkpoint_every: int | Literal["epoch"] = at_least(0, 0)
+    """Number of batches between checkpoints within epochs, counted over all epochs; "epoch": one
+    after the last batch of each; 0: none. The last two of them are kept."""
     resume: bool = field(default=False, metadata={"recorded": False})
     """Resume from the session's last checkpoint, up to `epoch_nb` epochs in total. While
     environments generate the samples, they generate those that are stored again, unless they depend
@@ -374,7 +374,8 @@ class Training(NewSessionPipeline):
 
     def _leave_batch(self, interrupt: Interrupt) -> None:
         """Write a checkpoint if one is due, and end within an epoch after a signal."""
-        if self.checkpoint_every and self._number % self.checkpoint_every == 0:
+        every = self._epoch_batches if self.checkpoint_every == "epoch" else self.checkpoint_every
+        if every and self._number % every == 0:
             self._save_within_epoch()
         if self.group.any(bool(interrupt)) and self.batch_condition():
             self._end_early(interrupt)

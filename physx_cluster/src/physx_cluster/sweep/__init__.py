@@ -1,0 +1,10 @@
+"""Sweeps: studies of pipelines, settings and seeds that survive any kill.
+
+The public names are imported on first use.
+"""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,63 @@
+"""Executor: starts the processes of trials and tells which have ended."""
+
+from __future__ import annotations
+
+import sys
+from abc import abstractmethod
+from pathlib import Path
+
+from physx_core import Closeable
+from physx_core.processes import describe_exit
+
+PATIENCE = 20.0
+"""Time in s that a trial gets to write a checkpoint when it is asked to end."""
+
+
+class Job(Closeable):
+    """The process of a trial, wherever it runs. Closing it ends it."""
+
+    @abstractmethod
+    def has_ended(self) -> bool:
+        """Return whether the process has ended."""
+
+    @abstractmethod
+    def describe_end(self) -> str:
+        """Return how it ended, for example ``was killed by signal 9 (SIGKILL)``."""
+
+
+class Executor(Closeable):
+    """Runs the processes of trials. Closing it ends those that still run.
+
+    Attributes:
+        interval: Time in s between two looks at the jobs.
+    """
+
+    interval: float
+
+    @abstractmethod
+    def start(self, folder: Path) -> Job:
+        """Start the process of the trial of a folder, an absolute path.
+
+        Raises:
+            PhysxError: If that is not possible.
+        """
+
+
+def command_of(folder: Path) -> list[str]:
+    """Return the command that runs a trial in the working directory of this process."""
+    return [sys.executable, "-m", "physx_cluster.sweep.trial", str(folder), str(Path.cwd())]
+
+
+def variables_of(threads: int) -> dict[str, str]:
+    """Return the environment variables of a trial's process.
+
+    Args:
+        threads: Number of threads of its numerical libraries.
+    """
+    names = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+    return dict.fromkeys(names, str(threads))
+
+
+def describe_status(status: int | None) -> str:
+    """Return how a process ended whose exit status is known, or not."""
+    return "ended without a word" if status is None else describe_exit(status)

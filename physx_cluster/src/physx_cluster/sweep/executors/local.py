@@ -1,0 +1,86 @@
+"""LocalExecutor: trials in processes of this machine."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from physx_cluster.sweep.executors.executor import (
+    PATIENCE,
+    Executor,
+    Job,
+    command_of,
+    describe_status,
+    variables_of,
+)
+from physx_cluster.sweep.results import OUTPUT
+from physx_core.errors import UnknownOptionError
+from physx_core.processes import ChildProcess
+
+
+class LocalExecutor(Executor):
+    """Runs each trial in a process of this machine, which ends with this one."""
+
+    interval = 0.05
+
+    def __init__(self, options: Mapping[str, Any], threads: int) -> None:
+        """Take the options.
+
+        Args:
+            options: There are none.
+            threads: Threads of each trial.
+
+        Raises:
+            UnknownOptionError: If an option is given.
+        """
+        if options:
+            raise UnknownOptionError('The executor "local"', options, ())
+        self._variables = variables_of(threads)
+        self._jobs: list[LocalJob] = []
+
+    def start(self, folder: Path) -> LocalJob:
+        """Start the process of a trial; see `Executor.start`."""
+        with (folder / OUTPUT).open("ab") as output:
+            place = output.fileno()
+            command, variables = command_of(folder), self._variables
+            process = ChildProcess(command, variables=variables, stdout=place, stderr=place)
+        self._jobs = [job for job in self._jobs if not job.has_ended()]
+        self._jobs.append(LocalJob(process))
+        return self._jobs[-1]
+
+    def close(self) -> None:
+        """End all processes, in order: each writes a checkpoint."""
+        for job in self._jobs:
+            job.ask_to_end()
+        for job in self._jobs:
+            job.close()
+
+
+class LocalJob(Job):
+    """The process of a trial on this machine.
+
+    Attributes:
+        process: The process.
+    """
+
+    def __init__(self, process: ChildProcess) -> None:
+        self.process = process
+
+    def has_ended(self) -> bool:
+        """Return whether it has ended."""
+        return self.process.exit_status() is not None
+
+    def describe_end(self) -> str:
+        """Return its exit status in words."""
+        return describe_status(self.process.exit_status())
+
+    def ask_to_end(self) -> None:
+        """Ask it to end, without waiting."""
+        self.process.send_signal(signal.SIGTERM)
+
+    def close(self) -> None:
+        """End it."""
+        if not self.has_ended():
+            self.process.close(PATIENCE)

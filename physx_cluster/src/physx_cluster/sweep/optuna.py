@@ -1,0 +1,239 @@
+"""Optuna's samplers and pruners, asked in an order that no process and no kill can change."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import re
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from physx_cluster.sweep.parameters import Choices, Parameter, Setting
+from physx_cluster.sweep.results import COMPLETE, FAILED, PRUNED, Result
+from physx_core.errors import ConfigError, MissingLibraryError, UnknownOptionError, listed, nearest
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    import optuna
+
+PREFIX = "optuna/"
+_UNFIT = ("base", "grid", "bruteforce", "partialfixed", "nop", "patient")
+_NAME = "study"
+
+
+class OptunaSearch:
+    """Chooses settings by one of Optuna's samplers.
+
+    The sampler's state is not stored: it is asked the same again, and told the same results, which
+    brings it to the same state.
+    """
+
+    def __init__(
+        self,
+        sampler: str,
+        kwargs: Mapping[str, Any],
+        parameters: Mapping[str, Parameter],
+        seed: int,
+        goal: str,
+    ) -> None:
+        """Create the sampler.
+
+        Args:
+            sampler: Its name, for example ``optuna/tpe``.
+            kwargs: Its keyword arguments.
+            parameters: The parameters by name.
+            seed: Its seed.
+            goal: "minimize" or "maximize".
+
+        Raises:
+            ConfigError: If there is no such sampler, or it has no such arguments.
+            MissingLibraryError: If Optuna, or what the sampler needs, is not installed.
+        """
+        library = _import()
+        made = _create(library.samplers, "Sampler", sampler, {"seed": seed, **kwargs})
+        self._library = library
+        self._parameters = parameters
+        self._study = library.create_study(sampler=made, direction=goal, study_name=_NAME)
+        self._asked: list[optuna.Trial] = []
+
+    def ask(self, count: int) -> list[Setting]:
+        """Return the next settings."""
+        ranges = {n: _distribution(self._library, p) for n, p in self._parameters.items()}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", self._library.exceptions.ExperimentalWarning)
+            try:
+                self._asked = [self._study.ask(ranges) for _ in range(count)]
+            except ImportError as error:  # of what the sampler needs beside Optuna
+                name = str(error.name or error)
+                raise MissingLibraryError("This sampler", name, "optuna", "physx-cluster") from None
+        return [
+            {name: _value(each, trial.params[name]) for name, each in self._parameters.items()}
+            for trial in self._asked
+        ]
+
+    def tell(self, results: Sequence[Sequence[Result]]) -> None:
+        """Tell the sampler the results of the settings that it was asked for last.
+
+        Args:
+            results: Those of each setting, one for each seed. Means over the seeds count; a setting
+                of which one is pruned is so itself.
+        """
+        states = self._library.trial.TrialState
+        for trial, of_setting in zip(self._asked, results, strict=True):
+            found = {result.state for result in of_setting}
+            mean = sum(result.value for result in of_setting) / len(of_setting)
+            steps = set.intersection(*(set(result.numbers) for result in of_setting))
+            for step in sorted(steps):
+                value = sum(result.numbers[step] for result in of_setting) / len(of_setting)
+                if math.isfinite(value):
+                    trial.report(value, step)
+            if FAILED in found or not math.isfinite(mean):
+                self._study.tell(trial, state=states.FAIL)
+            elif PRUNED in found:
+                self._study.tell(trial, state=states.PRUNED)
+            else:
+                self._study.tell(trial, mean)
+        self._asked = []
+
+
+class Pruning:
+    """Decides by one of Optuna's pruners whether a trial ends before its last epoch."""
+
+    def __init__(
+        self,
+        pruner: str,
+        kwargs: Mapping[str, Any],
+        goal: str,
+        earlier: Iterable[Result | None],
+    ) -> None:
+        """Create the pruner.
+
+        Args:
+            pruner: Its name, for example ``optuna/median``.
+            kwargs: Its keyword arguments.
+            goal: "minimize" or "maximize".
+            earlier: Results of the trials of this pipeline before this one, in their order; None
+                for those that run at the same time and must not matter.
+
+        Raises:
+            ConfigError: If there is no such pruner, or it has no such arguments.
+            MissingLibraryError: If Optuna is not installed.
+        """
+        library = _import()
+        made = _create(library.pruners, "Pruner", pruner, kwargs)
+        study = library.create_study(pruner=made, direction=goal, study_name=_NAME)
+        study.add_trials([_frozen(library, result) for result in earlier])
+        self._study, self._trial, self._told = study, study.ask(), 0
+
+    def decide(self, numbers: Mapping[int, float]) -> bool:
+        """Return whether the trial ends.
+
+        Args:
+            numbers: Its numbers so far, by epoch, at least those of the last call.
+        """
+        ends = False
+        for epoch in sorted(step for step in numbers if step > self._told):
+            self._told = epoch
+            if math.isfinite(numbers[epoch]):
+                self._trial.report(numbers[epoch], epoch)
+                ends = bool(self._trial.should_prune())
+        return ends
+
+    @property
+    def rungs(self) -> dict[str, float]:
+        """What the pruner keeps of the trial, to compare later ones with."""
+        kept = self._study.get_trials(deepcopy=False)[-1].system_attrs
+        return {name: float(value) for name, value in kept.items() if _is_rung(name)}
+
+
+def check_optuna(
+    sampler: str, sampler_kwargs: Mapping[str, Any], pruner: str | None, kwargs: Mapping[str, Any]
+) -> None:
+    """Check that Optuna has a sampler and a pruner; other samplers are not looked at.
+
+    Raises:
+        ConfigError: If it has not.
+        MissingLibraryError: If it is needed and not installed.
+    """
+    if sampler.startswith(PREFIX):
+        _create(_import().samplers, "Sampler", sampler, {"seed": 0, **sampler_kwargs})
+    if pruner is not None:
+        _create(_import().pruners, "Pruner", pruner, kwargs)
+
+
+def _import() -> Any:
+    try:
+        import optuna
+    except ImportError:
+        raise MissingLibraryError(
+            'A sampler or pruner "optuna/..."', "optuna", "optuna", "physx-cluster"
+        ) from None
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    return optuna
+
+
+def _create(module: ModuleType, kind: str, reference: str, kwargs: Mapping[str, Any]) -> Any:
+    found = {_short(name, kind): name for name in dir(module) if name.endswith(kind)}
+    known = [PREFIX + name for name in found if not name.startswith(_UNFIT)]
+    if reference not in known:
+        others = ["grid", "random", *known] if kind == "Sampler" else known
+        raise ConfigError(
+            f'There is no {kind.lower()} "{reference}".{nearest(reference, others)} '
+            f"There are: {listed(others)}."
+        )
+    make = getattr(module, found[reference.removeprefix(PREFIX)])
+    names = inspect.signature(make).parameters
+    unknown = kwargs.keys() - names.keys()
+    if unknown:
+        raise UnknownOptionError(f'The {kind.lower()} "{reference}"', unknown, names)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it is experimental
+            return make(**kwargs)
+    except ImportError as error:
+        name = str(error.name or error)
+        raise MissingLibraryError(f'"{reference}"', name, "optuna", "physx-cluster") from None
+    except (TypeError, ValueError) as error:
+        raise ConfigError(
+            f'The {kind.lower()} "{reference}" refuses its arguments: {error}'
+        ) from None
+
+
+def _short(name: str, kind: str) -> str:
+    """Return the name of a class in words, as ``successive_halving`` of SuccessiveHalvingPruner."""
+    plain = name.removesuffix(kind)
+    words = re.findall(r"[A-Z]+(?![a-z])|[A-Z][a-z]+", plain)
+    return "_".join(words).lower() if kind == "Pruner" else plain.lower()
+
+
+def _distribution(library: Any, parameter: Parameter) -> Any:
+    made = library.distributions
+    if isinstance(parameter, Choices):
+        return made.CategoricalDistribution(range(len(parameter.values)))
+    if parameter.is_whole:
+        return made.IntDistribution(int(parameter.low), int(parameter.high), log=parameter.log)
+    return made.FloatDistribution(parameter.low, parameter.high, log=parameter.log)
+
+
+def _value(parameter: Parameter, suggested: Any) -> Any:
+    return parameter.values[suggested] if isinstance(parameter, Choices) else suggested
+
+
+def _frozen(library: Any, result: Result | None) -> Any:
+    """Return a trial as Optuna keeps it; one that must not matter has failed, for all it knows."""
+    states = library.trial.TrialState
+    if result is None or result.state == FAILED or not math.isfinite(result.value):
+        return library.trial.create_trial(state=states.FAIL)
+    numbers = {step: value for step, value in result.numbers.items() if math.isfinite(value)}
+    return library.trial.create_trial(
+        state=states.COMPLETE if result.state == COMPLETE else states.PRUNED,
+        value=result.value,
+        intermediate_values=numbers,
+        system_attrs=dict(result.rungs),
+    )
+
+
+def _is_rung(name: str) -> bool:
+    return name.startswith("completed_rung_")

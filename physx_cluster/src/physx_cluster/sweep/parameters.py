@@ -1,0 +1,162 @@
+"""Parameters: which values the settings of a study take."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from physx_core.config import at_least, from_plain, options
+from physx_core.errors import ConfigError
+
+Setting = dict[str, Any]
+"""Name of a parameter to its value."""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """A parameter that takes one of some values.
+
+    Attributes:
+        values: The values, as TOML has them.
+    """
+
+    values: tuple[Any, ...]
+
+    def grid(self, where: str) -> Sequence[Any]:
+        """Return the values of a grid."""
+        return self.values
+
+    def draw(self, random: np.random.Generator) -> Any:
+        """Return a random value."""
+        return self.values[int(random.integers(len(self.values)))]
+
+    def ends(self) -> Sequence[Any]:
+        """Return the values between which, or among which, all others are."""
+        return self.values
+
+
+@options
+@dataclass(frozen=True)
+class Range:
+    """A parameter that takes numbers of a range; whole ones if both ends are.
+
+    Attributes:
+        low: Smallest value.
+        high: Largest value.
+        log: Whether the logarithms are evenly distributed, not the numbers.
+        num: Number of values in a grid.
+    """
+
+    low: float
+    high: float
+    log: bool = False
+    num: int | None = at_least(2, None)
+
+    def __post_init__(self) -> None:
+        """Check the ends.
+
+        Raises:
+            ConfigError: If there is no number between them, or none has a logarithm.
+        """
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
+            raise ConfigError(f"low is {self.low} and must be below high, which is {self.high}.")
+        if self.log and self.low <= 0:
+            raise ConfigError(f"low is {self.low} and must be positive where log is true.")
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the numbers are integers."""
+        return isinstance(self.low, int) and isinstance(self.high, int)
+
+    def grid(self, where: str) -> Sequence[Any]:
+        """Return the values of a grid.
+
+        Args:
+            where: The parameter, for messages.
+        """
+        if self.num is None:
+            raise ConfigError(f"{where}: a grid needs to know how many values: add num = 5.")
+        space = np.geomspace if self.log else np.linspace
+        return list(dict.fromkeys(self._value(x) for x in space(self.low, self.high, self.num)))
+
+    def draw(self, random: np.random.Generator) -> Any:
+        """Return a random value."""
+        low, high = self.low, self.high
+        if self.is_whole:  # each number owns what lies within 0.5 of it
+            low, high = low - 0.5, high + 0.5
+        if self.log:
+            return self._value(math.exp(random.uniform(math.log(low), math.log(high))))
+        return self._value(random.uniform(low, high))
+
+    def ends(self) -> Sequence[Any]:
+        """Return the smallest and the largest value."""
+        return (self.low, self.high)
+
+    def _value(self, number: float) -> float | int:
+        clipped = min(max(float(number), self.low), self.high)
+        return round(clipped) if self.is_whole else float(clipped)
+
+
+Parameter = Choices | Range
+
+
+def read_parameters(where: str, table: Mapping[str, Any]) -> dict[str, Parameter]:
+    """Return the parameters of a table by the dotted path of the option that each sets.
+
+    A list holds the values of a parameter. A table with ``low`` or ``high`` that are numbers is a
+    range. Any other table is part of a path.
+
+    Args:
+        where: The table and its file, for messages.
+        table: As TOML has it.
+
+    Raises:
+        ConfigError: If it is neither.
+    """
+    found: dict[str, Parameter] = {}
+    for path, value in _leaves(table):
+        if isinstance(value, list) and value:
+            found[path] = Choices(tuple(value))
+        elif isinstance(value, Mapping):
+            try:
+                found[path] = from_plain(Range, value)
+            except ConfigError as error:
+                raise ConfigError(f"{where}: {path}: {error}") from None
+        else:
+            raise ConfigError(
+                f"{where}: {path} is {value!r} and must be a list of values, as in [0.1, 0.01], or "
+                "a range, as in { low = 1e-4, high = 0.1, log = true }."
+            )
+    return found
+
+
+def _leaves(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in table.items():
+        is_table = isinstance(value, Mapping) and value
+        if is_table and not any(_is_number(value.get(end)) for end in ("low", "high")):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def grid_of(where: str, parameters: Mapping[str, Parameter]) -> list[Setting]:
+    """Return all combinations of the parameters' values; the last parameter changes first.
+
+    Args:
+        where: The file, for messages.
+        parameters: The parameters by name.
+
+    Raises:
+        ConfigError: If a range does not say how many values it has in a grid.
+    """
+    values = [parameter.grid(f"{where}: {name}") for name, parameter in parameters.items()]
+    return [dict(zip(parameters, each, strict=True)) for each in itertools.product(*values)]

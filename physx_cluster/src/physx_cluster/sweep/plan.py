@@ -1,0 +1,137 @@
+"""Plan: which trials a study has, batch by batch."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from physx_cluster.sweep.definition import Definition
+from physx_cluster.sweep.optuna import PREFIX, OptunaSearch
+from physx_cluster.sweep.parameters import Parameter, Setting, grid_of
+from physx_cluster.sweep.results import Result, Trial
+from physx_core.errors import ConfigError, listed, nearest
+
+
+class Search(Protocol):
+    """Chooses the settings of one pipeline."""
+
+    def ask(self, count: int) -> list[Setting]:
+        """Return the next settings, fewer than asked for where there are no more."""
+
+    def tell(self, results: Sequence[Sequence[Result]]) -> None:
+        """Take the results of the settings that it was asked for last, one for each seed."""
+
+
+class Plan:
+    """The trials of a study, in an order that depends on its definition and on results alone.
+
+    Within a batch trials are numbered by setting, then pipeline, then seed. So more settings leave
+    the numbers of the first ones as they are.
+
+    Attributes:
+        total: Number of trials.
+    """
+
+    def __init__(self, definition: Definition) -> None:
+        """Start with the first batch.
+
+        Raises:
+            ConfigError: If the sampler cannot choose such settings.
+        """
+        study = definition.study
+        self._seeds = study.seeds
+        self._searches: dict[str, Search] = {}
+        self._left: dict[str, int] = {}
+        for name, pipeline in definition.pipelines.items():
+            if study.sampler == "grid":
+                grid = Grid(grid_of(definition.name, pipeline.parameters))
+                self._searches[name], self._left[name] = grid, len(grid.settings)
+            else:
+                self._searches[name] = _search(definition, pipeline.parameters)
+                self._left[name] = study.trials or 0
+        waits = study.sampler.startswith(PREFIX) or study.pruner is not None
+        self._batch = study.batch if waits else max(self._left.values())
+        self.total = sum(self._left.values()) * len(self._seeds)
+        self._settings, self._trials = 0, 0
+        self._last: list[Trial] = []
+
+    def next_batch(self) -> list[Trial]:
+        """Return the next trials; none at the end. Before, `tell` takes the results of the last."""
+        chosen = {}
+        for name, search in self._searches.items():
+            count = min(self._batch, self._left[name])
+            self._left[name] -= count
+            chosen[name] = search.ask(count)
+        known, self._last = self._trials, []
+        for place in range(max(map(len, chosen.values()))):
+            for name, settings in chosen.items():
+                for seed in self._seeds if place < len(settings) else ():
+                    self._trials += 1
+                    setting = self._settings + place + 1
+                    values = settings[place]
+                    self._last.append(Trial(self._trials, name, setting, seed, values, known))
+        self._settings += self._batch
+        return self._last
+
+    def tell(self, results: Mapping[int, Result]) -> None:
+        """Take the results of all trials of the last batch, by their numbers."""
+        for name, search in self._searches.items():
+            of_pipeline = [trial for trial in self._last if trial.pipeline == name]
+            groups = itertools.groupby(of_pipeline, lambda trial: trial.setting)
+            search.tell([[results[trial.number] for trial in trials] for _, trials in groups])
+
+
+class Grid:
+    """Chooses all combinations, in order.
+
+    Attributes:
+        settings: The combinations.
+    """
+
+    def __init__(self, settings: list[Setting]) -> None:
+        """Start with the first one."""
+        self.settings = settings
+        self._next = iter(settings)
+
+    def ask(self, count: int) -> list[Setting]:
+        """Return the next ones."""
+        return list(itertools.islice(self._next, count))
+
+    def tell(self, results: Sequence[Sequence[Result]]) -> None:
+        """Do nothing: a grid learns nothing."""
+
+
+class RandomSearch:
+    """Chooses settings at random; each depends on the seed and its own number alone."""
+
+    def __init__(self, parameters: Mapping[str, Parameter], seed: int) -> None:
+        """Start with the first one."""
+        self._parameters, self._seed, self._number = parameters, seed, 0
+
+    def ask(self, count: int) -> list[Setting]:
+        """Return the next ones."""
+        return [self._draw() for _ in range(count)]
+
+    def tell(self, results: Sequence[Sequence[Result]]) -> None:
+        """Do nothing: chance learns nothing."""
+
+    def _draw(self) -> Setting:
+        self._number += 1
+        random = np.random.default_rng([self._seed, self._number])
+        return {name: parameter.draw(random) for name, parameter in self._parameters.items()}
+
+
+def _search(definition: Definition, parameters: Mapping[str, Parameter]) -> Search:
+    study = definition.study
+    if study.sampler == "random":
+        return RandomSearch(parameters, study.seed)
+    if study.sampler.startswith(PREFIX):
+        return OptunaSearch(study.sampler, study.sampler_kwargs, parameters, study.seed, study.goal)
+    known = ["grid", "random", f"{PREFIX}tpe"]
+    raise ConfigError(
+        f'There is no sampler "{study.sampler}".{nearest(study.sampler, known)} There are: '
+        f"{listed(known)}, and Optuna's others."
+    )

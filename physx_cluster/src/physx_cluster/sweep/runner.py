@@ -1,0 +1,200 @@
+"""Runs a study: its trials, batch by batch, until each has a result."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from physx_cluster.sweep.definition import Definition
+from physx_cluster.sweep.errors import StudyError
+from physx_cluster.sweep.executors.executor import Executor, Job
+from physx_cluster.sweep.plan import Plan
+from physx_cluster.sweep.results import FAILED, FAILURE, OUTPUT, Failure, Result, Trial
+from physx_cluster.sweep.study import Study
+from physx_core import files
+from physx_core.errors import PhysxError
+
+Say = Callable[[str], None]
+Start = Callable[[Definition], Executor]
+
+
+def run_study(definition: Definition, folder: Path, say: Say, start: Start | None = None) -> Study:
+    """Run all trials of a study that have no result yet, and return it, closed.
+
+    Args:
+        definition: What the study is made of.
+        folder: Its folder; one that is there is continued.
+        say: Prints a line for the user.
+        start: Starts the executor; None: the one that the definition names.
+
+    Raises:
+        StudyError: If the folder holds another study, or trials were given up; the same call
+            continues.
+        ConfigError: If sampler, pruner or executor cannot be used as they are to be.
+    """
+    with Study.open(folder, definition) as study:
+        plan = Plan(definition)
+        say(f"study: {folder} ({plan.total} trials, {len(study.results)} of them done)")
+        with _Workers(study, start or _start_executor, say, plan.total) as workers:
+            while batch := plan.next_batch():
+                for trial in batch:
+                    study.prepare(trial)
+                workers.run(batch)
+                plan.tell(study.results)
+    return study
+
+
+def _start_executor(definition: Definition) -> Executor:
+    options, threads = definition.run.options, definition.study.threads
+    match definition.run.executor:
+        case "ray":
+            from physx_cluster.sweep.executors.ray import RayExecutor
+
+            return RayExecutor(options, threads)
+        case "slurm":
+            from physx_cluster.sweep.executors.slurm import SlurmExecutor
+
+            return SlurmExecutor(options, threads)
+    from physx_cluster.sweep.executors.local import LocalExecutor
+
+    return LocalExecutor(options, threads)
+
+
+@dataclass
+class _Attempts:
+    """What is known of the attempts at a trial.
+
+    Attributes:
+        trial: The trial.
+        in_vain: Number of attempts in a row that got no further than the one before.
+        reached: How far the last one got.
+    """
+
+    trial: Trial
+    in_vain: int = 0
+    reached: frozenset[str] = field(default_factory=frozenset)
+
+
+class _Workers:
+    """Runs trials at the same time, and restarts those that end without a result."""
+
+    def __init__(self, study: Study, start: Start, say: Say, total: int) -> None:
+        self._study, self._say, self._total = study, say, total
+        self._run = study.definition.run
+        self._start = start
+        self._executor: Executor | None = None
+        self._jobs: dict[Job, _Attempts] = {}
+        self._given_up: list[tuple[Trial, str]] = []
+        self._is_in_vain = False  # as each trial would end by the same error
+
+    def __enter__(self) -> _Workers:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._executor is not None:
+            self._executor.close()
+
+    def run(self, batch: Sequence[Trial]) -> None:
+        """Run the trials of a batch until each has a result.
+
+        Raises:
+            StudyError: If some were given up.
+        """
+        waiting = [_Attempts(trial) for trial in batch if self._study.take_result(trial) is None]
+        while waiting or self._jobs:
+            while waiting and len(self._jobs) < self._run.parallel:
+                self._begin(waiting.pop(0))
+            ended = [job for job in self._jobs if job.has_ended()]
+            for job in ended:
+                attempts = self._jobs.pop(job)
+                if self._is_unfinished(attempts, job):
+                    waiting.insert(0, attempts)
+            waiting = [] if self._is_in_vain else waiting
+            if not ended:
+                time.sleep(self._executor.interval if self._executor is not None else 0.0)
+        if self._given_up:
+            raise self._error()
+
+    def _begin(self, attempts: _Attempts) -> None:
+        if self._executor is None:
+            self._executor = self._start(self._study.definition)
+        folder = self._study.folder_of(attempts.trial)
+        attempts.reached = _reached(folder)
+        files.remove(folder / FAILURE)
+        self._jobs[self._executor.start(folder.resolve())] = attempts
+
+    def _is_unfinished(self, attempts: _Attempts, job: Job) -> bool:
+        """Take the result of a trial whose process has ended; return whether it needs another."""
+        trial = attempts.trial
+        folder = self._study.folder_of(trial)
+        result = self._study.take_result(trial)
+        if result is not None:
+            self._tell(trial, result)
+            return False
+        failure = Failure.read(folder)
+        advances = bool(_reached(folder) - attempts.reached)
+        attempts.in_vain = 0 if advances else attempts.in_vain + 1
+        why = f"{failure.error}: {failure.message}" if failure is not None else job.describe_end()
+        is_final = failure is not None and failure.is_final
+        if not is_final and attempts.in_vain <= self._run.restarts:
+            self._say(f"{self._name(trial)} {_short(why)}; it is continued")
+            return True
+        if failure is not None and failure.is_result:
+            Result(FAILED, error=failure.error).write(folder)
+            result = self._study.take_result(trial)
+            assert result is not None
+            self._tell(trial, result, failure.message)
+        else:
+            self._given_up.append((trial, why))
+            self._is_in_vain |= is_final
+            self._say(f"{self._name(trial)} {_short(why)}; it is given up")
+        return False
+
+    def _tell(self, trial: Trial, result: Result, message: str = "") -> None:
+        text = f"{self._study.definition.study.result} {result.value:.6g}"
+        if result.state == FAILED:
+            text = f"{result.error}: {_short(message)}" if message else result.error
+        self._say(f"{self._name(trial)}: {result.state}, {text}")
+
+    def _name(self, trial: Trial) -> str:
+        return f"trial {trial.number} of {self._total} ({describe_trial(trial)})"
+
+    def _error(self) -> PhysxError:
+        trial, why = self._given_up[0]
+        count = len(self._given_up)
+        others = f" (In all {count} trials were given up.)" if count > 1 else ""
+        output = self._study.folder_of(trial) / OUTPUT
+        return StudyError(
+            f"Trial {trial.number} ({describe_trial(trial)}) has no result: "
+            f"{_sentence(why)}{others} See {output}. When that is put right, the same "
+            "command continues."
+        )
+
+
+def describe_trial(trial: Trial) -> str:
+    """Return pipeline, setting and seed of a trial in words."""
+    values: Mapping[str, object] = trial.values
+    settings = [f"{name.rpartition('.')[2]} {_number(value)}" for name, value in values.items()]
+    return ", ".join([trial.pipeline, *settings, f"seed {trial.seed}"])
+
+
+def _number(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _reached(folder: Path) -> frozenset[str]:
+    """Return what a trial has brought about: later attempts continue from it."""
+    names = {path.parent.name for path in folder.glob("network/*/checkpoint.toml")}
+    return frozenset(names | {path.name for path in folder.glob("generated")})
+
+
+def _short(text: str) -> str:
+    line = text.strip().partition("\n")[0]
+    return line if len(line) <= 160 else f"{line[:157]}..."
+
+
+def _sentence(why: str) -> str:
+    text = why.strip()
+    return text if text.endswith(".") else f"{text}."

@@ -1,0 +1,254 @@
+"""Study: the folder of a sweep, with a session for each trial and the table of their results."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import statistics
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import tomli_w
+
+from physx_cluster.sweep.definition import Definition
+from physx_cluster.sweep.errors import StudyError
+from physx_cluster.sweep.optuna import check_optuna
+from physx_cluster.sweep.plan import Plan
+from physx_cluster.sweep.results import COMPLETE, LOCK, TRIAL, Result, Trial
+from physx_core import Closeable, files
+from physx_core.config import read_toml
+from physx_core.errors import PhysxError
+
+STUDY, TABLE = "study.toml", "trials.csv"
+_LOCK = "study.lock"
+
+
+@dataclass(frozen=True)
+class Best:
+    """The setting with the best result, the mean over its seeds.
+
+    Attributes:
+        trials: Its trials.
+        value: The mean.
+    """
+
+    trials: tuple[Trial, ...]
+    value: float
+
+
+class Study(Closeable):
+    """The folder of a study: ``study.toml``, ``trials.csv``, and the session of each trial.
+
+    The table has a row for each trial with a result, by number. It depends on the definition alone:
+    not on the number of processes, nor on what was killed, nor on time.
+
+    Attributes:
+        folder: The folder.
+        definition: What the study is made of.
+        trials: The trials that were chosen so far, by number.
+        results: The results that there are, by the number of the trial.
+    """
+
+    def __init__(self, folder: Path, definition: Definition) -> None:
+        """Read the trials and results of a folder, which need not exist.
+
+        Raises:
+            StudyError: If a file is damaged.
+        """
+        self.folder, self.definition = folder, definition
+        self.trials: dict[int, Trial] = {}
+        self.results: dict[int, Result] = {}
+        self._lock: int | None = None
+        for path in sorted(folder.glob(f"trial_*/{TRIAL}")):
+            trial, _ = read_trial(path.parent)
+            self.trials[trial.number] = trial
+            result = Result.read(path.parent)
+            if result is not None:
+                self.results[trial.number] = result
+
+    @classmethod
+    def read(cls, folder: Path) -> Self:
+        """Read a study's folder, of a sweep that runs, too.
+
+        Raises:
+            StudyError: If there is no study, or a file of it is damaged.
+        """
+        if not (folder / STUDY).is_file():
+            raise StudyError(
+                f"There is no study in {folder}, as it has no {STUDY}. Make one: physx sweep FILE"
+            )
+        return cls(folder, Definition.read(folder / STUDY, folder.resolve().name))
+
+    @classmethod
+    def open(cls, folder: Path, definition: Definition) -> Self:
+        """Begin a study, or continue the one in the folder; no other process may write to it.
+
+        Raises:
+            StudyError: If another sweep writes to it, or the definition differs from that of the
+                trials that are there such that their results would.
+            ConfigError: If the sampler or the pruner cannot be used.
+        """
+        options = definition.study
+        check_optuna(options.sampler, options.sampler_kwargs, options.pruner, options.pruner_kwargs)
+        Plan(definition)
+        try:
+            files.make_folder(folder)
+            lock = files.try_lock(folder / _LOCK)
+        except OSError as error:
+            raise StudyError(
+                f"The study {folder} cannot be written to: {error.strerror}."
+            ) from None
+        if lock is None:
+            raise StudyError(f"Another sweep writes to {folder}: wait for it, or end it.")
+        try:
+            former = folder / STUDY
+            if former.exists():
+                change = definition.find_change(read_toml(former))
+                if change:
+                    raise StudyError(
+                        f"{folder} holds a study of another definition: {change}. Give the same, "
+                        "or another folder (--study). Only study.trials may grow, and [run] may "
+                        "change."
+                    )
+            files.replace(former, tomli_w.dumps(definition.plain).encode())
+            study = cls(folder, definition)
+        except BaseException:
+            files.close(lock)
+            raise
+        study._lock = lock
+        study.write_table()
+        return study
+
+    def close(self) -> None:
+        """Let other processes write to it."""
+        if self._lock is not None:
+            files.close(self._lock)
+            self._lock = None
+
+    def folder_of(self, trial: Trial) -> Path:
+        """Return the session's folder of a trial."""
+        return self.folder / trial.name
+
+    def prepare(self, trial: Trial) -> None:
+        """Make the session's folder of a trial, with what it is to do.
+
+        Raises:
+            StudyError: If another trial was planned in its place.
+        """
+        folder = self.folder_of(trial)
+        former = self.trials.get(trial.number)
+        if former is not None and former != trial:
+            raise StudyError(
+                f"{folder} holds another trial than the one that is its turn: {former.values}, not "
+                f"{trial.values}. Its results were changed, or Optuna is of another version: "
+                "continue with the former version, or begin another study (--study)."
+            )
+        files.make_folder(folder)
+        tables = self.definition.pipelines[trial.pipeline].with_setting(trial.values, trial.seed)
+        content = tomli_w.dumps({"trial": vars(trial), "pipelines": tables}).encode()
+        if former is None or (folder / TRIAL).read_bytes() != content:
+            files.replace(folder / TRIAL, content)
+        self.trials[trial.number] = trial
+
+    def take_result(self, trial: Trial) -> Result | None:
+        """Return the result of a trial, and add it to the table; None if there is none yet."""
+        if trial.number not in self.results:
+            result = Result.read(self.folder_of(trial))
+            if result is None:
+                return None
+            self.results[trial.number] = result
+            self.write_table()
+        return self.results[trial.number]
+
+    def write_table(self) -> None:
+        """Write ``trials.csv``, all or nothing."""
+        text = io.StringIO(newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        columns = self.definition.columns
+        head = ("trial", "pipeline", "setting", "seed", *columns)
+        writer.writerow((*head, "state", "epochs", self.definition.study.result, "error"))
+        for number, result in sorted(self.results.items()):
+            trial = self.trials[number]
+            values = [_text(trial.values.get(name)) for name in columns]
+            value = "" if math.isnan(result.value) else repr(result.value)
+            epochs = "" if result.epochs is None else result.epochs
+            place = (number, trial.pipeline, trial.setting, trial.seed)
+            writer.writerow((*place, *values, result.state, epochs, value, result.error))
+        try:
+            files.replace(self.folder / TABLE, text.getvalue().encode())
+        except OSError as error:
+            raise StudyError(
+                f"{self.folder / TABLE} cannot be written: {error.strerror}. The results are kept "
+                "in the trials' folders: the same command continues."
+            ) from None
+
+    def best(self) -> Best | None:
+        """Return the setting with the best result; None if none is complete with all seeds."""
+        groups: dict[tuple[str, int], list[Trial]] = {}
+        for trial in self.trials.values():
+            groups.setdefault((trial.pipeline, trial.setting), []).append(trial)
+        found = []
+        for trials in groups.values():
+            results = [self.results.get(trial.number) for trial in trials]
+            done = [each for each in results if each is not None and each.state == COMPLETE]
+            if len(done) == len(self.definition.study.seeds):
+                found.append(Best(tuple(trials), statistics.fmean(each.value for each in done)))
+        sound = [each for each in found if not math.isnan(each.value)]
+        return min(sound, key=lambda each: self.definition.sign * each.value, default=None)
+
+    def is_running(self, trial: Trial) -> bool:
+        """Return whether a process works on a trial."""
+        path = self.folder_of(trial) / LOCK
+        if not path.exists():
+            return False
+        lock = files.try_lock(path)
+        if lock is not None:
+            files.close(lock)
+        return lock is None
+
+
+def read_trial(folder: Path) -> tuple[Trial, Mapping[str, Mapping[str, Any]]]:
+    """Return the trial of a folder, and the tables of its pipelines.
+
+    Raises:
+        StudyError: If the folder has none, or it is damaged.
+    """
+    try:
+        plain = read_toml(folder / TRIAL)
+        trial = Trial(**plain["trial"])
+        if trial.name != folder.name:
+            raise ValueError(f"it belongs to {trial.name}")
+        return trial, dict(plain["pipelines"])
+    except (PhysxError, LookupError, TypeError, ValueError) as error:
+        raise StudyError(f"{folder / TRIAL} is damaged: {error}.") from None
+
+
+def earlier_results(folder: Path, trial: Trial) -> Iterator[Result | None]:
+    """Yield the results of the trials of a trial's pipeline before it, in their order.
+
+    Those of its own batch, whose results may or may not be there, are None.
+
+    Args:
+        folder: The study's folder.
+        trial: The trial.
+    """
+    for path in sorted(folder.glob(f"trial_*/{TRIAL}")):
+        other, _ = read_trial(path.parent)
+        if other.number < trial.number and other.pipeline == trial.pipeline:
+            yield Result.read(path.parent) if other.number <= trial.known else None
+
+
+def is_study(folder: Path) -> bool:
+    """Return whether a folder is that of a study."""
+    return (folder / STUDY).is_file()
+
+
+def _text(value: Any) -> str:
+    """Return a value of a parameter as the table has it; empty if the pipeline has no such one."""
+    if value is None:
+        return ""
+    return value if isinstance(value, str) else json.dumps(value)
