@@ -207,7 +207,8 @@ def build_stage(
     plain = {n if f"{n}_config" not in names else f"{n}_config": v for n, v in table.items()}
     if "environment" in table and "environment" not in table["environment"]:
         raise ConfigError(f"The table [{kind}.environment] does not name the environment.")
-    return from_plain(made, {**plain, **given})
+    built: T = from_plain(made, {**plain, **given})
+    return built
 
 
 def _flat(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -123,8 +123,7 @@ class Failure:
 
     def write(self, folder: Path) -> None:
         """Write it into a trial's folder."""
-        plain = {"error": self.error, "message": self.message}
-        plain |= {"is_final": self.is_final, "is_result": self.is_result}
+        plain = vars(self)
         files.replace(folder / FAILURE, tomli_w.dumps(plain).encode())
 
     @classmethod
