@@ -57,7 +57,9 @@ clean:
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(PACKAGES)
 	touch $@
 
-.venv/tools: .venv/packages requirements-dev.txt requirements-nodeps.txt
+.venv/tools: .venv/packages requirements-dev.txt requirements-nodeps.txt requirements-lerobot.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements-nodeps.txt
+	rm -rf .venv/lerobot
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --target .venv/lerobot -r requirements-lerobot.txt
 	touch $@

@@ -11,4 +11,5 @@ from .networks.unet_transformation import UNetTransformation as UNetTransformati
 from .training.data import StoredDataset as StoredDataset
 from .training.optimization import TorchOptimization as TorchOptimization
 from .training.tensorboard import TensorBoard as TensorBoard
+from .training.wandb import WandB as WandB
 from .version import __version__ as __version__

@@ -34,4 +34,7 @@ def physx_transformations() -> dict[str, str]:
 @hookimpl
 def physx_visualizers() -> dict[str, str]:
     """Return the observers by name."""
-    return {"tensorboard": "physx_torch.training.tensorboard:TensorBoard"}
+    return {
+        "tensorboard": "physx_torch.training.tensorboard:TensorBoard",
+        "wandb": "physx_torch.training.wandb:WandB",
+    }

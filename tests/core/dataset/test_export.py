@@ -249,7 +249,47 @@ LIBRARIES = {
     "parquet": "pyarrow",
     "zarr": "zarr",
     "minari": "minari",
+    "lerobot": "pyarrow",
 }
+
+
+def needed(to):
+    """Return the options without which a format refuses to work."""
+    return ExportOptions(fps=50) if to == "lerobot" else ExportOptions()
+
+
+def test_lerobot_keeps_every_value_of_the_types_that_it_has(folder, tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    pytest.importorskip("pandas")
+    arrays = table([dtype for dtype in DTYPES if not dtype.startswith("c")])
+    options = ExportOptions(actions=["f8_1", "f8_0"], rewards="f4_0", fps=20, task="lift")
+    with make(folder, {"training": arrays}) as dataset:
+        assert export(dataset, "lerobot", tmp_path / "out", options=options) == {"training": ROWS}
+    frames = parquet.read_table(tmp_path / "out/data/chunk-000/file-000.parquet")
+    episodes = parquet.read_table(tmp_path / "out/meta/episodes/chunk-000/file-000.parquet")
+    assert episodes["dataset_to_index"].to_pylist() == [20, 40, 60]
+    action = np.array(frames["action"].to_pylist())
+    assert_array_equal(action, np.column_stack([arrays["f8_1"], arrays["f8_0"]]))
+    assert_array_equal(np.array(frames["next.reward"].to_pylist(), "f4"), arrays["f4_0"])
+    for name in arrays.keys() - {"f8_1", "f8_0", "f4_0"}:
+        found = np.array(frames[f"observation.{name}"].to_pylist(), arrays[name].dtype)
+        assert_array_equal(found, arrays[name])
+
+
+@pytest.mark.parametrize(
+    ("arrays", "options", "message"),
+    [
+        ({"x": values("c8", (2,))}, {}, "no feature for the field"),
+        ({"x": values("f8", (0,))}, {}, "no feature for the field"),
+        ({"x": values("f8", (1,) * 6)}, {}, "1 to 5 axes"),
+        (table(["f8", "f4"]), {"actions": ["f8_0", "f4_1"]}, "one vector"),
+        (table(["f8"]), {"actions": ["f8_0", "f8_2"]}, "one vector"),
+    ],
+)
+def test_what_lerobot_has_no_place_for_is_named(folder, tmp_path, arrays, options, message):
+    pytest.importorskip("pandas")
+    with make(folder, {"training": arrays}) as dataset, pytest.raises(ExchangeError, match=message):
+        export(dataset, "lerobot", tmp_path / "out", options=ExportOptions(fps=50, **options))
 
 
 # What is rejected --------------------------------------------------------------------------------
@@ -257,12 +297,12 @@ LIBRARIES = {
 
 @pytest.mark.parametrize(
     ("to", "library"),
-    [("parquet", "pyarrow"), ("zarr", "zarr"), ("minari", "minari")],
+    [("parquet", "pyarrow"), ("zarr", "zarr"), ("minari", "minari"), ("lerobot", "pandas")],
 )
 def test_a_missing_library_is_named_with_its_extra(everything, tmp_path, monkeypatch, to, library):
     monkeypatch.setitem(__import__("sys").modules, library, None)
     with pytest.raises(MissingLibraryError, match=rf'pip install .*physx.core\[{to}\]"'):
-        export(everything, to, tmp_path / "out")
+        export(everything, to, tmp_path / "out", options=needed(to))
     assert [p.name for p in tmp_path.iterdir()] == ["data"]
 
 
@@ -272,8 +312,14 @@ def test_invalid_exports_are_rejected(everything, tmp_path):
         export(everything, "parket", out)
     with pytest.raises(ConfigError, match="deflate, none"):
         export(everything, "npz", out, options=ExportOptions(compression="zip"))
-    with pytest.raises(ConfigError, match="for minari"):
+    with pytest.raises(ConfigError, match="actions is for .*minari.*, not for npz"):
         export(everything, "npz", out, options=ExportOptions(actions=["f8_0"]))
+    with pytest.raises(ConfigError, match="fps is for lerobot, not for minari"):
+        export(everything, "minari", out, options=ExportOptions(fps=3))
+    with pytest.raises(ConfigError, match="give it with fps"):
+        export(everything, "lerobot", out)
+    with pytest.raises(ConfigError, match="fps is 0"):
+        export(everything, "lerobot", out, options=ExportOptions(fps=0))
     with pytest.raises(DatasetError, match="no mode"):
         export(everything, "npz", out, modes=["test"])
     with pytest.raises(ExchangeError, match="exists already"):
@@ -304,7 +350,7 @@ def test_an_export_that_fails_leaves_nothing(folder, tmp_path, to):
         for path in folder.glob("*_f8_2_*.h5"):
             path.write_bytes(path.read_bytes()[:5000])
         with pytest.raises(DatasetError):
-            export(dataset, to, tmp_path / "out")
+            export(dataset, to, tmp_path / "out", options=needed(to))
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
 
 
@@ -316,19 +362,21 @@ import resource
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
 import signal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-sys.exit(main(["export", {folder!r}, {out!r}, "--to", {to!r}]))
+sys.exit(main(["export", {folder!r}, {out!r}, "--to", {to!r}, *{more!r}]))
 """
 
 
-@pytest.mark.parametrize("to", ["npz", "parquet", "zarr", "hdf5-single"])
+@pytest.mark.parametrize("to", ["npz", "parquet", "lerobot", "zarr", "hdf5-single"])
 def test_a_full_disk_is_an_error(folder, tmp_path, to):
     """A limit of the file size simulates the disk: writing fails in the same way."""
     pytest.importorskip(LIBRARIES[to])
     with Dataset.create(folder) as dataset:
         random = np.random.default_rng(0)
-        dataset.append("training", {"x": random.normal(size=(20_000, 9)), "y": np.zeros(20_000)})
+        counters = {"episode": np.zeros(20_000, "i8"), "step": np.arange(20_000)}
+        dataset.append("training", {"x": random.normal(size=(20_000, 9)), **counters})
     out = tmp_path / "out"
-    code = FULL.format(path=sys.path, folder=str(folder), out=str(out), to=to)
+    more = ["--fps", "50"] if to == "lerobot" else []
+    code = FULL.format(path=sys.path, folder=str(folder), out=str(out), to=to, more=more)
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert run.returncode == 1, run.stderr
     assert "ExchangeError" in run.stderr and "cannot be written" in run.stderr
@@ -364,7 +412,7 @@ def test_memory_holds_a_few_blocks(folder, tmp_path, to):
         dataset.append("training", rows)
         del rows
         tracemalloc.start()
-        export(dataset, to, tmp_path / "out")
+        export(dataset, to, tmp_path / "out", options=needed(to))
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
     assert peak < 60e6  # the rows are 80 MB

@@ -2,6 +2,9 @@
 
 import pickle
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -186,3 +189,14 @@ def test_the_robot_and_its_state_have_the_names_of_jiminy():
     assert (env.robot.nq, env.robot.nv) == (15, 14)
     np.testing.assert_array_equal(env.robot_state.u_motor, env.robot_state.torques)
     assert np.all(env.robot_state.u_motor == 1.0)
+
+
+def test_a_trainer_in_one_file_learns_with_gymnasiums_own_vector_environments():
+    """As CleanRL's scripts do, which know Gymnasium only."""
+    pytest.importorskip("torch")
+    program = Path(__file__).parents[1] / "programs/single_file_ppo.py"
+    command = [sys.executable, program, "physx/Cartpole-v0", "12288"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert not ended.returncode, ended.stderr
+    first, last = map(float, ended.stdout.split())
+    assert last > 2 * first

@@ -1,4 +1,4 @@
-"""``physx export``: export a dataset as npz, Parquet, Minari, Zarr or a single HDF5 file."""
+"""``physx export``: export a dataset as npz, Parquet, Minari, LeRobot, Zarr or one HDF5 file."""
 
 from __future__ import annotations
 
@@ -20,34 +20,45 @@ class Export:
     """Write the samples of a dataset as one file or folder of another format.
 
     npz: NumPy. hdf5-single: one plain HDF5 file with MODE/FIELD. parquet: columns, for pandas,
-    polars and databases. zarr: chunked arrays. minari: episodes for offline reinforcement learning.
+    polars and databases. zarr: chunked arrays, for xarray. minari: episodes for offline
+    reinforcement learning. lerobot: episodes for imitation learning, in version 3 of LeRobot's
+    format.
     """
 
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
     """A session's or a dataset's folder."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
-    """The file, or the folder for zarr and minari, to create."""
-    to: Literal["npz", "parquet", "minari", "zarr", "hdf5-single"]
+    """The file, or the folder for zarr, minari and lerobot, to create."""
+    to: Literal["npz", "parquet", "minari", "lerobot", "zarr", "hdf5-single"]
     """The format."""
     mode: tuple[str, ...] = ()
-    """Modes to export; by default all with samples. Parquet and minari take one."""
+    """Modes to export; by default all with samples. Parquet, minari and lerobot take one."""
     compression: str = "none"
     """npz: deflate; parquet: snappy, gzip, zstd, lz4, brotli; zarr: zstd, gzip, blosc;
     hdf5-single: gzip, lzf."""
     observations: tuple[str, ...] = ()
-    """minari: fields of the observations; by default all training fields without another role,
-    as a dictionary. A single field is the observation itself."""
+    """minari, lerobot: fields of the observations; by default all training fields without another
+    role. A single field is the observation itself."""
     actions: tuple[str, ...] = ()
-    """minari: fields of the actions; by default there is one action, without effect."""
+    """minari, lerobot: fields of the actions; by default minari has one action, without effect."""
     rewards: str | None = None
-    """minari: field that is the reward; by default rewards are 0."""
+    """minari, lerobot: field that is the reward; by default minari's rewards are 0."""
+    fps: int | None = None
+    """lerobot: frames per second of simulated time; it must be given."""
+    task: str | None = None
+    """lerobot: what is done, in words."""
 
 
 def run(words: Sequence[str]) -> None:
     """Export a dataset and print the number of exported samples."""
     options = tyro.cli(Export, args=words, prog="physx export")
     form = ExportOptions(
-        options.compression, options.observations, options.actions, options.rewards
+        options.compression,
+        options.observations,
+        options.actions,
+        options.rewards,
+        options.fps,
+        options.task,
     )
     bar = ProgressBar()
     with Dataset.open(options.directory) as dataset:

@@ -10,6 +10,7 @@ from pathlib import Path
 from physx_core.dataset.dataset import Dataset
 from physx_core.dataset.exchange import (
     hdf5_format,
+    lerobot_format,
     minari_format,
     npz_format,
     parquet_format,
@@ -27,17 +28,23 @@ class Format:
         write: Writes tables to a path; returns how many rows it left out.
         compressions: Names of its compressions, "none" first.
         several: Whether one file holds several modes.
+        options: Which of the options for episodes it takes.
     """
 
     write: Callable[[Sequence[Table], Path, ExportOptions], int]
     compressions: Collection[str]
     several: bool
+    options: Collection[str] = ()
 
+
+_ROLES = ("observations", "actions", "rewards")
+_EPISODES = (*_ROLES, "fps", "task")
 
 FORMATS = {
     "npz": Format(npz_format.write, npz_format.COMPRESSIONS, True),
     "parquet": Format(parquet_format.write, parquet_format.COMPRESSIONS, False),
-    "minari": Format(minari_format.write, ("none",), False),
+    "minari": Format(minari_format.write, ("none",), False, _ROLES),
+    "lerobot": Format(lerobot_format.write, ("none",), False, _EPISODES),
     "zarr": Format(zarr_format.write, zarr_format.COMPRESSIONS, True),
     "hdf5-single": Format(hdf5_format.write, hdf5_format.COMPRESSIONS, True),
 }
@@ -60,8 +67,8 @@ def export(
     Args:
         dataset: The dataset.
         to: Name of the format, one of `FORMATS`.
-        out: The file, or the folder for zarr and minari. It must not exist.
-        modes: Names of the modes; empty: all that have rows. Parquet and minari hold one.
+        out: The file, or the folder for zarr, minari and lerobot. It must not exist.
+        modes: Names of the modes; empty: all that have rows. Parquet, minari and lerobot hold one.
         options: Options of the format.
         advance: Is called with the number of bytes read.
 
@@ -110,8 +117,12 @@ def _choose_format(to: str, options: ExportOptions) -> Format:
         raise ConfigError(
             f'{to} has no compression "{options.compression}". It has: {listed(form.compressions)}.'
         )
-    if to != "minari" and (options.observations or options.actions or options.rewards):
-        raise ConfigError(f"Observations, actions and rewards are for minari, not for {to}.")
+    for name in _EPISODES:
+        if getattr(options, name) not in ((), None) and name not in form.options:
+            takers = [other for other, known in FORMATS.items() if name in known.options]
+            raise ConfigError(f"{name} is for {listed(takers)}, not for {to}.")
+    if options.fps is not None and options.fps < 1:
+        raise ConfigError(f"fps is {options.fps}: at least 1 frame per second.")
     return form
 
 

@@ -11,15 +11,15 @@ import json
 import re
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from physx_core.dataset.exchange.roles import Roles
 from physx_core.dataset.exchange.table import ExportOptions, Table, encode_notes, import_library
 from physx_core.dataset.read.episodes import Episode, find_episodes
-from physx_core.errors import ConfigError, ExchangeError, listed, nearest
+from physx_core.errors import ExchangeError
 from physx_core.fields import Field
 from physx_core.typing import Batch
 
@@ -28,43 +28,6 @@ _OVERHEAD = 6000
 _OWN_ARRAYS = 4
 """Arrays that Minari adds to each episode: actions, rewards, terminations, truncations."""
 _NAME = re.compile(r"[-_\w]+-v\d+")
-
-
-@dataclass(frozen=True)
-class Roles:
-    """The roles of a mode's fields in an episode; the other fields are its infos.
-
-    Attributes:
-        observations: One field that is the observation itself, or several that are its entries.
-        actions: Likewise for the actions; none: there is only one action, which does nothing.
-        rewards: Field that is the reward, one number; None: the reward is 0.
-        entries: Whether the observation is a dictionary even if it is one field.
-    """
-
-    observations: Sequence[str]
-    actions: Sequence[str]
-    rewards: str | None
-    entries: bool
-
-    @classmethod
-    def choose(cls, table: Table, options: ExportOptions) -> Roles:
-        """Complete what a user chose."""
-        observations, actions, rewards = options.observations, options.actions, options.rewards
-        chosen = [*observations, *actions, *([] if rewards is None else [rewards])]
-        for name in chosen:
-            if name not in table.fields:
-                raise ConfigError(
-                    f'Mode "{table.mode}" has no field "{name}".{nearest(name, table.fields)} '
-                    f"Fields: {listed(table.fields)}."
-                )
-            if chosen.count(name) > 1:
-                raise ConfigError(f'The field "{name}" is chosen more than once.')
-        if rewards is not None and table.fields[rewards].shape != ():
-            raise ConfigError(f'The reward "{rewards}" is not one number.')
-        rest = [n for n, f in table.fields.items() if f.role == "training" and n not in chosen]
-        if not observations and not rest:
-            raise ConfigError("No field is left for the observations.")
-        return cls(observations or rest, actions, rewards, not observations)
 
 
 def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:

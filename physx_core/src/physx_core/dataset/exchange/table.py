@@ -33,16 +33,20 @@ class ExportOptions:
 
     Attributes:
         compression: Name of the format's compression, or "none".
-        observations: Fields that are the observations of an episode (minari only); empty: all
-            training fields without another role.
-        actions: Fields that are its actions (minari only).
-        rewards: Field that is its rewards (minari only); None: they are 0.
+        observations: Fields that are the observations of an episode (minari and lerobot only);
+            empty: all training fields without another role.
+        actions: Fields that are its actions (likewise).
+        rewards: Field that is its rewards (likewise); None: minari has zeros, lerobot none.
+        fps: Frames per second of simulated time (lerobot only, and needed there).
+        task: What is done, in words (lerobot only).
     """
 
     compression: str = "none"
     observations: Sequence[str] = ()
     actions: Sequence[str] = ()
     rewards: str | None = None
+    fps: int | None = None
+    task: str | None = None
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,13 @@
-"""Zarr: a folder with ``<mode>/<field>``, chunked along the rows, with units as attributes."""
+"""Zarr: a folder with ``<mode>/<field>``, chunked along the rows, with units as attributes.
+
+``xarray.open_zarr(folder, group=mode)`` opens a mode. Metadata are consolidated, so that this reads
+one file.
+"""
 
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -34,6 +39,9 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
         group = root.create_group(table.mode)
         for name in table.fields:
             _write_field(group, table, name, used)
+    with warnings.catch_warnings():  # that other libraries than zarr and xarray may not know it
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(str(out))
     return 0
 
 

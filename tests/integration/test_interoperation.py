@@ -1,0 +1,99 @@
+"""What physx stores, read by unmodified libraries of others; the trainers' side is in tests/gym."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from physx_core import Dataset
+from physx_core.dataset.exchange import ExportOptions, export
+
+PROGRAMS = Path(__file__).parent / "programs"
+ROWS = 60
+
+
+@pytest.fixture
+def dataset(tmp_path):
+    """Two instances with three trajectories of ten samples each, in turn."""
+    rng = np.random.default_rng(0)
+    rows = {
+        "state": rng.normal(size=(ROWS, 3)),
+        "grid": rng.normal(size=(ROWS, 2, 3)).astype("f4"),
+        "image": rng.integers(0, 256, (ROWS, 4, 5, 3)).astype("u1"),
+        "torque": rng.normal(size=(ROWS, 2)),
+        "lever": rng.normal(size=ROWS),
+        "reward": rng.normal(size=ROWS).astype("f4"),
+        "flag": rng.integers(0, 2, ROWS).astype("?"),
+        "env_id": np.tile([1, 2], ROWS // 2).astype("i4"),
+        "episode": np.repeat([0, 1, 2], ROWS // 3),
+        "step": np.arange(ROWS) // 2,
+    }
+    with Dataset.create(tmp_path / "data") as dataset:
+        dataset.append("training", rows)
+        yield dataset
+
+
+def unnested(values):
+    """Return arrays of arrays, as pandas keeps them, as one array."""
+    return np.stack([unnested(value) for value in values]) if values.dtype == "O" else values
+
+
+def test_pandas_reads_the_parquet_file(dataset, tmp_path):
+    pandas = pytest.importorskip("pandas")
+    export(dataset, "parquet", tmp_path / "rows.parquet")
+    frame = pandas.read_parquet(tmp_path / "rows.parquet")
+    for name, values in dataset["training"].items():
+        assert_array_equal(unnested(frame[name].to_numpy()), values[:])
+    means = frame.groupby("env_id")["lever"].mean()
+    assert means[1] == pytest.approx(dataset["training"]["lever"][:][::2].mean())
+
+
+@pytest.mark.filterwarnings("error")
+def test_xarray_opens_the_zarr_folder(dataset, tmp_path):
+    xarray = pytest.importorskip("xarray")
+    export(dataset, "zarr", tmp_path / "rows.zarr")
+    with xarray.open_zarr(tmp_path / "rows.zarr", group="training") as found:
+        assert found.sizes["sample"] == ROWS
+        for name, values in dataset["training"].items():
+            assert found[name].dtype == values.dtype
+            assert_array_equal(found[name].to_numpy(), values[:])
+    with xarray.open_datatree(tmp_path / "rows.zarr", engine="zarr") as tree:
+        assert list(tree.children) == ["training"]
+
+
+def test_lerobot_loads_its_format(dataset, tmp_path):
+    library = Path(sys.prefix) / "lerobot"
+    if not library.is_dir():
+        assert not os.environ.get("CI"), f"{library} is missing: make test installs it"
+        pytest.skip(f"LeRobot is not installed in {library}: make test installs it")
+    options = ExportOptions(
+        observations=["state"], actions=["torque", "lever"], rewards="reward", fps=50, task="swing"
+    )
+    assert export(dataset, "lerobot", tmp_path / "arm", options=options) == {"training": ROWS}
+    command = [sys.executable, PROGRAMS / "read_lerobot.py", tmp_path / "arm", tmp_path / "out.npz"]
+    offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "home")}
+    variables = os.environ | offline | {"PYTHONPATH": str(library)}
+    ended = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
+    assert not ended.returncode, ended.stderr
+    stored = {name: values[:] for name, values in dataset["training"].items()}
+    order = np.lexsort([stored["step"], stored["env_id"], stored["episode"]])
+    rows = {name: values[order] for name, values in stored.items()}
+    actions = np.concatenate([rows["torque"], rows["lever"][:, None]], axis=1)
+    with np.load(tmp_path / "out.npz") as found:
+        # torch datasets of LeRobot give float32 and int64, whatever is stored
+        assert_array_equal(found["observation.state"], rows["state"].astype("f4"))
+        assert_array_equal(found["action"], actions.astype("f4"))
+        assert_array_equal(found["next.reward"], rows["reward"])
+        for name in ("grid", "image", "flag", "env_id", "episode", "step"):
+            assert_array_equal(found[f"info.{name}"], rows[name])
+        assert found["lengths"].tolist() == [10] * 6
+        assert_array_equal(found["frame_index"], np.tile(np.arange(10), 6))
+        assert_array_equal(found["timestamp"], np.tile(np.arange(10) / 50, 6).astype("f4"))
+        following = np.where(np.arange(ROWS) % 10 == 9, np.arange(ROWS), np.arange(ROWS) + 1)
+        assert_array_equal(found["ahead"][:, 1], rows["state"].astype("f4")[following])
+        assert found["mean"] == pytest.approx(rows["state"].mean(axis=0))
+        assert set(found["tasks"]) == {"swing"}
