@@ -1,4 +1,4 @@
-"""Runs the code of README.md and of the pages in docs/, each page in order, in a folder of its own.
+"""Runs the code of README.md and of the pages in docs/, each in a folder of its own.
 
 python docs/run_pages.py [PAGE ...]    # all pages, or some; says which block failed, and how
 
@@ -21,7 +21,8 @@ So does a comment on the line before the block:
 ``<!-- not run: REASON -->``       it is shown only: it is another project's code
 =================================  ================================================================
 
-``examples`` is the folder of the repository. There is no display.
+The pages in docs/learn build on each other, so they share a folder. ``examples`` is the folder of
+the repository. There is no display.
 """
 
 from __future__ import annotations
@@ -40,10 +41,12 @@ from pathlib import Path
 from markdown_it import MarkdownIt
 
 ROOT = Path(__file__).resolve().parent.parent
+LEARN = sorted((ROOT / "docs/learn").glob("*.md"))
 PAGES = [
     ROOT / "README.md",
     *sorted(page for page in (ROOT / "docs").rglob("*.md") if "_build" not in page.parts),
 ]
+BOOKS = [LEARN, *([page] for page in PAGES if page not in LEARN)]
 COMMENT = re.compile(r"<!-- (file|tested by|not run|fails):? ?(.*?) ?-->\n?")
 COMMAND = re.compile(r"\$? ?(physx|python|pip|make|torchrun|apt|rerun)[ -]")
 SAME = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
@@ -206,30 +209,37 @@ class Runner:
             raise block.error(f"{words[-1]}\nprints\n{done.stdout}\nand not\n{printed}")
 
 
-def run(page: Path, folder: Path) -> int:
-    """Run the blocks of a page in an empty folder, and return how many ran.
+def run(pages: list[Path], folder: Path) -> int:
+    """Run the blocks of pages that build on each other, in an empty folder.
+
+    Returns:
+        How many blocks ran.
 
     Raises:
         PageError: A block failed, printed something else, or says nothing of what runs it.
     """
-    blocks = read(page)
+    runner, ran = Runner(folder), 0
+    blocks = [block for page in pages for block in read(page)]
     check(blocks)
-    runner = Runner(folder)
     for block in blocks:
         runner.run(block)
+        ran += not block.is_shown_only
     runner.finish()
-    return sum(not block.is_shown_only for block in blocks)
+    return ran
 
 
 def main() -> int:
     """Run the pages that the command line names, and return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("pages", nargs="*", type=Path, default=PAGES)
+    parser.add_argument("pages", nargs="*", type=Path, help="README.md, docs/online.md, ...")
+    asked = {page.resolve() for page in parser.parse_args().pages}
     failed = 0
-    for page in parser.parse_args().pages:
+    for pages in BOOKS:
+        if asked and not asked.intersection(pages):
+            continue
         with tempfile.TemporaryDirectory() as folder:
             try:
-                print(f"{page.resolve().relative_to(ROOT)}: {run(page.resolve(), Path(folder))}")
+                print(f"{pages[-1].relative_to(ROOT)}: {run(pages, Path(folder))} blocks")
             except PageError as error:
                 failed += 1
                 print(error, file=sys.stderr)

@@ -14,10 +14,12 @@ pytest.importorskip("torch")
 
 
 @pytest.mark.parametrize(
-    "page", run_pages.PAGES, ids=[str(page.relative_to(run_pages.ROOT)) for page in run_pages.PAGES]
+    "pages",
+    run_pages.BOOKS,
+    ids=[str(pages[-1].relative_to(run_pages.ROOT)) for pages in run_pages.BOOKS],
 )
-def test_the_code_of_a_page_runs(page, tmp_path):
-    run_pages.run(page, tmp_path)
+def test_the_code_of_a_page_runs(pages, tmp_path):
+    run_pages.run(pages, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +43,7 @@ def test_a_page_that_says_what_is_not_so(text, error, tmp_path, monkeypatch):
     (tmp_path / "folder").mkdir()
     (tmp_path / "page.md").write_text(text)
     with pytest.raises(run_pages.PageError, match=f"(?s){error}"):
-        run_pages.run(tmp_path / "page.md", tmp_path / "folder")
+        run_pages.run([tmp_path / "page.md"], tmp_path / "folder")
 
 
 def test_blocks_of_all_kinds(tmp_path, monkeypatch):
@@ -54,7 +56,7 @@ def test_blocks_of_all_kinds(tmp_path, monkeypatch):
         "```console\n$ cat b.txt\none...\ntwo = 2\n$ echo \\\n  end\nend\n```\n"
         "<!-- not run: not ours -->\n```sh\nfalse\n```\n```text\n1\n```\n```{note}\nmore\n```\n"
     )
-    assert run_pages.run(tmp_path / "page.md", tmp_path / "folder") == 5
+    assert run_pages.run([tmp_path / "page.md"], tmp_path / "folder") == 5
 
 
 @pytest.mark.parametrize(
