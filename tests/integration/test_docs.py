@@ -1,12 +1,14 @@
 """README.md and the pages in docs/: their code runs, and what they claim to be complete is."""
 
+import inspect
 import re
 
+import figures
 import public_names
 import pytest
 import run_pages
 
-from physx_core import checkpoint
+from physx_core import PhysxError, checkpoint, errors
 
 pytestmark = pytest.mark.slow
 
@@ -110,3 +112,33 @@ def test_the_reference_shows_every_face(root):
         assert f"physx_core.{name}" in public_names.MODULES
     packages = {path.parent.name for path in root.glob("physx_*/pyproject.toml")}
     assert set(public_names.FACES) == packages
+
+
+def test_every_error_has_a_cause_and_a_cure(root):
+    text = (root / "docs/howto/mistakes.md").read_text()
+    rows = re.findall(r"^\| `(\w+)`[^|]*\| ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE)
+    classes = {
+        name: value
+        for name, value in vars(errors).items()
+        if inspect.isclass(value) and issubclass(value, PhysxError) and value is not PhysxError
+    }
+    assert sorted(name for name, *_ in rows) == sorted(classes)
+    told = dict(re.findall(r"^\| `(\w+)` \(([^)]*)\) \|", text, re.MULTILINE))
+    for name, listed in told.items():
+        for attribute in re.findall(r"`(\w+)`", listed):
+            assert re.search(rf"^ +{attribute}:", inspect.getdoc(classes[name]), re.MULTILINE)
+
+
+def test_the_page_of_figures_is_what_the_benchmarks_say():
+    assert figures.PAGE.read_text() == figures.page()
+
+
+def test_the_gallery_shows_every_example(root):
+    text = (root / "docs/gallery.md").read_text()
+    there = {
+        path.name for path in (root / "examples").iterdir() if not path.name.startswith(("_", "."))
+    }
+    assert {name for name in there if f"examples/{name}" not in text} == set()
+    assert {name for name in re.findall(r"examples/(\w+)", text)} <= {
+        name.removesuffix(".py") for name in there
+    }
