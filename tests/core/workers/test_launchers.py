@@ -87,8 +87,8 @@ class FarLauncher(CommandLauncher):
 class IdleHandle(ClientHandle):
     """A client that waits for something forever."""
 
-    def __init__(self, instance_id):
-        self.instance_id, self.over = instance_id, False
+    def __init__(self, instance_id, queued_until):
+        self.instance_id, self.queued_until, self.over = instance_id, queued_until, False
 
     def exit_status(self):
         return 1 if self.over else None
@@ -102,12 +102,18 @@ class IdleHandle(ClientHandle):
     def state(self):
         return "pending (Resources)"
 
+    def is_queued(self):
+        return time.monotonic() < self.queued_until
+
 
 class IdleLauncher(Launcher):
-    """Starts clients that never come."""
+    """Starts clients that wait for their turn, and then never come."""
+
+    def __init__(self, *, queued=0.0):
+        self.queued = queued
 
     def launch(self, instances, address, token):
-        return [IdleHandle(number) for number in instances]
+        return [IdleHandle(number, time.monotonic() + self.queued) for number in instances]
 
 
 class ForgetfulLauncher(Launcher):
@@ -176,6 +182,16 @@ def test_the_run_says_what_an_absent_client_waits_for(clients):
     error = r"(?s)did not connect for 0\.5 s while the server waited for it: pending \(Resources\)"
     with pytest.raises(ClientError, match=error), clients(launcher=IdleLauncher, timeout=0.5):
         pass
+
+
+def test_the_time_of_a_client_begins_when_it_is_not_queued_any_more(clients, caplog):
+    settings = {"launcher": IdleLauncher, "launcher_kwargs": {"queued": 6.0}, "timeout": 0.5}
+    began = time.monotonic()
+    with pytest.raises(ClientError, match="did not connect"), clients(**settings):
+        pass
+    assert time.monotonic() - began > 6.2  # asked for every 0.1 s
+    assert "pending (Resources)" in caplog.text
+    assert "once it is not queued any more" in caplog.text
 
 
 def test_a_launcher_that_forgets_its_handles_is_named(clients):

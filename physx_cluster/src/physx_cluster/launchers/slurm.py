@@ -1,16 +1,332 @@
-"""SlurmLauncher: clients on the nodes of a Slurm cluster."""
+"""SlurmLauncher: clients as jobs of Slurm."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import logging
+import os
+import secrets
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
+from physx_cluster.launchers.slurm_queue import (
+    FORGOTTEN,
+    JobState,
+    LocalQueue,
+    Queue,
+    SlurmQueue,
+    find_controller,
+)
+from physx_cluster.placement.address import address_towards
+from physx_core import files
 from physx_core.components import ClientHandle, Launcher
-from physx_core.errors import ClientError
+from physx_core.errors import ClientError, ConfigError
+from physx_core.net import TOKEN_VARIABLE
+from physx_core.origin import install_hint
+from physx_core.processes import ChildProcess
+
+try:
+    import submitit
+except ImportError as error:
+    raise ConfigError(
+        f"The launcher cluster/slurm needs submitit: {error}. "
+        f"{install_hint('physx-cluster', 'slurm')}"
+    ) from error
+
+from physx_cluster.launchers.slurm_job import TOKEN, ClientJob, status_file
+
+_RARELY = 5.0  # s between two questions to the queue
+_SOON = 0.25  # s, where somebody waits for the answer
+_TIMEOUTS = 1_000  # after which submitit starts a job again
+_LEAVE_TIME = 10.0  # for jobs to leave the queue
+_PAUSE = 0.05
+_INTERRUPTED = -15
 
 
 class SlurmLauncher(Launcher):
-    """Starts each client on a node of a Slurm cluster."""
+    """Starts each client as a job of Slurm; those that start together are one job array.
+
+    A job that Slurm preempts, or whose time is over, is queued again; the run goes on where its
+    client was (`EnvironmentConfig.restarts`), with the same rows. While a job is queued, the time
+    does not count as that of a silent client (`EnvironmentConfig.timeout`).
+    """
+
+    elsewhere = True
+
+    def __init__(
+        self,
+        *,
+        cluster: str = "slurm",
+        folder: str = ".",
+        queue_time: float = 3600.0,
+        timeout_min: int = 60,
+        **parameters: Any,
+    ) -> None:
+        """Keep the options.
+
+        Args:
+            cluster: "slurm", or "local" for processes of this machine in place of jobs.
+            folder: Folder on a disk that all nodes share. A hidden folder in it, which only its
+                user can enter, holds the token and the jobs' output until the run ends.
+            queue_time: Longest time in s for which a job may wait in the queue.
+            timeout_min: Time limit of a job in min; after it, the job is queued again.
+            parameters: Parameters of `submitit.AutoExecutor`, such as ``mem_gb=4``,
+                ``cpus_per_task=2`` or ``slurm_partition="gpu"``.
+
+        Raises:
+            ConfigError: If submitit does not know a parameter.
+        """
+        if cluster not in ("slurm", "local"):
+            raise ConfigError(f'cluster is {cluster!r}, but must be "slurm" or "local".')
+        self._cluster, self._place, self._queue_time = cluster, Path(folder), queue_time
+        self._parameters = {"timeout_min": timeout_min, **parameters}
+        self._queue: Queue | None = None
+        self._folder = Path()
+        self._guard: ChildProcess | None = None
+        self._pipe = -1
+        self._handles: dict[int, JobHandle] = {}
+        self._asked, self._states = 0.0, dict[str, JobState]()
+        logging.getLogger("submitit").setLevel(logging.WARNING)
+
+    def open(self) -> str | None:
+        """Look for Slurm, and make the folder of the run: see `Launcher.open`."""
+        controller = None if self._cluster == "local" else find_controller()
+        name = f"physx-{secrets.token_hex(6)}"
+        try:
+            self._folder = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=self._place.resolve()))
+        except OSError as error:
+            raise ConfigError(
+                f"The folder of the jobs cannot be made in {self._place}: {error}. Name one that "
+                'all nodes share with launcher_kwargs={"folder": ...}.'
+            ) from error
+        local = LocalQueue(self._folder)
+        self._queue = local if controller is None else SlurmQueue(name)
+        self._local_jobs = local.jobs
+        self._start_guard("" if controller is None else name)
+        self._executor = self._make_executor(name)
+        return None if controller is None else address_towards(controller)
 
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
-        """Start the clients: see `Launcher.launch`."""
-        raise ClientError(instances[0], "cannot be started on Slurm by this version.")
+        """Submit the jobs, or take those that Slurm runs again: see `Launcher.launch`."""
+        self._write_token(token)
+        former = {number: self._handles.get(number) for number in instances}
+        again = {number: old for number, old in former.items() if old and old.runs_again()}
+        fresh = [number for number in instances if number not in again]
+        jobs = {number: old.job for number, old in again.items()}
+        for number in instances:
+            with contextlib.suppress(FileNotFoundError):
+                files.remove(status_file(self._folder, number))
+        jobs |= self._submit(fresh, address) if fresh else {}
+        self._local_jobs.update(jobs)
+        for number in instances:
+            old = again.get(number)
+            runs = old.look(_SOON).runs if old else 0
+            self._handles[number] = JobHandle(number, jobs[number], self, self._folder, runs)
+        return [self._handles[number] for number in instances]
+
+    def close(self) -> None:
+        """Wait for the jobs to leave the queue, and remove the folder: see `Launcher.close`."""
+        until = time.monotonic() + _LEAVE_TIME
+        while self._jobs_left() and time.monotonic() < until:
+            time.sleep(_SOON)
+        guard, self._guard = self._guard, None
+        if guard is not None:
+            os.close(self._pipe)  # it does the rest, as it would if this process were killed
+            guard.wait()
+
+    def state_of(self, job: Any, max_age: float) -> JobState:
+        """Return what the queue says of a job; all jobs are asked for at once.
+
+        Args:
+            job: The job.
+            max_age: How old the answer may be, in s.
+        """
+        assert self._queue is not None
+        if time.monotonic() - self._asked > max_age:
+            found = self._queue.states()
+            self._asked = time.monotonic()
+            if found is not None:
+                self._states = found
+        return self._states.get(job.job_id, FORGOTTEN)
+
+    def interrupt(self, job: Any) -> None:
+        """Ask the client of a job to end."""
+        assert self._queue is not None
+        self._queue.interrupt(job)
+
+    def cancel(self, job: Any) -> None:
+        """End a job at once."""
+        assert self._queue is not None
+        self._queue.cancel([job])
+        self._asked = 0.0
+
+    @property
+    def queue_time(self) -> float:
+        """Longest time in s for which a job may wait in the queue."""
+        return self._queue_time
+
+    def _submit(self, instances: Sequence[int], address: str) -> dict[int, Any]:
+        work = [ClientJob(self._folder, number, address) for number in instances]
+        self._executor.update_parameters(slurm_array_parallelism=len(work))
+        self._asked = 0.0
+        try:
+            with _without_token(), self._executor.batch():
+                jobs = [self._executor.submit(job) for job in work]
+        except (submitit.core.utils.FailedJobError, submitit.core.utils.FailedSubmissionError) as e:
+            reason = " ".join(str(e).split()[-60:])
+            raise ClientError(
+                instances[0],
+                f"was refused by Slurm: {reason}. What a job asks for are launcher_kwargs, such as "
+                'timeout_min, mem_gb, cpus_per_task and slurm_partition; "sinfo" says what there '
+                "is.",
+            ) from e
+        return dict(zip(instances, jobs, strict=True))
+
+    def _make_executor(self, name: str) -> Any:
+        executor = submitit.AutoExecutor(
+            self._folder, self._cluster, slurm_max_num_timeout=_TIMEOUTS
+        )
+        try:
+            executor.update_parameters(name=name, **self._parameters)
+        except (NameError, ValueError, AssertionError, TypeError) as error:
+            raise ConfigError(f"launcher_kwargs of cluster/slurm: {error}") from error
+        return executor
+
+    def _write_token(self, token: str) -> None:
+        descriptor = os.open(self._folder / TOKEN, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+        with os.fdopen(descriptor, "w") as file:
+            file.write(token)
+
+    def _start_guard(self, name: str) -> None:
+        reading, self._pipe = os.pipe()
+        module = "physx_cluster.launchers.slurm_guard"
+        words = [sys.executable, "-P", "-m", module, str(reading), str(self._folder), name]
+        try:
+            self._guard = ChildProcess(words, pass_fds=[reading], lives_on=True)
+        finally:
+            os.close(reading)
+
+    def _jobs_left(self) -> bool:
+        states = [self.state_of(handle.job, 0.0) for handle in self._handles.values()]
+        return any(not state.is_over for state in states)
+
+
+class JobHandle(ClientHandle):
+    """A client that is a job.
+
+    Attributes:
+        job: The job, of submitit.
+    """
+
+    def __init__(
+        self, instance_id: int, job: Any, launcher: SlurmLauncher, folder: Path, runs: int
+    ) -> None:
+        """Keep the arguments.
+
+        Args:
+            instance_id: Number of the instance, from 1.
+            job: The job, of submitit.
+            launcher: Asks the queue.
+            folder: Folder of the run.
+            runs: How often the job was started again before it got this client.
+        """
+        self.instance_id, self.job = instance_id, job
+        self._launcher, self._folder, self._runs = launcher, folder, runs
+        self._status: int | None = None
+        self._said = ""
+        self._began = time.monotonic()
+
+    def look(self, max_age: float) -> JobState:
+        """Return what the queue says of the job, at most `max_age` s ago."""
+        return self._launcher.state_of(self.job, max_age)
+
+    def runs_again(self) -> bool:
+        """Return whether Slurm has ended this client and starts the job again."""
+        state = self.look(_SOON)
+        return not state.is_over and state.runs > self._runs
+
+    def exit_status(self) -> int | None:
+        """Return the exit status: see `ClientHandle.exit_status`."""
+        return self._find_status(_RARELY)
+
+    def wait(self, until: float) -> bool:
+        """Wait for the end of the client: see `ClientHandle.wait`."""
+        while self._find_status(_SOON) is None:
+            if time.monotonic() >= until:
+                return False
+            time.sleep(_PAUSE)
+        return True
+
+    def stderr(self) -> str:
+        """Return the last lines of its standard error: see `ClientHandle.stderr`."""
+        return self._said
+
+    def state(self) -> str:
+        """Return what it waits for: see `ClientHandle.state`."""
+        state = self.look(_RARELY)
+        return f"its job {self.job.job_id} is {state.name} ({state.reason})"
+
+    def is_queued(self) -> bool:
+        """Return whether it waits for its turn: see `ClientHandle.is_queued`."""
+        if not self.look(_RARELY).is_queued:
+            return False
+        if time.monotonic() - self._began < self._launcher.queue_time:
+            return True
+        self._end(_INTERRUPTED, f"{self.state()} for longer than queue_time, {self.queue_time:g} s")
+        return False
+
+    @property
+    def queue_time(self) -> float:
+        """Longest time in s for which the job may wait in the queue."""
+        return self._launcher.queue_time
+
+    def terminate(self) -> None:
+        """Ask the client to end, unless Slurm runs its job again: see `ClientHandle.terminate`."""
+        if self._find_status(0.0) is None:
+            self._launcher.interrupt(self.job)
+
+    def kill(self) -> None:
+        """End the job, unless Slurm runs it again: see `ClientHandle.kill`."""
+        if self._find_status(0.0) is None:
+            self._launcher.cancel(self.job)
+
+    def _find_status(self, max_age: float) -> int | None:
+        if self._status is not None:
+            return self._status
+        state = self.look(max_age)
+        noted = self._read_note() if max_age < _RARELY or state.is_over else None
+        if state.runs > self._runs:
+            self._end(_INTERRUPTED, f"Slurm interrupted job {self.job.job_id} and runs it again.")
+        elif noted is not None:
+            self._end(*noted)
+        elif state.is_over:
+            text = f"Slurm: job {self.job.job_id} is {state.name} ({state.reason})"
+            self._end(0 if state.name in ("COMPLETED", "FINISHED") else 1, text)
+        return self._status
+
+    def _end(self, status: int, said: str) -> None:
+        self._status, self._said = status, said
+
+    def _read_note(self) -> tuple[int, str] | None:
+        """Return exit status and last lines that the job noted, if its client has ended."""
+        try:
+            text = files.read_content(status_file(self._folder, self.instance_id), 1 << 20)
+            status, _, said = text.decode(errors="replace").partition("\n")
+            return int(status), said
+        except (OSError, ValueError):
+            return None
+
+
+@contextlib.contextmanager
+def _without_token() -> Iterator[None]:
+    """Keep the secret of the run out of the jobs' environments, which Slurm stores."""
+    token = os.environ.pop(TOKEN_VARIABLE, None)
+    try:
+        yield
+    finally:
+        if token is not None:
+            os.environ[TOKEN_VARIABLE] = token

@@ -38,6 +38,10 @@ class ClientHandle(ABC):
         """Return what a client that has not connected waits for, for messages; empty: unknown."""
         return ""
 
+    def is_queued(self) -> bool:
+        """Return whether the client waits for its turn to start, which is not silence."""
+        return False
+
     def wait(self, until: float) -> bool:
         """Wait for the client to end; return whether it did before `until`, in monotonic s."""
         while self.exit_status() is None:

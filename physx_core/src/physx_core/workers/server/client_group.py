@@ -90,6 +90,7 @@ class ClientGroup:
         self._laggards, self._named = Laggards(), set[str]()
         self._handles: dict[int, ClientHandle] = {}
         self._launched: dict[int, float] = {}
+        self._queued: dict[int, float] = {}
         self._exits: dict[int, float] = {}
         self._restarts: Counter[int] = Counter()
         self._checked = self._served = self._said = self._began = self._looked = 0.0
@@ -435,16 +436,20 @@ class ClientGroup:
         numbers = self._with_client(self.server.holding_up(waited))
         times = {n: now - max(began, self._heard(n)) for n in numbers}
         absent = [n for n in sorted(times) if self._find_peer(n) is None and times[n] > _SAY_EVERY]
+        queued = [n for n in absent if self._is_queued(n)]
+        if queued and now - self._said < max(times[n] for n in queued) / 2:
+            return  # it may take hours
         if absent:
             self._said = now
             _LOG.warning(
                 "The run waits for a client to run instance %s, since %.0f s, at %s%s. "
-                "It waits no longer than %g s.",
+                "It waits no longer than %g s%s.",
                 ", ".join(map(str, absent)),
                 max(times[number] for number in absent),
                 self._public_address(),
                 describe_states([self._handles[n] for n in absent if n in self._handles]),
                 self.config.timeout,
+                " once it is not queued any more" if queued else "",
             )
 
     def _heard(self, number: int) -> float:
@@ -460,9 +465,16 @@ class ClientGroup:
 
     def _find_silent(self, waited: Sequence[int], began: float) -> list[int]:
         """Return the instances that keep the server waiting for too long."""
-        limit = time.monotonic() - self.config.timeout
+        now = time.monotonic()
         numbers = self._with_client(self.server.holding_up(waited))
-        return [number for number in numbers if max(began, self._heard(number)) < limit]
+        self._queued |= {number: now for number in numbers if self._is_queued(number)}
+        since = {n: max(began, self._heard(n), self._queued.get(n, 0.0)) for n in numbers}
+        return [number for number in numbers if since[number] < now - self.config.timeout]
+
+    def _is_queued(self, number: int) -> bool:
+        """Return whether an instance's client waits for its turn; its time begins after that."""
+        handle = self._handles.get(number)
+        return handle is not None and self._find_peer(number) is None and handle.is_queued()
 
     def _encode_setup(self, peer: Peer) -> bytes:
         """Return the first message to a client: its instance, and what the server has of it."""

@@ -1,0 +1,77 @@
+"""Guard: ends the jobs of a run and removes its folder once the run has ended, however it did.
+
+It is ``python -m physx_cluster.launchers.slurm_guard DESCRIPTOR FOLDER NAME``. The descriptor is
+that of a pipe to which only the run can write, so it closes with the run, even by SIGKILL.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+_PATIENCE = 20.0  # for jobs to leave the queue
+_PAUSE = 0.1
+
+
+def main(descriptor: int, folder: Path, name: str) -> None:
+    """Wait for the end of the run, then tidy up.
+
+    Args:
+        descriptor: End of the pipe to read from.
+        folder: Folder of the run.
+        name: Name of its jobs in Slurm's queue; empty: they are processes of this machine.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    os.read(descriptor, 1)
+    until = time.monotonic() + _PATIENCE
+    if name:
+        _end_jobs(name, until)
+    else:
+        _end_processes(folder, until)
+    while folder.exists() and time.monotonic() < until:  # a job may be writing its last lines
+        shutil.rmtree(folder, ignore_errors=True)
+        time.sleep(_PAUSE)
+
+
+def _end_jobs(name: str, until: float) -> None:
+    for words in (["--signal=KILL"], []):
+        _run("scancel", "--quiet", *words, f"--name={name}")
+    while time.monotonic() < until:
+        if not _run("squeue", "--noheader", f"--name={name}").stdout.strip():
+            return
+        time.sleep(_PAUSE)
+
+
+def _run(*words: str) -> subprocess.CompletedProcess[bytes]:
+    return subprocess.run(words, capture_output=True, check=False)
+
+
+def _end_processes(folder: Path, until: float) -> None:
+    """End the jobs of submitit's local executor; the folder stands on their command lines."""
+    while found := _processes_of(folder):
+        late = time.monotonic() > until
+        for process in found:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL if late else signal.SIGINT)
+        time.sleep(_PAUSE)
+
+
+def _processes_of(folder: Path) -> list[int]:
+    mark, found = f"\0{folder}\0".encode(), []
+    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            command = entry.read_bytes()
+            if mark in command and b"submitit" in command:
+                found.append(int(entry.parent.name))
+    return found
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), Path(sys.argv[2]), sys.argv[3])
