@@ -88,6 +88,7 @@ def _show(study: Any, options: Sweep) -> None:
 
 
 def _report(study: Any, folder: Path) -> None:
+    from physx_cluster.sweep.errors import StudyError
     from physx_cluster.sweep.show import summary
     from physx_cluster.sweep.study import TABLE
 
@@ -95,6 +96,11 @@ def _report(study: Any, folder: Path) -> None:
         _say(line)
     _say(f"table: {folder / TABLE}")
     _say(f"next: physx sweep {shlex.quote(str(folder))} --status")
+    if study.best() is None:
+        raise StudyError(
+            f"No trial of {folder} is complete with all seeds. What ended each is at the end of its "
+            "output.txt."
+        )
 
 
 def _say(line: str) -> None:

@@ -109,10 +109,10 @@ def record_curves(study: Study, reference: str) -> Sequence[str]:
     visualizer = plugins.resolve("visualizer", reference)()
     visualizer.open(study.definition.name, study.folder, 0)
     try:
-        for line in summary(study):
-            visualizer.note(line)
         for step, values in sorted(curves.items()):
             visualizer.scalars(values, step, "epoch")
+        for line in summary(study):
+            visualizer.note(line)
     finally:
         visualizer.close()
     return visualizer.outputs()
@@ -165,6 +165,7 @@ def _draw_progress(axes: Any, study: Study, done: dict[int, float]) -> None:
     _scatter(axes, study, list(done), list(done.values()), list(done))
     axes.step(list(done), so_far, where="post", color="0.5", label="best so far")
     axes.set(xlabel="trial", ylabel=study.definition.study.result)
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.legend()
 
 
