@@ -1,6 +1,7 @@
 """Gradient descent for the linear model, which tells how many batches it was really given."""
 
 import os
+import signal
 import sys
 import time
 
@@ -38,3 +39,10 @@ class Descent(Optimization):
             descriptor = os.open(place, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
             os.write(descriptor, b".")
             os.close(descriptor)
+
+
+class Doomed(Descent):
+    """Kills its process, as a system does that has no memory left."""
+
+    def optimize(self, loss):
+        os.kill(os.getpid(), signal.SIGKILL)

@@ -98,8 +98,8 @@ def _report(study: Any, folder: Path) -> None:
     _say(f"next: physx sweep {shlex.quote(str(folder))} --status")
     if study.best() is None:
         raise StudyError(
-            f"No trial of {folder} is complete with all seeds. What ended each is at the end of its "
-            "output.txt."
+            f"No trial of {folder} is complete with all seeds. What ended each is at the end of "
+            "its output.txt."
         )
 
 

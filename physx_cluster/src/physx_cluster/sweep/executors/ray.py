@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import logging
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from physx_cluster.sweep.errors import StudyError
 from physx_cluster.sweep.executors.executor import (
     PATIENCE,
     Executor,
@@ -22,8 +19,6 @@ from physx_cluster.sweep.results import OUTPUT
 from physx_core.errors import ConfigError, MissingLibraryError
 from physx_core.processes import ChildProcess
 
-_ADDRESS = "RAY_ADDRESS"
-
 
 class RayExecutor(Executor):
     """Runs each trial in a process beside a worker of Ray, on whatever node Ray chooses.
@@ -35,7 +30,7 @@ class RayExecutor(Executor):
     interval = 0.2
 
     def __init__(self, options: Mapping[str, Any], threads: int) -> None:
-        """Connect to the cluster: ``RAY_ADDRESS``, or one that was started here, or a new one.
+        """Connect to the cluster: see `RayConnection`.
 
         Args:
             options: Options of Ray's tasks, for example ``num_cpus``, and ``address``.
@@ -43,8 +38,7 @@ class RayExecutor(Executor):
 
         Raises:
             MissingLibraryError: If Ray is not installed.
-            StudyError: If the cluster cannot be reached.
-            ConfigError: If Ray refuses the options.
+            ConfigError: If the cluster cannot be reached, or Ray refuses the options.
         """
         try:
             import ray
@@ -53,15 +47,9 @@ class RayExecutor(Executor):
         task = {"num_cpus": threads, **options, "max_retries": 0}
         address = task.pop("address", None)
         self._ray, self._variables = ray, variables_of(threads)
-        self._starts = not ray.is_initialized()
-        if self._starts:
-            try:
-                _connect(ray, address)
-            except Exception as error:  # Ray raises whatever it likes
-                raise StudyError(
-                    f"Ray cannot be reached at {address or os.environ.get(_ADDRESS, 'auto')}: "
-                    f"{error} Start it with  ray start --head  or give run.options.address."
-                ) from None
+        from physx_cluster.launchers.ray_connection import RayConnection
+
+        self._connection = RayConnection(address)
         try:
             self._task = ray.remote(run_command).options(**task)
         except (TypeError, ValueError) as error:
@@ -84,8 +72,7 @@ class RayExecutor(Executor):
             job.ask_to_end()
         if jobs:
             self._ray.wait([job.result for job in jobs], num_returns=len(jobs), timeout=PATIENCE)
-        if self._starts and self._ray.is_initialized():
-            self._ray.shutdown()
+        self._connection.close()
 
 
 class RayJob(Job):
@@ -138,13 +125,3 @@ def run_command(command: Sequence[str], variables: Mapping[str, str], output: st
         return process.exit_status()
     finally:
         process.close(PATIENCE)
-
-
-def _connect(ray: Any, address: str | None) -> None:
-    options = {"log_to_driver": False, "logging_level": logging.ERROR}
-    options |= {"configure_logging": False, "include_dashboard": False}
-    if address is not None or _ADDRESS in os.environ:
-        options.pop("include_dashboard")
-        ray.init(address=address, **options)
-        return
-    ray.init(**options)
