@@ -229,6 +229,10 @@ class DatasetConfig:
     that `check_sample` rejected, is only read."""
     max_file_size: float = at_least(1e-6, 0.25)
     """Size of a partition in GB."""
+    writers: str = field(default="server", metadata={"choices": ("server", "clients")})
+    """Who writes the rows of a data generation: the run's own process, "server", or each client
+    those that it makes, "clients", to partitions of its own in the dataset's folder, which all must
+    share: for rates that the run's connection cannot carry."""
     shuffle: bool = True
     """Read each epoch in a new random order; otherwise in the order of writing."""
     validation_split: float = field(default=0.0, metadata={"minimum": 0.0, "maximum": 0.99})

@@ -24,6 +24,7 @@ from physx_core.dataset.store.manifest import Manifest, to_plain_info
 from physx_core.dataset.write.appender import Appender
 from physx_core.dataset.write.merging import add_partitions, drop_partition
 from physx_core.dataset.write.opening import WriterOptions, create, extend
+from physx_core.dataset.write.stripes import Stripes
 from physx_core.dataset.write.updating import check_update
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError, UsageError
@@ -374,6 +375,22 @@ class Dataset(Closeable):
             UsageError: If the dataset is closed or open for reading only.
         """
         self._for_writing().append(mode, rows, checked=checked)
+
+    def stripes(self, mode: str, count: int) -> Stripes:
+        """Let `count` other processes write the rows of a mode from now on, in turn.
+
+        Row r of those that they write, counted from 0, comes from process ``r % count``. They share
+        the dataset's folder, and write with a `StripeWriter` each; this process keeps the manifest.
+
+        Args:
+            mode: Name of the mode; nothing else may change its rows until the dataset is closed.
+            count: How many processes write it.
+
+        Raises:
+            UsageError: If the dataset is closed, open for reading only, or shared.
+            DatasetError: If the folder cannot be written.
+        """
+        return self._as_only_writer("let others write stripes").stripes(mode, count)
 
     def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
         """Store one sample; it is committed together with others, or by `flush`.

@@ -88,6 +88,16 @@ class Kind(enum.IntEnum):
     """Client: exit status and last words of a worker that ended [its ticket]."""
     PING = 32
     """Server: are you there? Client: the same back."""
+    FOLDER = 33
+    """Client that writes partitions: what it read in the dataset's folder."""
+    PARTITION = 34
+    """Server: a partition that the client writes its rows to [its number among the client's]."""
+    WRITTEN = 35
+    """Client: rows are in its partitions [their total number since the start]."""
+    SEAL = 36
+    """Server: order to make no more rows and to seal the last partition [rows to keep in all]."""
+    SEALED = 37
+    """Client: a partition is sealed; its checksums and statistics [its number]."""
 
 
 _KINDS = {int(kind): kind for kind in Kind}

@@ -19,6 +19,7 @@ from physx_core.pipelines.run_description import (
     describe_samples,
 )
 from physx_core.pipelines.storage import (
+    check_client_writers,
     describe_environment,
     end_generation,
     open_own,
@@ -37,7 +38,7 @@ class DataGeneration(NewSessionPipeline):
     Attributes:
         dataset: The session's dataset, open for writing.
         source: The environments.
-        batch: The last batch.
+        batch: The last batch; empty if the clients write the rows themselves.
         batch_id: Number of stored batches.
     """
 
@@ -105,7 +106,8 @@ class DataGeneration(NewSessionPipeline):
                 self.dataset.define_fields(self._mode, self.source.fields)
                 described = describe_environment(self.environment_config, self._seed)
                 self.dataset.update_info(**described)
-            self.dataset.append(self._mode, self.batch, checked=True)
+            if self.batch:
+                self.dataset.append(self._mode, self.batch, checked=True)
 
     def batch_count(self) -> None:
         """Count the batch."""
@@ -136,6 +138,8 @@ class DataGeneration(NewSessionPipeline):
                 "DataGeneration generates new samples, so load_samples cannot be set: it works in "
                 "Training, Prediction and Replay."
             )
+        if dataset_config.writers == "clients":
+            check_client_writers(config)
         if self._mode == WRONG:
             raise ConfigError(
                 'The mode "wrong" is for samples that check_sample rejects. Generate samples for '
@@ -148,11 +152,15 @@ class DataGeneration(NewSessionPipeline):
         self._seed = seed
         self._record_config(seed)
         self._observe(resources, config)
+        stripes = None
+        if dataset_config.writers == "clients":
+            stripes = self.dataset.stripes(self._mode, config.num_clients)
         self.source = self._open_source(
             resources,
             config,
             derive_seed(seed, self._mode, offset),
             total=self.batch_nb * self.batch_size,
+            stripes=stripes,
         )
 
     def _results(self) -> Iterable[str]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from physx_core.components.visualizer import Observer
 from physx_core.config import EnvironmentConfig, to_plain
+from physx_core.dataset.write.stripes import Stripes
 from physx_core.errors import UsageError
 from physx_core.observers import Observers, ProgressBar, ScalarsFile
 from physx_core.pipelines.services import Predict, RunServices, Show
@@ -237,6 +238,7 @@ class Pipeline(ABC):
         replayed: Path | None = None,
         accept_all: bool = False,
         skip: Skip = NOTHING,
+        stripes: Stripes | None = None,
     ) -> Source:
         """Open the environments, in this process or in clients.
 
@@ -254,6 +256,7 @@ class Pipeline(ABC):
                 can be loaded. None: they generate new samples.
             accept_all: Whether samples that `check_sample` rejects count like the others.
             skip: The rows that an earlier run has had: they are generated again, but not returned.
+            stripes: Where clients write the rows themselves; None: the source returns them.
         """
         services = RunServices(
             self.session.dataset_dir, show or self.observers.events, predict, replayed
@@ -274,6 +277,7 @@ class Pipeline(ABC):
                 total=total,
                 accept_all=accept_all,
                 skip=skip,
+                stripes=stripes,
             )
         return resources.enter_context(source)
 

@@ -26,6 +26,7 @@ from physx_core.pipelines.storage import (
     open_existing,
     open_own,
     record_beside_rows,
+    reject_client_writers,
 )
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.processes import deferred_interrupt
@@ -172,6 +173,7 @@ class Prediction(Pipeline):
         self.session = Session.existing(self.session_dir, self.session_name)
         self.learner = load_learner(self.session.path, network, trust=self.trust)
         config = self.dataset_config or DatasetConfig()
+        reject_client_writers(config, "a prediction")
         self._stored, replayed = None, None
         if environment.load_samples:
             existing = resources.enter_context(open_existing(self.session, config))

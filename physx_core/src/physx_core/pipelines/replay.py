@@ -19,6 +19,7 @@ from physx_core.config import (
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, UntrustedReferenceError
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
+from physx_core.pipelines.storage import reject_client_writers
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.plugins.references import check_recorded, find, is_recorded_as
 from physx_core.processes import deferred_interrupt
@@ -118,6 +119,7 @@ class Replay(NewSessionPipeline):
 
     def _open(self, resources: contextlib.ExitStack) -> None:
         config = self.dataset_config
+        reject_client_writers(config, "a replay")
         if config.existing_dir is None:
             raise ConfigError("Replay needs stored samples: name their dataset in existing_dir.")
         dataset = resources.enter_context(Dataset.open(config.existing_dir))

@@ -12,6 +12,7 @@ from physx_core.config import SETS, WRONG, DatasetConfig, EnvironmentConfig, to_
 from physx_core.dataset import Dataset
 from physx_core.dataset.store.locks import LOCK
 from physx_core.dataset.store.manifest_file import FILE
+from physx_core.dataset.write.stripes import PROOF
 from physx_core.errors import (
     ConfigError,
     DatasetNotFoundError,
@@ -110,7 +111,9 @@ def _is_unused(session: Session, path: Path, opened: bool) -> bool:
             return NOTES in path.read_text(encoding="utf-8")
         case ("dataset", name):
             is_data = name == FILE or path.suffix == ".h5"
-            return not opened or name == LOCK or (is_data and not _has_samples(path.parent))
+            return (
+                not opened or name in (LOCK, PROOF) or (is_data and not _has_samples(path.parent))
+            )
         case ("stats", *_):
             numbers = session.stats_dir / "scalars.csv"
             return not numbers.exists() or not read_scalars(session.path)
@@ -142,6 +145,33 @@ def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) 
         raise ConfigError(
             "A training takes its samples from existing_dir or from an environment, not both. To "
             "send the stored samples through the environment, set load_samples=True."
+        )
+
+
+def check_client_writers(config: EnvironmentConfig) -> None:
+    """Check that the environments of a data generation can write their rows themselves."""
+    clients = "DatasetConfig.writers='clients' has each client write the rows that it makes"
+    if not config.as_tcp_ip_client:
+        raise ConfigError(
+            f"{clients}, but as_tcp_ip_client=False starts none. Use writers='server'."
+        )
+    if config.record_wrong_samples:
+        raise ConfigError(
+            f"{clients}, and the run, which stores the rejected ones, does not know to which batch "
+            "they belong. Use writers='server', or leave out record_wrong_samples."
+        )
+    if config.redraw:
+        raise ConfigError(
+            f"{clients}, but redraw needs the rows in the run's process. Use writers='server'."
+        )
+
+
+def reject_client_writers(config: DatasetConfig, what: str) -> None:
+    """Reject the option that clients write their rows, where the run itself needs them."""
+    if config.writers != "server":
+        raise ConfigError(
+            f"DatasetConfig.writers='clients' is for data generation: {what} needs the rows in the "
+            "run's own process. Generate the samples first, then read them with existing_dir."
         )
 
 

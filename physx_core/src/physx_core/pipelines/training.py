@@ -39,7 +39,12 @@ from physx_core.pipelines.run_description import (
     describe_samples,
     describe_training,
 )
-from physx_core.pipelines.storage import GENERATION, check_sources, reject_environments
+from physx_core.pipelines.storage import (
+    GENERATION,
+    check_sources,
+    reject_client_writers,
+    reject_environments,
+)
 from physx_core.processes import Interrupt, Terminated, deferred_interrupt
 from physx_core.session import Session
 from physx_core.typing import Batch
@@ -452,6 +457,7 @@ class Training(NewSessionPipeline):
     def _open(self, resources: contextlib.ExitStack) -> None:
         start = Start(self.dataset_config or DatasetConfig(), self.environment_config)
         check_sources(start.config, start.environment)
+        reject_client_writers(start.config, "a training")
         self.group, network_class = join_group(self.network_config)
         self._leads = self.group.leads
         if self.group.size > 1 and start.environment is not None and not self.resume:

@@ -9,7 +9,9 @@ import numpy as np
 
 from physx_core.components.environment import Services
 from physx_core.config import EnvironmentConfig
+from physx_core.dataset.write.stripes import Stripes
 from physx_core.errors import (
+    ConfigError,
     FieldShapeError,
     FieldsMismatchError,
     UsageError,
@@ -25,6 +27,8 @@ from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.row_codec import row_bytes
 from physx_core.workers.server.client_group import ClientGroup
+from physx_core.workers.server.peer import Peer
+from physx_core.workers.server.written_rows import WrittenRows
 
 _AHEAD_BYTES = 4 << 20
 _AHEAD_ROWS = 1 << 16
@@ -52,6 +56,7 @@ class ClientSource(Source):
         total: int | None = None,
         accept_all: bool = False,
         skip: Skip = NOTHING,
+        stripes: Stripes | None = None,
     ) -> None:
         """Prepare the clients.
 
@@ -66,11 +71,20 @@ class ClientSource(Source):
                 no client generates any; None: unknown.
             accept_all: Whether samples that `check_sample` rejects count like the others.
             skip: The rows that an earlier run has had: they are generated again, but not returned.
+            stripes: Where the clients write the rows themselves; None: `batch` returns them.
         """
+        self._written = None if stripes is None else WrittenRows(stripes)
         self.instance_nb = config.num_clients
         self.sets = ParameterSets(config, seed, skip)
         self._group = ClientGroup(
-            config, services, seed, self.sets, accept_all=accept_all, skip=skip, total=total
+            config,
+            services,
+            seed,
+            self.sets,
+            accept_all=accept_all,
+            skip=skip,
+            total=total,
+            written=self._written,
         )
         self._rejections = 0
         if config.record_wrong_samples:
@@ -102,7 +116,13 @@ class ClientSource(Source):
             for number in range(2, self.instance_nb + 1):
                 self._agree(number, first, self._group.peer(number).fields)
             peers = map(self._group.peer, range(1, self.instance_nb + 1))
-            self.sets.begin([peer.parameters for peer in peers])
+            parameters = [peer.parameters for peer in peers]
+            if self._written is not None and any(parameters):
+                raise ConfigError(
+                    "The environment has parameters, and the run records which rows were made with "
+                    "which: it needs the rows. Use DatasetConfig.writers='server'."
+                )
+            self.sets.begin(parameters)
         except BaseException:
             self._failed = True
             raise
@@ -110,6 +130,8 @@ class ClientSource(Source):
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:
         """Return the next rows: see `Source.batch`.
+
+        If the clients write them, the batch is empty, and they are in the dataset.
 
         Raises:
             UsageError: If stored rows are given, but the clients run ahead.
@@ -131,13 +153,16 @@ class ClientSource(Source):
             if not self._table:
                 self._group.wait(self._without_table)
                 self._grant()
-            if self._capacity < size:
+            if self._written is None and self._capacity < size:
                 self._capacity = size
                 self._out = {
                     field.name: np.empty((size, *(field.shape or ())), field.dtype)
                     for field in self._table
                 }
             self._group.wait(self._without_rows)
+            if self._written is not None:
+                self._written.commit(self._asked)
+                return {}
         except BaseException:
             self._failed = True
             raise
@@ -233,6 +258,7 @@ class ClientSource(Source):
         if ahead is None:
             size = row_bytes(self._table) or _AHEAD_BYTES
             ahead = min(max(1, _AHEAD_BYTES // size), _AHEAD_ROWS) if self._table else 0
+        allowances: dict[Peer, int] = {}
         for number in range(1, self.instance_nb + 1):
             peer = self._group.peer(number)
             needed = peer.wanted = self._wanted(number, self._asked)
@@ -240,6 +266,13 @@ class ClientSource(Source):
             if self._total is not None:
                 allowed = max(needed, min(allowed, self._wanted(number, self._total)))
             if peer.granted < needed or allowed - peer.granted > ahead // 4:
+                allowances[peer] = allowed
+            else:
+                allowances[peer] = peer.granted
+        if self._written is not None and self._table:
+            self._written.extend(allowances)
+        for peer, allowed in allowances.items():
+            if allowed > peer.granted:
                 peer.granted = allowed
                 peer.rejected_limit = allowed * self._rejections
                 peer.send(pack(Kind.CREDIT, number=allowed))
@@ -251,6 +284,8 @@ class ClientSource(Source):
         peer = self._group.peer(1)
         if peer.row_fields:
             self._table = peer.row_fields
+            if self._written is not None:
+                self._written.define(self._table)
             return []
         if peer.failure is not None:
             raise peer.failure
@@ -265,10 +300,14 @@ class ClientSource(Source):
             missing = self._wanted(number, self._asked) - taken
             if not missing:
                 continue
-            if peer.rows.count:
-                if number not in self._agreeing:
-                    self._agree(number, self._table, peer.row_fields)
-                    self._agreeing.add(number)
+            if peer.row_fields and number not in self._agreeing:
+                self._agree(number, self._table, peer.row_fields)
+                self._agreeing.add(number)
+            if self._written is not None:
+                moved = min(missing, peer.received - taken)
+                self._taken[number - 1] += moved
+                missing -= moved
+            elif peer.rows.count:
                 start = taken * self.instance_nb + number - 1 - self._first
                 moved = peer.rows.take(missing, self._out, start, self.instance_nb)
                 self._taken[number - 1] += moved

@@ -55,9 +55,7 @@ def merge_statistics(
 
 def _update_running(reader: Reader, mode: Mode, partition: Partition) -> None:
     """Bring the running statistics of a partition up to its last committed row."""
-    start = mode.start(partition)
     for name in mode.counted_fields:
         statistics = partition.running.setdefault(name, RunningStatistics())
-        first, stop = start + statistics.count, start + partition.rows
-        for block in reader.blocks(partition.mode, name, first, stop):
+        for block in reader.partition_blocks(partition, name, statistics.count):
             statistics.update(block)

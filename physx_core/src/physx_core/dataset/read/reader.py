@@ -9,7 +9,7 @@ import numpy as np
 
 from physx_core import files
 from physx_core.dataset.store import manifest_file
-from physx_core.dataset.store.manifest import Manifest, Mode
+from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition.format import inspect
 from physx_core.dataset.store.partition.segment import BLOCK, RowsCheck, Segment, rows_per_block
 from physx_core.errors import DatasetError, listed, nearest
@@ -67,12 +67,12 @@ class Reader:
 
     def segments(self, mode: str, name: str) -> list[Segment]:
         """Return where the rows of a field lie, in their order."""
-        found, start, field = [], 0, self.field(mode, name)
-        for partition in self.mode(mode).partitions:
-            if partition.rows:
-                found.append(partition.segment(self.directory, field, start))
-            start += partition.rows
-        return found
+        field, known = self.field(mode, name), self.mode(mode)
+        return [
+            partition.segment(self.directory, field, span)
+            for partition, span in zip(known.partitions, known.spans, strict=True)
+            if partition.rows
+        ]
 
     def read(self, mode: str, name: str, start: int, stop: int) -> Array:
         """Return rows as a new array, shape (stop - start, *field shape)."""
@@ -86,7 +86,7 @@ class Reader:
     def check(self, mode: str, name: str, start: int = 0, stop: int | None = None) -> None:
         """Check that the files are long enough, before memory is allocated for their rows."""
         for segment in self.segments(mode, name):
-            if start < segment.start + segment.rows and (stop is None or segment.start < stop):
+            if segment.span.inside(start, self.rows(mode) if stop is None else stop)[1]:
                 segment.open()[0].close()
 
     def read_into(
@@ -108,21 +108,29 @@ class Reader:
             start: First row.
             checks: Of partitions that are read in several calls, kept from one to the next.
         """
-        size, stop = self.field(mode, name).nbytes, start + len(out)
-        if not size:
+        if not self.field(mode, name).nbytes:
             return
-        view = files.as_bytes(out)
         for segment in self.segments(mode, name):
-            first = max(start, segment.start)
-            count = min(stop, segment.start + segment.rows) - first
-            if count <= 0:
-                continue
-            part = view[(first - start) * size : (first - start + count) * size]
-            file, offset = segment.open()
-            with file:
-                segment.read(file, offset + (first - segment.start) * size, part)
-            if _differs(segment, first, count, part, {} if checks is None else checks):
-                self._report(mode, segment)
+            first, count = segment.span.inside(start, start + len(out))
+            if count:
+                rows = out[segment.span.among(first, count, start)]
+                part = rows if segment.span.stride == 1 else np.empty(rows.shape, rows.dtype)
+                self._read_part(part, mode, segment, first, {} if checks is None else checks)
+                if part is not rows:
+                    rows[...] = part
+
+    def partition_blocks(self, partition: Partition, name: str, start: int) -> Iterator[Array]:
+        """Yield a partition's rows from its row `start` on, as `blocks` does those of a mode."""
+        field = self.field(partition.mode, name)
+        segment = partition.segment(self.directory, field)
+        count, end = rows_per_block(field.nbytes), partition.rows
+        buffer = np.empty((min(count, max(0, end - start)), *(field.shape or ())), field.dtype)
+        checks: dict[int, RowsCheck] = {}
+        for first in range(start, end, count):
+            block = buffer[: end - first]
+            if field.nbytes:
+                self._read_part(block, partition.mode, segment, first, checks)
+            yield block
 
     def blocks(
         self, mode: str, name: str, start: int = 0, stop: int | None = None
@@ -144,6 +152,17 @@ class Reader:
             self.read_into(block, mode, name, first, checks)
             yield block
 
+    def _read_part(
+        self, out: Array, mode: str, segment: Segment, first: int, checks: dict[int, RowsCheck]
+    ) -> None:
+        """Fill a contiguous array with the rows of a segment from its row `first` on."""
+        view = files.as_bytes(out)
+        file, offset = segment.open()
+        with file:
+            segment.read(file, offset + first * segment.field.nbytes, view)
+        if _differs(segment, first, len(out), view, checks):
+            self._report(mode, segment)
+
     def _report(self, mode: str, segment: Segment) -> None:
         """Raise the error for a wrong checksum, unless another process has updated the rows."""
         name, commit = segment.field.name, segment.commit
@@ -164,11 +183,12 @@ def _differs(
 ) -> bool:
     """Add rows to the check of their segment; return whether they fail it after the last ones."""
     known = segment.checksum is not None or segment.commit is not None
-    if not known or (first > segment.start and segment.start not in checks):
+    start = segment.span.start
+    if not known or (first and start not in checks):
         return False
-    check = checks.pop(segment.start, None) or RowsCheck(segment)
+    check = checks.pop(start, None) or RowsCheck(segment)
     check.add(part)
-    if first + count == segment.start + segment.rows:
+    if first + count == segment.rows:
         return not check.passed
-    checks[segment.start] = check
+    checks[start] = check
     return False

@@ -12,7 +12,7 @@ from physx_core import files
 from physx_core.dataset.repair.aside import FOLDER, keep, set_aside
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.definitions import compare_fields
-from physx_core.dataset.store.manifest import Manifest, Mode, Partition
+from physx_core.dataset.store.manifest import Manifest, Mode, Partition, trim_stripes
 from physx_core.dataset.store.partition.commits import SECTOR
 from physx_core.dataset.store.partition.format import (
     FORMAT,
@@ -226,7 +226,7 @@ def count_rows(directory: Path, manifest: Manifest, *, thorough: bool = False) -
             for partition in mode.partitions:
                 if not partition.sealed:
                     _count_open(directory, mode, partition, thorough)
-            _discard_behind_lost_rows(mode)
+            _discard_behind_gaps(mode)
         except DatasetError as error:
             manifest.problems[name] = error
 
@@ -265,18 +265,29 @@ def _count_open(directory: Path, mode: Mode, partition: Partition, thorough: boo
         partition.problem = str(unreadable)
 
 
-def _discard_behind_lost_rows(mode: Mode) -> None:
-    """Let open partitions have no rows if rows of the one that its writer filled before are lost.
+def _discard_behind_gaps(mode: Mode) -> None:
+    """Let open partitions have no rows that would follow upon a gap.
 
-    Otherwise these would follow upon a gap.
+    These are the rows of those whose writer filled another before, of which rows are lost or were
+    never written; and of stripes those for which it was not yet the turn, as others lack theirs.
     """
-    for partition in mode.partitions:
-        if partition.follows is not None and not partition.sealed:
-            index, rows = partition.follows
-            key = partition.session, index
-            if any(p.key == key and p.rows < rows for p in mode.partitions) and partition.rows:
-                partition.problem = "It comes after rows that did not reach the disk."
+    for group in mode.groups:
+        if group[0].sealed:
+            continue
+        if any(_follows_gap(mode, partition) for partition in group):
+            for partition in group:
+                if partition.rows and not partition.stripe:
+                    partition.problem = "It comes after rows that did not reach the disk."
                 partition.rows = 0
+        trim_stripes(group)
+
+
+def _follows_gap(mode: Mode, partition: Partition) -> bool:
+    if partition.follows is None:
+        return False
+    index, rows = partition.follows
+    key = partition.session, index
+    return any(p.key == key and p.rows < rows for p in mode.partitions)
 
 
 def _is_partition(path: Path) -> bool:
@@ -313,15 +324,17 @@ def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
             key = identity.mode, identity.session, identity.index
             groups.setdefault(key, {})[identity.field.name] = found
     for (mode_name, session, index), group in sorted(groups.items(), key=_order):
-        if not all(found.rows for found in group.values()):
+        identity = next(iter(group.values())).identity
+        if not identity.stripe and not all(found.rows for found in group.values()):
             continue  # the writer was killed before the partition's first commit
         fields = {name: found.identity.field for name, found in sorted(group.items(), key=_role)}
         mode = manifest.modes.get(mode_name)
         if mode is not None and not strict and not _fits(mode, fields):
             continue  # a part of what was being removed, or not part of this dataset
         mode = manifest.modes.setdefault(mode_name, Mode(fields))
-        first_row = next(iter(group.values())).identity.first_row
-        mode.partitions.append(Partition(mode_name, session, index, first_row))
+        mode.partitions.append(
+            Partition(mode_name, session, index, identity.first_row, stripe=identity.stripe)
+        )
         mode.fields |= {
             name: field
             for name, field in fields.items()

@@ -5,14 +5,17 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from physx_core import files
-from physx_core.errors import DatasetLockedError
+from physx_core.errors import DatasetError, DatasetLockedError
 
 LOCK = "dataset.lock"
 MANIFEST_LOCK = "dataset.json.lock"
+_PATIENCE = 20.0
+_PAUSE = 0.02
 
 
 def lock(directory: Path) -> int:
@@ -67,6 +70,31 @@ def share(directory: Path, descriptor: int) -> None:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         raise _locked(directory, descriptor) from None
+
+
+def take_over(descriptor: int, path: Path) -> None:
+    """Lock a partition file for the process that writes its next rows, until it is closed.
+
+    A process whose place it takes may need a moment to end.
+
+    Raises:
+        DatasetError: If another process keeps it.
+    """
+    until = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > until:
+                raise DatasetError(
+                    f"{path} is still written by an earlier client, {_PATIENCE:g} s after another "
+                    "one has taken its place. End it, or wait until it has noticed."
+                ) from None
+            time.sleep(_PAUSE)
+        except OSError:  # a file system without locks
+            return
+        else:
+            return
 
 
 @contextlib.contextmanager

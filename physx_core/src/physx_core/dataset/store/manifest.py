@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -19,11 +20,13 @@ from physx_core.dataset.store.partition.commits import Commit
 from physx_core.dataset.store.partition.format import (
     Identity,
     Inspection,
+    Stripe,
     find_rows,
     inspect,
     partition_file,
 )
 from physx_core.dataset.store.partition.segment import Segment
+from physx_core.dataset.store.partition.spans import Span
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.fields import RESERVED, Field
 from physx_core.statistics import RunningStatistics
@@ -31,13 +34,17 @@ from physx_core.statistics import RunningStatistics
 
 @dataclass
 class Partition:
-    """Consecutive rows of one mode: one file for each field.
+    """Rows of one mode: one file for each field.
+
+    They are consecutive, or every n-th: n partitions that were begun together may have stripes of
+    the same rows, in turn.
 
     Attributes:
         mode: Name of the mode.
         session: Session that wrote it.
         index: Its number in the session and mode, counted from 0.
         first_row: Row of the mode that was its first when it was begun; it orders the partitions.
+        stripe: Which of the rows from there on it has; None: all up to the next partition.
         rows: Committed rows, the same in all fields.
         sealed: Whether it is complete: every file has exactly these rows.
         offsets: Byte of the file at which the rows begin, by field.
@@ -59,6 +66,7 @@ class Partition:
     first_row: int
     rows: int = 0
     sealed: bool = False
+    stripe: Stripe | None = None
     offsets: dict[str, int] = field(default_factory=dict)
     checksums: dict[str, int] = field(default_factory=dict)
     counted: bool = False
@@ -73,6 +81,13 @@ class Partition:
         """What tells it from the other partitions of its mode."""
         return self.session, self.index
 
+    @property
+    def group(self) -> tuple[str, int, int]:
+        """What it has in common only with the partitions that have stripes of the same rows."""
+        if self.stripe is None:
+            return self.session, self.first_row, self.index
+        return self.session, self.first_row - self.stripe.place, -1
+
     def file_name(self, name: str) -> str:
         """Return the name of a field's file."""
         return partition_file(self.session, self.mode, name, self.index)
@@ -83,7 +98,7 @@ class Partition:
 
     def identity(self, of: Field) -> Identity:
         """Return what a field's file is part of."""
-        return Identity(self.session, self.mode, of, self.index, self.first_row)
+        return Identity(self.session, self.mode, of, self.index, self.first_row, self.stripe)
 
     def inspect(self, directory: Path, of: Field) -> Inspection:
         """Return what a field's file says of itself."""
@@ -96,13 +111,12 @@ class Partition:
         path, offset = self.path(directory, of.name), self.offsets.get(of.name)
         return find_rows(path, offset, of.nbytes, thorough=thorough)
 
-    def segment(self, directory: Path, of: Field, start: int = 0) -> Segment:
-        """Return the rows of a field, of which the first is row `start` of the mode."""
+    def segment(self, directory: Path, of: Field, span: Span | None = None) -> Segment:
+        """Return the rows of a field, which lie at the places of `span` in the mode."""
         return Segment(
             self.path(directory, of.name),
             of,
-            start,
-            self.rows,
+            span or Span(0, self.rows),
             self.offsets.get(of.name, 0),
             self.sealed,
             self.checksums.get(of.name),
@@ -122,12 +136,41 @@ class Partition:
             "sealed": self.sealed,
             "offsets": self.offsets,
         }
+        if self.stripe is not None:
+            plain["stripe"] = list(self.stripe)
         if self.sealed:
             crc32 = {name: f"{value:08x}" for name, value in self.checksums.items()}
             plain |= {"rows": self.rows, "crc32": crc32, "counted": self.counted}
         elif self.follows is not None:
             plain["follows"] = list(self.follows)
         return plain
+
+
+def whole_stripes(rows: Sequence[int]) -> int:
+    """Return how many rows, from the first, none of some stripes lacks.
+
+    Args:
+        rows: How many rows each stripe has.
+    """
+    return min(have * len(rows) + place for place, have in enumerate(rows))
+
+
+def trim_stripes(group: Sequence[Partition], total: int | None = None) -> None:
+    """Let the partitions of a group have only rows before which no row is missing.
+
+    Args:
+        group: Partitions that have stripes of the same rows, in their order.
+        total: How many rows they have together at most.
+    """
+    whole = whole_stripes([partition.rows for partition in group])
+    total = whole if total is None else min(whole, total)
+    for place, partition in enumerate(group):
+        partition.rows = rows_of_stripe(total, place, len(group))
+
+
+def rows_of_stripe(total: int, place: int, count: int) -> int:
+    """Return how many of the first `total` rows belong to a stripe."""
+    return (total - place + count - 1) // count
 
 
 @dataclass
@@ -170,9 +213,23 @@ class Mode:
         """Return the position of a partition, even if it has been replaced by a later state."""
         return [p.key for p in self.partitions].index(partition.key)
 
-    def start(self, partition: Partition) -> int:
-        """Return the row of the mode with which a partition now begins."""
-        return sum(before.rows for before in self.partitions[: self.place(partition)])
+    @property
+    def groups(self) -> list[list[Partition]]:
+        """The partitions; those that have stripes of the same rows together, in their order."""
+        grouped = itertools.groupby(self.partitions, lambda partition: partition.group)
+        return [list(partitions) for _, partitions in grouped]
+
+    @property
+    def spans(self) -> list[Span]:
+        """Which rows of the mode each partition has now."""
+        found, start = [], 0
+        for group in self.groups:
+            found += [
+                Span(start + place, partition.rows, len(group), place)
+                for place, partition in enumerate(group)
+            ]
+            start += sum(partition.rows for partition in group)
+        return found
 
     def swap(self, partition: Partition) -> None:
         """Replace the earlier state of a partition."""
@@ -190,9 +247,10 @@ class Mode:
         """Return whether all rows of an earlier state are still there, with the same numbers."""
         before = [p for p in earlier.partitions if p.rows]
         now = [p for p in self.partitions if p.rows]
+        last = before[-1].group if before else None
         grown = all(
             old.key == new.key
-            and (old.rows == new.rows or old is before[-1])
+            and (old.rows == new.rows or (old.group == last and old.rows < new.rows))
             and (old.checksums == new.checksums or not old.sealed)
             for old, new in zip(before, now, strict=False)
         )
@@ -259,6 +317,12 @@ class Manifest:
         """Names of the sessions that wrote rows, in the order of their rows."""
         found = [p.session for mode in self.modes.values() for p in mode.partitions]
         return list(dict.fromkeys(found))
+
+    @property
+    def is_striped(self) -> bool:
+        """Whether partitions have stripes of the same rows."""
+        modes = self.modes.values()
+        return any(p.stripe for mode in modes for p in (*mode.partitions, *mode.dropped))
 
     @property
     def file_names(self) -> set[str]:

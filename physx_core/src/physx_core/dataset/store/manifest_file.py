@@ -25,6 +25,8 @@ from physx_core.parsing import parse_json
 FILE = "dataset.json"
 FORMAT = "physx dataset"
 VERSION = 1
+STRIPED_VERSION = 2
+"""Version of a dataset that has stripes, so that a physx that does not know of them refuses it."""
 
 _LARGEST = 2**27
 _END = re.compile(rb',\n "crc32": "([0-9a-f]{8})"\n\}\s*$')
@@ -40,7 +42,7 @@ def save(directory: Path, manifest: Manifest) -> None:
     """Write the manifest atomically."""
     plain = {
         "format": FORMAT,
-        "format_version": VERSION,
+        "format_version": STRIPED_VERSION if manifest.is_striped else VERSION,
         "versions": manifest.versions,
         "info": manifest.info,
         "modes": {name: mode.to_dict() for name, mode in manifest.modes.items()},
@@ -74,10 +76,11 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
         if not isinstance(plain, dict) or plain.get("format") != FORMAT:
             raise ValueError("it does not claim to be one")
         version = whole(plain["format_version"], "the format's version")
-        if version != VERSION:
+        if version not in (VERSION, STRIPED_VERSION):
             raise DatasetError(
                 f"{path} has version {version} of the dataset's format, but this physx reads "
-                f"version {VERSION}. {install_hint('physx-core', update=True)}"
+                f"versions {VERSION} and {STRIPED_VERSION}. "
+                f"{install_hint('physx-core', update=True)}"
             )
         if not edited and not _is_whole(content):
             raise ValueError("it was cut or edited by hand: its checksum does not match")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
+from physx_core.dataset.store.partition.format import Stripe, parse_stripe
 from physx_core.dataset.store.validation import (
     SESSION,
     checked,
@@ -50,6 +51,8 @@ def _mode(mode_name: str, plain: Any) -> Mode:
     keys = [partition.key for partition in (*mode.partitions, *mode.dropped)]
     if len(set(keys)) != len(keys):
         raise ValueError("a partition is listed twice")
+    for group in mode.groups:
+        _check_stripes(group)
     whole(mode.rows, "the number of rows")
     _add_statistics(mode, checked(dict, plain["normalization"], "'normalization'"))
     return mode
@@ -83,11 +86,24 @@ def _partition(mode_name: str, plain: Any, fields: Mapping[str, Field]) -> Parti
         first_row=whole(plain["first_row"], "a first row"),
         rows=rows,
         sealed=sealed,
+        stripe=parse_stripe(plain["stripe"]) if "stripe" in plain else None,
         offsets=offsets,
         checksums={n: int(checked(str, crc, "a checksum"), 16) for n, crc in crc32.items()},
         counted=sealed and bool(crc32) and plain.get("counted") is True,
         follows=follows,
     )
+
+
+def _check_stripes(group: list[Partition]) -> None:
+    """Check that partitions have stripes of the same rows: each in turn has one, from the first."""
+    places = [partition.stripe or Stripe(0, 1) for partition in group]
+    if len({stripe.of for stripe in places}) > 1 or places != sorted(set(places)):
+        raise ValueError("stripes of the same rows do not follow each other")
+    if len({partition.sealed for partition in group}) > 1:
+        raise ValueError("some stripes of the same rows are sealed, and others are not")
+    rows = [partition.rows for partition in group]
+    if rows != sorted(rows, reverse=True) or rows[0] > rows[-1] + 1:
+        raise ValueError("stripes of the same rows have numbers of rows that do not fit together")
 
 
 def _add_statistics(mode: Mode, plain: Mapping[str, Any]) -> None:

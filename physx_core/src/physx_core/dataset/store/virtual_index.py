@@ -46,19 +46,18 @@ def write_index(directory: Path, session: str, manifest: Manifest, *, wait: bool
 def _add(group: Any, mode: Mode, field: Field) -> None:
     import h5py
 
-    sealed = [partition for partition in mode.partitions if partition.sealed]
-    rows = sum(partition.rows for partition in sealed)
+    sealed = Mode(mode.fields, [partition for partition in mode.partitions if partition.sealed])
+    rows = sealed.rows
     shape, dtype = (rows, *(field.shape or ())), np.dtype(field.dtype)
     if not rows or not field.nbytes:
         entry = group.create_dataset(field.name, shape, dtype)
     else:
-        layout, start = h5py.VirtualLayout(shape, dtype), 0
-        for partition in sealed:
+        layout = h5py.VirtualLayout(shape, dtype)
+        for partition, span in zip(sealed.partitions, sealed.spans, strict=True):
             source_shape = (partition.rows, *shape[1:])
             source_file = partition.file_name(field.name)
             source = h5py.VirtualSource(source_file, "data", source_shape, dtype)
-            layout[start : start + partition.rows] = source
-            start += partition.rows
+            layout[span.among(0, span.rows, 0)] = source
         missing = np.nan if dtype.kind == "f" else None  # how rows of a lost partition read
         entry = group.create_virtual_dataset(field.name, layout, fillvalue=missing)
     entry.attrs["unit"], entry.attrs["role"] = field.unit, field.role

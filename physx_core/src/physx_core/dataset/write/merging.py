@@ -82,10 +82,12 @@ def _reserve(writer: Writer, given: Manifest) -> dict[str, Pairs]:
     with writer.store.change() as manifest:
         for name, other in given.modes.items():
             mode, found = manifest.modes[name], pairs.setdefault(name, [])
-            for old in other.partitions:
-                if old.rows:
+            for group in other.groups:
+                first = mode.next_row
+                for old in (partition for partition in group if partition.rows):
                     new = writer.new_partition(name, mode)
-                    new.rows = old.rows
+                    new.rows, new.stripe = old.rows, old.stripe
+                    new.first_row = first + (0 if old.stripe is None else old.stripe.place)
                     mode.dropped.append(new)
                     found.append((old, new))
     return pairs

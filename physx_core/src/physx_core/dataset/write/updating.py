@@ -13,6 +13,7 @@ import numpy as np
 from physx_core import files
 from physx_core.dataset.store.manifest import Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
+from physx_core.dataset.store.partition.spans import FlatIndex
 from physx_core.dataset.store.sealing import unseal
 from physx_core.dataset.write.row_validation import check_rows
 from physx_core.errors import DatasetError, FieldShapeError, MissingFieldError
@@ -71,15 +72,14 @@ def update_rows(
         The files that were written to.
     """
     mode = store.manifest.modes[mode_name]
-    starts = np.cumsum([0, *(partition.rows for partition in mode.partitions)])
-    owners = np.searchsorted(starts, index, side="right") - 1
+    owners, rows_there = FlatIndex(mode.spans).locate(index)
     touched = [mode.partitions[owner] for owner in np.unique(owners)]
     _invalidate(store, mode_name, touched)
     updated = set()
     for place in map(mode.place, touched):
         partition = mode.partitions[place]
         here = np.flatnonzero(owners == place)
-        places = index[here] - starts[place]
+        places = rows_there[here]
         if opened is not None and partition is opened.partition:
             opened.settle(rows, int(places.max()))
         elif not partition.sealed:

@@ -21,8 +21,9 @@ from physx_core.dataset.store.partition.file import PartitionFile
 from physx_core.dataset.store.sealing import remove_files, seal
 from physx_core.dataset.store.syncing import Syncer
 from physx_core.dataset.store.virtual_index import write_index
+from physx_core.dataset.write.stripes import Stripes
 from physx_core.dataset.write.updating import update_rows
-from physx_core.errors import DatasetError
+from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
 from physx_core.typing import Batch, Index
 
@@ -129,6 +130,22 @@ class Writer:
         self._sealing: deque[Future[Partition]] = deque()
         self._sealed: list[Partition] = []
         self._sealer = ThreadPoolExecutor(1, "physx-seal")
+        self._stripes: dict[str, Stripes] = {}
+
+    def stripes(self, mode_name: str, count: int) -> Stripes:
+        """Let other processes write a mode's rows from now on: see `Dataset.stripes`."""
+        self.finish(mode_name)
+        found = self._stripes[mode_name] = Stripes(self, mode_name, count)
+        return found
+
+    def check_alone(self, mode_names: Iterable[str]) -> None:
+        """Refuse to change rows of modes that other processes write."""
+        for name in mode_names:
+            if name in self._stripes:
+                raise UsageError(
+                    f"Other processes write the rows of mode {name!r}: nothing else changes them "
+                    "until the dataset has been closed and opened again."
+                )
 
     def append(self, mode_name: str, rows: Batch, count: int) -> None:
         """Store and commit rows.
@@ -139,6 +156,7 @@ class Writer:
             count: How many rows there are.
         """
         done = 0
+        self.check_alone([mode_name])
         try:
             self._check()
             if self._sealing:
@@ -166,6 +184,7 @@ class Writer:
             index: Numbers of the rows, all in range.
             rows: Field name to new rows, checked.
         """
+        self.check_alone([mode_name])
         self.wait()
         with self.store.syncing():
             self._check()
@@ -185,6 +204,7 @@ class Writer:
 
     def finish(self, mode_name: str) -> None:
         """Seal the open partition of a mode, if there is one, and wait until all are sealed."""
+        self.check_alone([mode_name])
         if mode_name in self._open:
             self._retire(mode_name)
         self.wait()
@@ -205,12 +225,16 @@ class Writer:
                 for mode_name in list(self._open):
                     self._retire(mode_name)
                 self._collect(wait=True)
+                for stripes in self._stripes.values():
+                    stripes.close()
                 self._complete()
         except DatasetError as error:
             cause = error.__cause__
             if not (isinstance(cause, OSError) and cause.errno in files.FULL):
                 raise
         finally:
+            for stripes in self._stripes.values():
+                stripes.forget()
             self._sealer.shutdown()
             self._digester.close()
             for opened in self._open.values():
@@ -277,17 +301,12 @@ class Writer:
         try:
             with self.store.change() as manifest:
                 mode = manifest.modes[mode_name]
-                row_nbytes = max(1, *(field.nbytes for field in mode.fields.values()))
-                capacity = max(1, self._max_nbytes // row_nbytes)
+                capacity = self.capacity(mode)
                 entry = self.new_partition(mode_name, mode)
                 entry.writing = True
                 entry.follows = self._find_unsealed_before(mode_name, mode)
                 for name, field in mode.fields.items():
-                    identity = entry.identity(field)
-                    parts[name] = PartitionFile.create(
-                        self._directory, identity, capacity, self._digester
-                    )
-                    entry.offsets[name] = parts[name].data_offset
+                    parts[name] = self.create_file(entry, field, capacity)
                 for part in parts.values():
                     part.publish()
                 files.sync_folder(self._directory)
@@ -297,6 +316,18 @@ class Writer:
                 part.discard()
             raise
         return OpenPartition(entry, capacity, parts, self._syncer)
+
+    def capacity(self, mode: Mode) -> int:
+        """Return how many rows of a mode fit into a partition."""
+        row_nbytes = max(1, *(field.nbytes for field in mode.fields.values()))
+        return max(1, self._max_nbytes // row_nbytes)
+
+    def create_file(self, entry: Partition, field: Field, capacity: int) -> PartitionFile:
+        """Create a file of a new partition, under its temporary name."""
+        identity = entry.identity(field)
+        file = PartitionFile.create(self._directory, identity, capacity, self._digester)
+        entry.offsets[field.name] = file.data_offset
+        return file
 
     def new_partition(self, mode_name: str, mode: Mode) -> Partition:
         """Return a partition with the first number whose files do not exist yet."""

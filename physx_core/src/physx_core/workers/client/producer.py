@@ -11,6 +11,7 @@ from physx_core.net.values import decode, encode
 from physx_core.rows import ROW_FIELDS, RowBuffer, copy_row, infer_shapes
 from physx_core.typing import Sample
 from physx_core.workers.client.link import RunEnded, WorkerLink
+from physx_core.workers.client.row_sinks import RowSink
 from physx_core.workers.instance import Instance
 from physx_core.workers.row_codec import pack_rows
 
@@ -29,6 +30,7 @@ class Producer:
         self,
         link: WorkerLink,
         instance: Instance,
+        sink: RowSink,
         *,
         rows: int = 0,
         rejected: int = 0,
@@ -40,6 +42,7 @@ class Producer:
         Args:
             link: The connection to the server.
             instance: Generates the rows; open.
+            sink: Takes the rows.
             rows: How many rows the server has from earlier clients. They are generated again, but
                 not sent.
             rejected: How many rejected rows it has that are generated again.
@@ -48,7 +51,7 @@ class Producer:
         """
         self.made = made
         self.failure: PhysxError | None = None
-        self._link, self._instance = link, instance
+        self._link, self._instance, self._sink = link, instance, sink
         self._skip, self._skip_rejected = rows, rejected
         self._slow_until = slow_until
         self._buffer: RowBuffer | None = None
@@ -56,6 +59,10 @@ class Producer:
         self._stored: deque[Sample] = deque()
         self._credit = 0
         self._sent_at = 0.0
+
+    def open(self) -> None:
+        """Begin to write: rows that the server has, but not the sink, are put there once more."""
+        self._skip = self._sink.open(self._skip)
 
     def run(self) -> None:
         """Generate rows until the server ends the run."""
@@ -91,7 +98,7 @@ class Producer:
                 self.failure, rows = error, buffer.take()
             count = len(rows["step"])
             if count:
-                self._link.send_parts(pack_rows(rows, count))
+                self._sink.put(rows, count, buffer.fields)
             self.made += count
         self._sent_at = time.monotonic()
         if self.failure is not None:
@@ -172,6 +179,8 @@ class Producer:
     def _obey(self, frame: Frame) -> None:
         if frame.kind is Kind.CREDIT:
             self._credit = frame.number
+        elif self._sink.take(frame):
+            self._credit = self.made if self._sink.ended else self._credit
         elif frame.kind is Kind.APPLY:
             prediction = decode(frame.payload)
             for row in range(frame.number):

@@ -21,6 +21,7 @@ from physx_core.workers.client.hosting import host_workers
 from physx_core.workers.client.joining import PATIENCE, join
 from physx_core.workers.client.link import RunEnded, ServerGone, WorkerLink
 from physx_core.workers.client.producer import Producer
+from physx_core.workers.client.row_sinks import RowSink, SentRows, StripedRows
 from physx_core.workers.instance import Instance
 
 
@@ -65,7 +66,8 @@ def run_client(
 
 def _serve(link: WorkerLink, setup: dict[str, Any], say: Callable[[str], None]) -> int:
     os.environ[CLIENT_VARIABLE] = "1"
-    draw, skip = setup.pop("draw"), setup.pop("skip")
+    draw, skip, stripes = setup.pop("draw"), setup.pop("skip"), setup.pop("stripes", None)
+    sink = SentRows(link) if stripes is None else StripedRows(link, stripes)
     _take_place(setup.pop("path"), setup.pop("directory"))
     again = skip["rows"] - skip["made"]
     say(
@@ -73,7 +75,7 @@ def _serve(link: WorkerLink, setup: dict[str, Any], say: Callable[[str], None]) 
         + (f"; {again} rows are stored and are made again" if again else "")
     )
     link.spins = has_core_for_each(setup["instance_nb"])
-    client = _Client(link, Instance(**setup), skip.pop("shown"), skip)
+    client = _Client(link, Instance(**setup), sink, skip.pop("shown"), skip)
     try:
         client.live(draw)
     finally:
@@ -105,17 +107,23 @@ class _Client:
     """
 
     def __init__(
-        self, link: WorkerLink, instance: Instance, shown: int, skip: dict[str, int]
+        self,
+        link: WorkerLink,
+        instance: Instance,
+        sink: RowSink,
+        shown: int,
+        skip: dict[str, int],
     ) -> None:
         self.failure: PhysxError | None = None
         self.is_forsaken = False
-        self._link, self._instance = link, instance
-        self._producer = Producer(link, instance, **skip)
+        self._link, self._instance, self._sink = link, instance, sink
+        self._producer = Producer(link, instance, sink, **skip)
         self._services = RemoteServices(link, self._producer, shown)
 
     def live(self, draw: bool) -> None:
         """Open the environment and make rows until the run ends or the environment fails."""
         try:
+            self._producer.open()
             self._instance.open(self._services, draw, self._services.choose)
             parameters = [parameter.to_dict() for parameter in self._instance.parameters]
             if parameters:
@@ -131,12 +139,13 @@ class _Client:
             self._report(error, self._producer.made)
 
     def close(self) -> None:
-        """Close the environment."""
-        try:
-            self._instance.close()
-        except PhysxError as error:
-            if self.failure is None:
-                self._report(error, 0)
+        """Close the environment, and the files that it writes."""
+        for close in (self._instance.close, self._sink.close):
+            try:
+                close()
+            except PhysxError as error:
+                if self.failure is None:
+                    self._report(error, 0)
 
     def _report(self, error: PhysxError, row: int) -> None:
         self.failure = error

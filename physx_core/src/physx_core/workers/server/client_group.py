@@ -35,6 +35,7 @@ from physx_core.workers.server.client_pool import ClientPool
 from physx_core.workers.server.pace import Laggards
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.server import Server
+from physx_core.workers.server.written_rows import WrittenRows
 
 _ALL = ("", "0.0.0.0", "::")  # all addresses of this machine
 _TICK = 0.1
@@ -63,6 +64,7 @@ class ClientGroup:
         accept_all: bool = False,
         skip: Skip = NOTHING,
         total: int | None = None,
+        written: WrittenRows | None = None,
     ) -> None:
         """Keep the arguments; `open` starts the clients.
 
@@ -74,7 +76,9 @@ class ClientGroup:
             accept_all: Whether samples that `check_sample` rejects count like the others.
             skip: What an earlier run has had: clients generate it again, but do not send it.
             total: Number of rows of the whole run, with those to skip; None: unknown.
+            written: Counts the rows that the clients write themselves; None: they send them.
         """
+        self._written = written
         self.config = config
         self._seed, self._sets = list(seed), sets
         self._accepts_all, self._skip = accept_all, skip
@@ -107,6 +111,7 @@ class ClientGroup:
             self._replaces,
             skip,
             self._pool,
+            written,
         )
 
     def open(self) -> None:
@@ -169,6 +174,8 @@ class ClientGroup:
         patience = 0.0
         self._closing = True
         try:
+            if orderly and self._written is not None:
+                self._written.end(self.server.peers.values())
             absent = [number for number in self._handles if self._find_peer(number) is None]
             stop([self._handles.pop(number) for number in absent], 0.0)
             self.server.end()
@@ -486,7 +493,9 @@ class ClientGroup:
             "made": origin.rows,
             "slow_until": peer.slow_until,
         }
-        first = {"first_step": origin.step, "first_episode": origin.episode}
+        first: dict[str, Any] = {"first_step": origin.step, "first_episode": origin.episode}
+        if self._written is not None:
+            first["stripes"] = self._written.describe(peer)
         return self._encode(peer.instance_id, skip=skip, **first)
 
     def _encode(self, instance_id: int, **progress: Any) -> bytes:

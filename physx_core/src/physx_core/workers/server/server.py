@@ -35,6 +35,7 @@ from physx_core.workers.server.validation import (
     parse_fields,
     parse_parameters,
 )
+from physx_core.workers.server.written_rows import WrittenRows
 from physx_core.workers.tickets import is_ticket
 
 _HANDSHAKE_TIME = 5.0
@@ -65,6 +66,7 @@ class Server:
         replaces: Callable[[int, PhysxError | None], bool] = lambda number, error: False,
         skip: Skip = NOTHING,
         pool: ClientPool | None = None,
+        written: WrittenRows | None = None,
     ) -> None:
         """Keep the arguments; `open` starts to listen.
 
@@ -80,6 +82,7 @@ class Server:
                 left without one.
             skip: What an earlier run has had of the instances.
             pool: The clients, if they run workers for several instances; None: each runs one.
+            written: Counts the rows that the clients write themselves; None: they send them.
         """
         self.peers: dict[int, Peer] = {}
         self.token = token
@@ -97,12 +100,12 @@ class Server:
             Kind.PARAMETERS: _take_parameters,
             Kind.READY: _take_ready,
             Kind.FIELDS: _take_fields,
-            Kind.ROWS: _take_rows,
             Kind.WRONG: _take_wrong,
             Kind.ERROR: _take_error,
             Kind.BYE: self._take_bye,
             Kind.AGAIN: _take_again,
             **dict.fromkeys(_REQUESTS, self._requests.take),
+            **({Kind.ROWS: _take_rows} if written is None else written.dispatch),
         }
 
     def open(self, host: str | None = None) -> None:

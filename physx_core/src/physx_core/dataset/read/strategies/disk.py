@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import builtins
 import os
-from bisect import bisect_right
+from collections.abc import Iterator
 from io import FileIO
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from physx_core import files
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.strategies.cache import converted_dtype
+from physx_core.dataset.store.partition.spans import FlatIndex
 from physx_core.typing import Array, Index
 
 _OPEN_FILES = 64
@@ -46,7 +48,7 @@ class DiskColumn:
         self._own = np.dtype(field.dtype)
         self._scratch = np.empty((0, *self.shape[1:]), self._own)
         self._segments = reader.segments(mode, name)
-        self._starts = [segment.start for segment in self._segments]
+        self._index = FlatIndex([segment.span for segment in self._segments])
         self._opened: dict[int, tuple[FileIO, int]] = {}
 
     def announce(self, start: int, count: int = 1) -> None:
@@ -54,25 +56,29 @@ class DiskColumn:
         size = self.row_nbytes
         if not size or not hasattr(os, "posix_fadvise"):
             return
-        while count > 0:
-            number, place, part = self._locate(start, count)
-            descriptor = self._opened[number][0].fileno()
-            os.posix_fadvise(descriptor, place, part * size, os.POSIX_FADV_WILLNEED)
-            start, count = start + part, count - part
+        for number, first, part, _ in self._parts(start, count):
+            file, offset = self._open(number)
+            place = offset + first * size
+            os.posix_fadvise(file.fileno(), place, part * size, os.POSIX_FADV_WILLNEED)
 
     def gather(self, index: Index, out: Array) -> None:
         """Copy single rows into a contiguous array, shape (rows, *field shape)."""
         size, rows = self.row_nbytes, self._target(out)
         view = files.as_bytes(rows)
         for number, row in enumerate(index.tolist()):
-            self._read(row, 1, view[number * size : (number + 1) * size])
+            self._read(*self._index.find(row)[:2], view[number * size : (number + 1) * size])
         if rows is not out:
             out[...] = rows
 
     def slice(self, start: int, out: Array) -> None:
         """Copy consecutive rows into a contiguous array, shape (rows, *field shape)."""
         rows = self._target(out)
-        self._read(start, len(rows), files.as_bytes(rows))
+        for number, first, _, where in self._parts(start, len(rows)):
+            target = rows[where]
+            part = target if where.step == 1 else np.empty(target.shape, target.dtype)
+            self._read(number, first, files.as_bytes(part))
+            if part is not target:
+                target[...] = part
         if rows is not out:
             out[...] = rows
 
@@ -90,21 +96,37 @@ class DiskColumn:
             self._scratch = np.empty(out.shape, self._own)
         return self._scratch[: len(out)]
 
-    def _read(self, row: int, count: int, view: memoryview) -> None:
-        size = self.row_nbytes
-        while view:
-            number, place, part = self._locate(row, count)
-            file = self._opened[number][0]
-            self._segments[number].read(file, place, view[: part * size])
-            row, count, view = row + part, count - part, view[part * size :]
+    def _read(self, number: int, first: int, view: memoryview) -> None:
+        """Fill a buffer with the rows of a segment from its row `first` on."""
+        if view:
+            file, offset = self._open(number)
+            self._segments[number].read(file, offset + first * self.row_nbytes, view)
 
-    def _locate(self, row: int, count: int) -> tuple[int, int, int]:
-        """Return a row's opened segment, its offset, and how many of `count` rows follow there."""
-        number = bisect_right(self._starts, row) - 1
-        segment, found = self._segments[number], self._opened.get(number)
+    def _parts(self, start: int, count: int) -> Iterator[tuple[int, int, int, builtins.slice]]:
+        """Yield which rows of which segments are `count` rows of the mode from `start` on.
+
+        Yields:
+            Number of the segment, its first row, how many, and where they lie among the `count`.
+        """
+        if not count:
+            return
+        number, place, follow = self._index.find(start)
+        if count <= follow:
+            yield number, place, count, builtins.slice(0, count, 1)
+            return
+        number, stop = number - self._segments[number].span.place, start + count
+        while number < len(self._segments) and self._segments[number].span.start < stop:
+            span = self._segments[number].span
+            first, part = span.inside(start, stop)
+            if part:
+                yield number, first, part, span.among(first, part, start)
+            number += 1
+
+    def _open(self, number: int) -> tuple[FileIO, int]:
+        """Return the open file of a segment, and the offset of its first row."""
+        found = self._opened.get(number)
         if found is None:
             if len(self._opened) >= _OPEN_FILES:
                 self._opened.pop(next(iter(self._opened)))[0].close()
-            found = self._opened[number] = segment.open()
-        before = row - segment.start
-        return number, found[1] + before * self.row_nbytes, min(count, segment.rows - before)
+            found = self._opened[number] = self._segments[number].open()
+        return found

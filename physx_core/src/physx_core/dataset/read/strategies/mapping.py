@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from physx_core import files
 from physx_core.dataset.store.partition.format import cannot_read, truncated
 from physx_core.dataset.store.partition.segment import Segment
+from physx_core.dataset.store.partition.spans import FlatIndex
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
 from physx_core.typing import Array, Index
@@ -36,8 +37,8 @@ class _Mapped(NamedTuple):
 class MappedColumn:
     """A field on the disk whose partitions are mapped side by side in the address space.
 
-    Row numbers are shifted by an amount that each partition has, so that a batch is one gather
-    however many partitions there are. Processes that map the same files share the system's memory
+    The place of a row follows from that of its partition, so that a batch is one gather however
+    many partitions there are. Processes that map the same files share the system's memory
     for them.
 
     Attributes:
@@ -54,8 +55,9 @@ class MappedColumn:
         self.dtype = np.dtype(field.dtype)
         self._row_nbytes = field.nbytes
         self._mapped: list[_Mapped] = []
-        self._starts = np.array([segment.start for segment in segments], np.intp)
-        self._shifts, slots = _places(segments, field.nbytes)
+        self._slots, slots = _places(segments, field.nbytes)
+        self._index = FlatIndex([segment.span for segment in segments])
+        self._single = len(segments) == 1
         if field.nbytes and slots:
             content = self._map(segments, slots * field.nbytes)
             self._array = content.view(self.dtype).reshape(slots, *self.shape[1:])
@@ -64,8 +66,9 @@ class MappedColumn:
 
     def gather(self, index: Index, out: Array) -> None:
         """Copy the rows of an index array, all in range, into `out` of the field's own type."""
-        if len(self._starts) > 1:
-            index = index + self._shifts[self._starts.searchsorted(index, "right") - 1]
+        if not self._single and len(index):
+            numbers, places = self._index.locate(index)
+            index = self._slots[numbers] + places
         self._array.take(index, 0, out, "clip")
 
     def check(self) -> None:
@@ -82,8 +85,8 @@ class MappedColumn:
     def _map(self, segments: Sequence[Segment], nbytes: int) -> NDArray[np.uint8]:
         base = _reserve(nbytes)
         weakref.finalize(self, _libc().munmap, base, nbytes).atexit = False
-        for segment, shift in zip(segments, self._shifts, strict=True):
-            address = base + int(segment.start + shift) * self._row_nbytes
+        for segment, slot in zip(segments, self._slots, strict=True):
+            address = base + int(slot) * self._row_nbytes
             file, offset = segment.open()
             with file:
                 count = segment.rows * self._row_nbytes
@@ -100,17 +103,17 @@ class MappedColumn:
 
 
 def _places(segments: Sequence[Segment], row_nbytes: int) -> tuple[Index, int]:
-    """Return how far each segment's rows are shifted, and the number of places in the array.
+    """Return the place of each segment's first row, and the number of places in the array.
 
     Each segment begins at the start of a page, and at a whole number of rows.
     """
     step = mmap.PAGESIZE // math.gcd(mmap.PAGESIZE, max(1, row_nbytes))
-    shifts, end = [], 0
+    slots, end = [], 0
     for segment in segments:
         end = -(-end // step) * step
-        shifts.append(end - segment.start)
+        slots.append(end)
         end += segment.rows
-    return np.array(shifts, np.intp), end
+    return np.array(slots, np.intp), end
 
 
 def _place(address: int, count: int, descriptor: int, offset: int) -> None:

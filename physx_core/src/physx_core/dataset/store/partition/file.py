@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import struct
 import threading
 from pathlib import Path
@@ -11,9 +12,11 @@ from xxhash import xxh3_64
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
+from physx_core.dataset.store import locks
 from physx_core.dataset.store.partition.commits import COUNT, RECORD, Commit, digest_of, encode
 from physx_core.dataset.store.partition.digesting import LARGE, Digester
-from physx_core.dataset.store.partition.format import Header, Identity, make_header
+from physx_core.dataset.store.partition.format import Header, Identity, inspect, make_header
+from physx_core.errors import DatasetError
 from physx_core.typing import Array
 
 _SMALLEST_STEP = 2**20
@@ -81,6 +84,41 @@ class PartitionFile:
             raise
         return file
 
+    @classmethod
+    def reopen(
+        cls, directory: Path, identity: Identity, rows: int, digester: Digester
+    ) -> PartitionFile:
+        """Open an existing partition file, to write the rows behind its first ones.
+
+        Args:
+            directory: The dataset's folder.
+            identity: What the file has to be part of.
+            rows: How many of its committed rows stay.
+            digester: Computes the digests.
+
+        Raises:
+            DatasetError: If it is not that file, or does not have these rows.
+        """
+        path = directory / identity.file_name
+        descriptor = files.open_regular(path, os.O_RDWR)
+        try:
+            locks.take_over(descriptor, path)
+            found = inspect(path)
+            if found.identity != identity or found.rows < rows:
+                raise DatasetError(f"{path} is not the partition that was to be continued.")
+        except BaseException:
+            files.close(descriptor)
+            raise
+        nbytes = identity.field.nbytes
+        header = Header(
+            b"", found.rows_offset, found.data_offset, found.data_offset + found.capacity * nbytes
+        )
+        file = cls(path, identity, header, descriptor, digester)
+        file._reserved = file.data_offset + rows * nbytes
+        if found.rows:
+            file.withdraw((rows, 0, 0))
+        return file
+
     def publish(self) -> None:
         """Give the file its name."""
         files.rename(files.temporary_path(self.path), self.path)
@@ -146,16 +184,16 @@ class PartitionFile:
         """Return to an earlier commit, whatever has been written since.
 
         Args:
-            commit: The commit, of the same base.
+            commit: The commit; its digest is computed again.
         """
         self._digester.wait()
         rows, base, _ = commit
         with self._lock:
-            self.committed = commit
             start, stop = (self.data_offset + row * self._row_nbytes for row in (base, rows))
             self._digest = digest_of(self.descriptor, start, stop) or xxh3_64()
+            self.committed = rows, base, self._digest.intdigest()
             files.sync(self.descriptor)
-            files.write_at(self.descriptor, encode(commit), self._rows_offset)
+            files.write_at(self.descriptor, encode(self.committed), self._rows_offset)
             files.sync(self.descriptor)
 
     def is_checked(self, row: int) -> bool:

@@ -16,6 +16,7 @@ import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from xxhash import xxh3_64_intdigest
@@ -39,8 +40,11 @@ from physx_core.fields import Field
 
 FORMAT = "physx partition"
 VERSION = 2
-READABLE = (2,)
-"""Versions of the header; `version_1` reads the files of version 1, which have none."""
+STRIPED_VERSION = 3
+READABLE = (VERSION, STRIPED_VERSION)
+"""Versions of the header; `version_1` reads the files of version 1, which have none. Only files of
+stripes have version 3, so that a physx that does not know of stripes refuses them."""
+MOST_STRIPES = 2**24
 MAGIC = b"\x89physx\r\n"
 """Beginning of the dataset ``header``, which tells physx what it needs without HDF5."""
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -57,6 +61,18 @@ _INVALID = (
 _END_OF_FILE = 40  # where the file's size stands in an HDF5 superblock of version 0
 
 
+class Stripe(NamedTuple):
+    """Which rows a partition has that shares consecutive rows of a mode with others, in turn.
+
+    Attributes:
+        place: Place of its first row among theirs, counted from 0.
+        of: How many partitions share the rows: it has every `of`-th.
+    """
+
+    place: int
+    of: int
+
+
 @dataclass(frozen=True)
 class Identity:
     """What a partition file is part of.
@@ -67,6 +83,7 @@ class Identity:
         field: Its field, with a known shape.
         index: Number of the partition in its session and mode, counted from 0.
         first_row: Row of the mode that is the partition's first.
+        stripe: Which rows from there on it has; None: all up to the next partition.
     """
 
     session: str
@@ -74,6 +91,12 @@ class Identity:
     field: Field
     index: int
     first_row: int
+    stripe: Stripe | None = None
+
+    @property
+    def version(self) -> int:
+        """Version of the file's header."""
+        return VERSION if self.stripe is None else STRIPED_VERSION
 
     @property
     def file_name(self) -> str:
@@ -81,11 +104,11 @@ class Identity:
         return partition_file(self.session, self.mode, self.field.name, self.index)
 
     @property
-    def attributes(self) -> dict[str, str | int]:
+    def attributes(self) -> dict[str, str | int | Stripe]:
         """The file's attributes."""
         return {
             "format": FORMAT,
-            "format_version": VERSION,
+            "format_version": self.version,
             "session": self.session,
             "mode": self.mode,
             "field": self.field.name,
@@ -93,6 +116,7 @@ class Identity:
             "unit": self.field.unit,
             "role": self.field.role,
             "first_row": self.first_row,
+            **({} if self.stripe is None else {"stripe": self.stripe}),
         }
 
 
@@ -146,6 +170,15 @@ class Inspection:
 def partition_file(session: str, mode: str, field: str, index: int) -> str:
     """Return the name of a partition file."""
     return f"{session}_{mode}_{field}_{index}.h5"
+
+
+def parse_stripe(plain: Any) -> Stripe:
+    """Return the stripe that plain data describe."""
+    place, count = checked(list, plain, "a stripe")
+    count = whole(count, "the number of stripes", MOST_STRIPES)
+    if count < 2:
+        raise ValueError(f"the number of stripes cannot be {count}")
+    return Stripe(whole(place, "the place of a stripe", count - 1), count)
 
 
 def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
@@ -319,13 +352,14 @@ def _check_superblock(file: io.FileIO, path: Path, offset: int | None, row_nbyte
 def _describe(identity: Identity) -> bytes:
     plain = {
         "format": FORMAT,
-        "format_version": VERSION,
+        "format_version": identity.version,
         "session": identity.session,
         "mode": identity.mode,
         "field": identity.field.to_dict(),
         "partition": identity.index,
         "first_row": identity.first_row,
         "boot": boot_id(),
+        **({} if identity.stripe is None else {"stripe": list(identity.stripe)}),
     }
     text = json.dumps(plain).encode()
     return text + b" " * (-(len(MAGIC) + _NUMBERS.size + len(text)) % _ALIGNMENT)
@@ -377,6 +411,7 @@ def _parse_header(head: bytes) -> Inspection:
         field,
         whole(plain["partition"], "the number of a partition", 2**31),
         whole(plain["first_row"], "a first row"),
+        parse_stripe(plain["stripe"]) if version == STRIPED_VERSION else None,
     )
     rows, commits = decode(head[rows_offset : rows_offset + NBYTES])
     boot = checked(str, plain["boot"], "'boot'")

@@ -21,6 +21,7 @@ from physx_core.dataset.store.partition.format import (
     open_partition,
     truncated,
 )
+from physx_core.dataset.store.partition.spans import Span
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
 from physx_core.typing import Array
@@ -36,8 +37,7 @@ class Segment:
     Attributes:
         path: The file.
         field: The field, with a known shape.
-        start: Row of the mode that is the first one here.
-        rows: How many rows to read.
+        span: Which rows of the mode they are.
         offset: Byte of the file at which they begin.
         certain: Whether `offset` can be relied on; otherwise it is read from the file, because
             another process may replace the file by its final form at any moment.
@@ -47,12 +47,16 @@ class Segment:
 
     path: Path
     field: Field
-    start: int
-    rows: int
+    span: Span
     offset: int
     certain: bool
     checksum: int | None = None
     commit: Commit | None = None
+
+    @property
+    def rows(self) -> int:
+        """How many rows there are to read."""
+        return self.span.rows
 
     def open(self) -> tuple[FileIO, int]:
         """Open the file; return it with the offset of the first row."""

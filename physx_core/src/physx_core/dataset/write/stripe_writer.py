@@ -1,0 +1,172 @@
+"""Writes one stripe of a mode's rows, in a process beside the one that keeps the manifest."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+from physx_core import files
+from physx_core.closeable import Closeable
+from physx_core.dataset.store.manifest import Partition
+from physx_core.dataset.store.partition.digesting import Digester
+from physx_core.dataset.store.partition.file import PartitionFile
+from physx_core.dataset.store.sealing import seal
+from physx_core.dataset.store.syncing import Syncer
+from physx_core.dataset.write.writer import OpenPartition
+from physx_core.errors import DatasetError
+from physx_core.fields import Field
+from physx_core.typing import Batch
+
+
+class StripeWriter(Closeable):
+    """Writes and seals the partitions of one stripe, in their order; close it after use.
+
+    What `append` has written survives if the process dies at any later moment, and a power cut
+    about a second later.
+
+    Attributes:
+        rows: How many rows the stripe has, in all its partitions.
+        fields: The fields of the rows.
+    """
+
+    def __init__(self, directory: Path, fields: Sequence[Field], capacity: int) -> None:
+        """Start without a partition.
+
+        Args:
+            directory: The dataset's folder.
+            fields: The fields of the rows, with their shapes.
+            capacity: How many rows fit into a partition.
+        """
+        self.rows = 0
+        self.fields = list(fields)
+        self._directory, self._capacity = directory, capacity
+        self._fields = {field.name: field for field in fields}
+        self._entries: dict[int, Partition] = {}
+        self._opened: OpenPartition | None = None
+        self._syncer, self._digester = Syncer(), Digester()
+        self._sealer = ThreadPoolExecutor(1, "physx-seal")
+        self._sealing: deque[tuple[int, Future[Partition]]] = deque()
+
+    def add(self, number: int, entry: Partition) -> None:
+        """Learn of the partition that gets rows ``number * capacity`` and those after it."""
+        self._entries[number] = entry
+
+    def resume(self, told: int) -> int:
+        """Continue a stripe that another process has begun.
+
+        The rows of its partitions that are not sealed are compared with their digests.
+
+        Args:
+            told: How many rows it is said to have.
+
+        Returns:
+            How many rows it has. The others have to be written again.
+        """
+        self.rows = told
+        with files.storing("The rows of an earlier process"):
+            for number, entry in sorted(self._entries.items()):
+                begin = number * self._capacity
+                rows = min(max(0, told - begin), self._capacity, self._count(entry))
+                self.rows = begin + rows
+                self._opened = self._open(number, rows)
+                if self._opened.free:
+                    break
+                self._retire()
+        return self.rows
+
+    @property
+    def room(self) -> int:
+        """How many rows more fit into the partitions that are known."""
+        known = (max(self._entries) + 1) * self._capacity if self._entries else 0
+        return max(0, known - self.rows)
+
+    def append(self, rows: Batch, count: int) -> None:
+        """Write and commit rows, for which there is room.
+
+        Raises:
+            DatasetError: If the disk is full or fails; `rows` says how many are stored.
+        """
+        done = 0
+        with files.storing("The rows of this client"):
+            self._syncer.check()
+            while done < count:
+                if self._opened is None:
+                    self._opened = self._open(self.rows // self._capacity, 0)
+                part = min(self._opened.free, count - done)
+                self._opened.append(rows, done, part)
+                done, self.rows = done + part, self.rows + part
+                if not self._opened.free:
+                    self._retire()
+
+    def take_sealed(self, *, wait: bool = False) -> list[tuple[int, Partition]]:
+        """Return the partitions that have been sealed since the last call, with their numbers."""
+        found = []
+        with files.storing("A partition of this client"):
+            while self._sealing and (wait or self._sealing[0][1].done()):
+                number, work = self._sealing.popleft()
+                try:
+                    found.append((number, work.result()))
+                except OSError as error:
+                    if error.errno not in files.FULL:  # else it is sealed when there is space
+                        raise
+        return found
+
+    def finish(self, rows: int) -> list[tuple[int, Partition]]:
+        """Seal the last partition, and return all that have been sealed since the last call.
+
+        Args:
+            rows: How many rows the stripe keeps. Those of earlier partitions stay in any case.
+        """
+        if self._opened is not None:
+            number = (self.rows - self._opened.partition.rows) // self._capacity
+            keep = min(max(0, rows - number * self._capacity), self._opened.partition.rows)
+            if keep:
+                self._retire(keep)
+        return self.take_sealed(wait=True)
+
+    def close(self) -> None:
+        """Close the files, without sealing them, when they are on the disk."""
+        self._sealer.shutdown()
+        self._digester.close()
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            opened.close()
+        with files.storing("The last rows"):
+            self._syncer.close()
+
+    def _count(self, entry: Partition) -> int:
+        """Return how many rows a partition really has, in all fields."""
+        found = []
+        for field in self.fields:
+            _, commit = entry.find_rows(self._directory, field, thorough=True)
+            found.append(0 if commit is None else commit.rows)
+        return min(found)
+
+    def _open(self, number: int, rows: int) -> OpenPartition:
+        entry = replace(self._entries[number], rows=rows)
+        parts: dict[str, PartitionFile] = {}
+        try:
+            for field in self.fields:
+                parts[field.name] = PartitionFile.reopen(
+                    self._directory, entry.identity(field), rows, self._digester
+                )
+        except (OSError, DatasetError):
+            for part in parts.values():
+                part.close()
+            raise
+        return OpenPartition(entry, self._capacity, parts, self._syncer)
+
+    def _retire(self, rows: int | None = None) -> None:
+        """Close the open partition, and have it sealed in the background."""
+        opened = self._opened
+        if opened is None:
+            return
+        self._opened, entry = None, opened.partition
+        number = (self.rows - entry.rows) // self._capacity
+        opened.close()
+        entry = replace(entry, rows=entry.rows if rows is None else rows)
+        work = self._sealer.submit(seal, self._directory, self._fields, entry)
+        self._sealing.append((number, work))
