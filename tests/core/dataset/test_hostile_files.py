@@ -141,7 +141,7 @@ IMPOSSIBLE = [
     (("format",), "other"),
     (("format",), ...),
     (("format_version",), 0),
-    (("format_version",), 2),
+    (("format_version",), 3),
     (("format_version",), -1),
     (("format_version",), "1"),
     (("format_version",), True),

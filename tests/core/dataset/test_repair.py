@@ -286,10 +286,10 @@ def test_version_1_is_read(folder):
 def test_a_newer_version_is_rejected(folder, thousand):
     thousand.write(folder)
     path = folder / "dataset.json"
-    plain = json.loads(path.read_text()) | {"format_version": 2}
+    plain = json.loads(path.read_text()) | {"format_version": 3}
     path.write_text(json.dumps(plain))
     with pytest.raises(
-        DatasetError, match=r"version 2 of the dataset's format, but this physx reads version 1"
+        DatasetError, match=r"version 3 of the dataset's format, but this physx reads versions 1 and 2"
     ):
         Dataset.open(folder)
 
