@@ -289,7 +289,8 @@ def test_a_newer_version_is_rejected(folder, thousand):
     plain = json.loads(path.read_text()) | {"format_version": 3}
     path.write_text(json.dumps(plain))
     with pytest.raises(
-        DatasetError, match=r"version 3 of the dataset's format, but this physx reads versions 1 and 2"
+        DatasetError,
+        match=r"version 3 of the dataset's format, but this physx reads versions 1 and 2",
     ):
         Dataset.open(folder)
 

@@ -194,6 +194,18 @@ def test_clients_that_are_killed_at_any_moments(nothing_stays_behind, process_id
     assert_same(rows(folder), wanted)
 
 
+def test_a_client_that_leaves_an_elastic_run_has_its_instances_continued(
+    nothing_stays_behind, process_ids
+):
+    wanted = rows(generate("server", "server", batches=20, num_clients=4))
+    clients = threading.Timer(1.5, lambda: os.kill(process_ids()[1], signal.SIGKILL))
+    clients.start()
+    options = {"num_clients": 4, "min_clients": 1, "max_clients": 2, "restarts": 3}
+    folder = generate("clients", batches=20, env_kwargs={"delay": 0.03}, **options)
+    clients.join()
+    assert_same(rows(folder), wanted)
+
+
 def test_what_was_written_before_an_error_stays(nothing_stays_behind):
     wanted = rows(generate("server", "server", batches=3, size=60))
     with pytest.raises(NotFiniteError, match='field "x"'):

@@ -12,7 +12,7 @@ import contextlib
 import secrets
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from physx_core import files
 from physx_core.dataset.read.mode_statistics import count_sealed
@@ -25,6 +25,7 @@ from physx_core.dataset.store.manifest import (
     rows_of_stripe,
     whole_stripes,
 )
+from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.partition.file import PartitionFile
 from physx_core.dataset.store.partition.format import Stripe
 from physx_core.dataset.store.sealing import remove_files, seal
@@ -32,9 +33,6 @@ from physx_core.dataset.store.virtual_index import write_index
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
 from physx_core.statistics import RunningStatistics
-
-if TYPE_CHECKING:
-    from physx_core.dataset.write.writer import Writer
 
 PROOF = "dataset.clients"
 """File with a random text, by which other processes prove that they see the same folder."""
@@ -55,6 +53,27 @@ class _Group:
     sealed: dict[int, Partition] = field(default_factory=dict)
 
 
+class Beginning(Protocol):
+    """What begins partitions: the dataset's writer.
+
+    Attributes:
+        store: The manifest.
+        session: Session that writes.
+    """
+
+    store: ManifestStore
+    session: str
+
+    def capacity(self, mode: Mode) -> int:
+        """Return how many rows of a mode fit into a partition."""
+
+    def new_partition(self, mode_name: str, mode: Mode) -> Partition:
+        """Return a partition with the first number whose files do not exist yet."""
+
+    def create_file(self, entry: Partition, field: Field, capacity: int) -> PartitionFile:
+        """Create a file of a new partition, under its temporary name."""
+
+
 class Stripes:
     """The partitions of one mode that other processes write, one stripe each.
 
@@ -68,7 +87,7 @@ class Stripes:
         begun: How many groups have been begun.
     """
 
-    def __init__(self, writer: Writer, mode_name: str, count: int) -> None:
+    def __init__(self, writer: Beginning, mode_name: str, count: int) -> None:
         self.count = count
         self.mode_name = mode_name
         self.session = writer.session
