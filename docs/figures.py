@@ -19,7 +19,7 @@ HERE = Path(__file__).resolve().parent
 BENCHMARKS = HERE.parent / "benchmarks"
 PAGE, KEPT = HERE / "figures.md", HERE / "figures"
 MARK = "<!-- What follows is written by figures.py. -->"
-OTHERS = {"compare", "jiminy_zoo", "remote_servers"}  # they compare checkouts, or serve another benchmark
+OTHERS = {"compare", "jiminy_zoo", "remote_servers"}  # which others start
 
 
 def names() -> list[str]:

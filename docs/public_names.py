@@ -20,7 +20,16 @@ from sphinx.pycode import ModuleAnalyzer
 FACES = {
     "physx_core": (
         "",
-        *("components", "config", "dataset", "pipelines", "plugins", "simulation", "rotations"),
+        *(
+            "components",
+            "config",
+            "dataset",
+            "pipelines",
+            "plugins",
+            "simulation",
+            "engines",
+            "rotations",
+        ),
         *("errors", "fields", "typing", "testing", "checks", "parsing", "rows", "sources"),
         *("workers", "net", "processes", "files", "origin", "cli"),
     ),

@@ -55,7 +55,7 @@ def test_a_file_gives_options_and_words_replace_them(capsys, tmp_path):
         ([*GENERATE, "--config", "none.toml"], "no configuration file"),
         (["generate", "--config"], "needs the path"),
         (["info", "nowhere"], "nowhere"),
-        (["info"], "one folder"),
+        (["info", "--verify"], "needs a folder"),
         (["predict", "sessions/none", "toy/spring"], "no session"),
         ([*TRAIN, "--epoch-nb", "1", "--batch-size", "1"], "nowhere"),
     ],

@@ -1,7 +1,8 @@
-"""``physx info``: show a session or dataset: fields, units, samples, normalization, integrity."""
+"""``physx info``: show a session or dataset; without a folder, what is installed, and where."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,25 +11,62 @@ from typing import Annotated
 import tyro
 
 from physx_core import checkpoint
+from physx_core.cli import installation
+from physx_core.cli.commands.plugins import load_all
 from physx_core.cli.dataset_tables import print_dataset
-from physx_core.cli.output import show
-from physx_core.errors import CheckpointError, DatasetNotFoundError
+from physx_core.cli.output import show, show_table
+from physx_core.errors import CheckpointError, DatasetNotFoundError, UsageError
 
 
 @dataclass
 class Info:
-    """Show the contents of a session or dataset."""
+    """Show the contents of a session or dataset.
 
-    directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
-    """A session's or a dataset's folder; give one folder."""
+    Without a folder, show what a report of a bug needs: the interpreter, versions, where each
+    package comes from, drivers, plugins that are broken, packages that hide others.
+    """
+
+    directory: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[DIR]")] = None
+    """A session's or a dataset's folder."""
     verify: bool = False
     """Check every byte, not only sizes and headers."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Print the dataset and the checkpoints of a folder."""
+    """Print the dataset and the checkpoints of a folder, or what is installed."""
     options = tyro.cli(Info, args=words, prog="physx info")
-    place = Path(options.directory)
+    if options.directory is not None:
+        _show_session(Path(options.directory), options)
+    elif options.verify:
+        raise UsageError("--verify needs a folder: physx info SESSION --verify.")
+    else:
+        _show_installation()
+
+
+def _show_installation() -> None:
+    """Print what a report of a bug needs, without secrets."""
+    packages = installation.find_packages()
+    for title, values in (
+        ("machine", installation.describe_machine()),
+        ("drivers", installation.describe_drivers(os.environ)),
+        ("environment variables", installation.describe_variables(os.environ)),
+    ):
+        show(title if values else f"{title}: none that matter")
+        for name, text in values.items():
+            show(f"  {name:<12} {text}")
+    show("packages")
+    rows = [(each.name, each.version, each.place) for each in packages]
+    show_table(("name", "version", "imported from"), rows, indent=2)
+    problems = [f"{each.name}: {text}" for each in packages for text in each.problems]
+    show(f"in each other's way: {'' if problems else 'nothing'}")
+    for text in problems:
+        show(f"  {text}")
+    show("plugins")
+    for _ in load_all():
+        pass
+
+
+def _show_session(place: Path, options: Info) -> None:
     checkpoints = checkpoint.list_all(place / "network")
     try:
         print_dataset(place, verify=options.verify)

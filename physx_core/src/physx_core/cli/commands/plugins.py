@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from physx_core import plugins
 from physx_core.cli.output import show, width
 from physx_core.errors import PhysxError, UsageError, printable
+from physx_core.plugins import Plugin
 from physx_core.plugins.entries import find_unreadable
 
 
@@ -18,14 +19,7 @@ def run(words: Sequence[str]) -> None:
         return
     if words:
         raise UsageError(f"physx plugins takes no options, not {' '.join(words)}.")
-    for name, info in plugins.available().items():
-        # At once: if the plugin crashes or hangs for ever, this is what tells which one it was.
-        print(printable(f"{name}  ({', '.join(info.distributions)})"), flush=True)
-        try:
-            plugin = plugins.load(name)
-        except PhysxError as error:
-            show(f"  broken: {error}")
-            continue
+    for name, plugin in load_all():
         for kind, components in plugin.components.items():
             text = f"{kind}: {', '.join(f'{name}/{key}' for key in components)}"
             show(
@@ -38,5 +32,18 @@ def run(words: Sequence[str]) -> None:
                     break_on_hyphens=False,
                 )
             )
+
+
+def load_all() -> Iterator[tuple[str, Plugin]]:
+    """Load each plugin, print its name before and what is wrong with it after, yield the others."""
+    for name, info in plugins.available().items():
+        # At once: if the plugin crashes or hangs for ever, this is what tells which one it was.
+        print(printable(f"{name}  ({', '.join(info.distributions)})"), flush=True)
+        try:
+            plugin = plugins.load(name)
+        except PhysxError as error:
+            show(f"  broken: {error}")
+            continue
+        yield name, plugin
     for package, problem in find_unreadable().items():
         show(f"The entry points of the package {package} cannot be read: {problem}")
