@@ -2,6 +2,7 @@
 
 python docs/pictures.py    # writes environments.png, replay.png, examples.png beside this file
 python docs/pictures.py --demo PICTURE    # compares a picture of the demo with arm.png
+python docs/pictures.py --film sessions/arm/tracking.rrd    # writes arm.webp, in some minutes
 
 ``make demo DEMO_ARGS="--picture docs/arm.png"`` draws arm.png.
 """
@@ -215,7 +216,23 @@ def check_demo(path: Path) -> None:
         assert curves["blue"] > 5e-4 and curves["orange"] > 5e-4, (file, "the plot", curves)
 
 
+def film(recording: Path, path: Path) -> None:
+    """Write a film of a recording of the demo: the three arms, at every 16th of 800 steps."""
+    frames = []
+    with tempfile.TemporaryDirectory() as folder:
+        for step in range(0, 800, 16):
+            file = render_picture(recording, Path(folder, f"{step}.png"), (900, 540), at=step)
+            picture = Image.open(file).convert("RGB")
+            frames.append(picture.crop((0, 0, picture.width, 508)))  # without the controls
+    frames[0].save(
+        path, quality=60, method=6, save_all=True, append_images=frames[1:], duration=80, loop=0
+    )
+
+
 if __name__ == "__main__":
+    if sys.argv[1:2] == ["--film"]:
+        film(Path(sys.argv[2]), HERE / "arm.webp")
+        sys.exit(0)
     if sys.argv[1:2] == ["--demo"]:
         check_demo(Path(sys.argv[2]))
         sys.exit(0)
