@@ -117,10 +117,10 @@ class RayLauncher(Launcher):
         """Reserve what the clients need; Ray says where when it has found nodes."""
         assert self._nodes is not None and self._connection is not None
         found = self._connection.nodes()
-        needs = {name: need for name, need in self._needs.items() if need}
-        if self._needs["CPU"] is None:
+        needs = dict(self._needs)
+        if needs["CPU"] is None:
             needs["CPU"] = share_of_processors(found, len(instances))
-        bundle: Bundle = {name: float(need or 0.0) for name, need in needs.items()}
+        bundle: Bundle = {name: float(need) for name, need in needs.items() if need}
         group = placement_group([bundle] * len(instances), strategy=self._strategy)
         self._nodes.add(group, instances, bundle)
         if not group.wait(_LOOK_TIME) and (misfit := self._find_reason(group, bundle)):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 import sys
+from pathlib import Path
 from typing import Any
 
 import ray
@@ -12,9 +14,11 @@ from ray import exceptions as ray_errors
 
 from physx_cluster.placement.address import address_towards
 from physx_core.errors import ConfigError
+from physx_core.net import parse_address
 
 _FAILURES = (ray_errors.RayError, ConnectionError, RuntimeError, ValueError, OSError, TimeoutError)
 _ADDRESS = "RAY_ADDRESS"
+_PROBE_TIME = 3.0  # s
 
 
 class RayConnection:
@@ -62,22 +66,37 @@ class RayConnection:
                 'run on a node of the cluster, with launcher_kwargs={"address": "auto"}.'
             )
         try:
-            if address is None:
-                try:
-                    _init("auto")
-                except ConnectionError:
-                    self._is_local = True
-                    _init("local")
-            else:
-                _init(address)
+            if address in (None, "auto"):
+                running = _find_running()
+                self._is_local = running is None and address is None
+                address = running or ("local" if self._is_local else address)
+            if address not in ("auto", "local"):
+                _probe(str(address))
+            _init(str(address))
         except _FAILURES as error:
-            reason = " ".join(str(error).split())
+            reason = " ".join(str(error).split()).rstrip(".")
             raise ConfigError(
-                f"Ray does not answer at {address or 'this machine'}: {reason} Start it with "
+                f"Ray does not answer at {address}: {reason}. Start it with "
                 '"ray start --head" on one node and "ray start --address HOST:6379" on the others, '
                 f"this one too; or leave out the address and {_ADDRESS}, and the run starts a Ray "
                 "of its own."
             ) from error
+
+
+def _find_running() -> str | None:
+    """Return the address of the cluster that was started on this machine, if it still runs."""
+    note = Path(os.environ.get("RAY_TMPDIR", "/tmp"), "ray", "ray_current_cluster")
+    try:
+        address = note.read_text().strip()
+        _probe(address)
+    except (OSError, ConfigError):
+        return None
+    return address
+
+
+def _probe(address: str) -> None:
+    """Raise an error if nothing listens at an address, for which Ray would wait two minutes."""
+    socket.create_connection(parse_address(address), timeout=_PROBE_TIME).close()
 
 
 def _init(address: str) -> None:

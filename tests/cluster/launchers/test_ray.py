@@ -1,0 +1,141 @@
+"""Clients on Ray: the rows of a local run, whatever is lost, and nothing left on any node."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("ray")
+
+RAY = ("--environment.launcher", "cluster/ray")
+KWARGS = "--environment.launcher-kwargs"
+
+
+def on(cluster, *kwargs):
+    """Return the words and variables of a run on a cluster."""
+    return (*RAY, *((KWARGS, *kwargs) if kwargs else ()))
+
+
+def test_the_rows_are_those_of_a_local_run(runs, ray_cluster, eventually):
+    expected = runs.rows()
+    assert runs.same(runs.rows(*on(ray_cluster), **ray_cluster.variables), expected)
+    nodes = {node for *_, node in runs.clients()}
+    assert nodes == {"here", *(str(ray_cluster.raylet_of(node)) for node in ray_cluster.nodes)}
+    said = runs.log.read_text().splitlines()
+    assert [line.partition(":")[0] for line in said if "batches" not in line] == [
+        *("session", "samples", "next", "next")
+    ]
+    eventually(runs.nothing_is_left)
+
+
+def test_a_killed_node_is_replaced_and_the_rows_stay_the_same(runs, ray_cluster, eventually):
+    expected = runs.rows(batches=20)
+    lost = ray_cluster.nodes.pop()
+    process = runs.start(
+        *on(ray_cluster, "num_cpus=0.5"),
+        *("--environment.restarts", "1"),
+        batches=20,
+        pace=0.05,
+        **ray_cluster.variables,
+    )
+    runs.wait_for_clients(4, process)
+    time.sleep(1)
+    ray_cluster.kill(lost)
+    status, said = runs.finish(process)
+    ray_cluster.nodes.append(ray_cluster.add_node())
+    assert status == 0, said
+    assert "Restart 1 of 1" in said
+    assert runs.same(runs.stored(), expected)
+    assert len(runs.clients()) == 5
+    eventually(runs.nothing_is_left)
+
+
+@pytest.mark.parametrize("way", ["error", "SIGINT", "SIGTERM", "SIGKILL"])
+def test_nothing_is_left_on_any_node(way, runs, ray_cluster, eventually):
+    fail_at = 5 if way == "error" else -1
+    process = runs.start(
+        *on(ray_cluster), batches=10_000, pace=0.01, fail_at=fail_at, **ray_cluster.variables
+    )
+    runs.wait_for_clients(2, process)
+    if way != "error":
+        process.send_signal(getattr(signal, way))
+    status, said = runs.finish(process)
+    assert status != 0, said
+    eventually(runs.nothing_is_left)
+    if way == "error":
+        assert "on purpose" in said
+    eventually(lambda: not any(b"ray::Agent" in command for command in commands()))
+
+
+def test_a_cluster_is_started_for_the_run_and_ends_with_it(runs, eventually):
+    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")
+    try:
+        for way in ("return", "SIGKILL"):
+            forever = 4 if way == "return" else 10_000
+            process = runs.start(*RAY, batches=forever, pace=0.01, RAY_TMPDIR=folder)
+            runs.wait_for_clients(2 if way == "return" else 4, process)
+            if way == "SIGKILL":
+                process.kill()
+            status, said = runs.finish(process)
+            assert status == (0 if way == "return" else -signal.SIGKILL), said
+            eventually(runs.nothing_is_left)
+            eventually(lambda: not any(folder.encode() in command for command in commands()))
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "text"),
+    [
+        (["num_gpus=3"], "a client needs 1 CPU and 3 GPU of one node, and the nodes have up to"),
+        (["num_cpus=1.5"], "has no place on Ray"),
+        (["strategy='STRICT_PACK'"], "2 clients, each with 1 CPU, do not fit the 2 nodes"),
+        (["strategy='AROUND'"], "strategy is 'AROUND', but must be one of"),
+        (["num_cpus=0"], "at least one resource"),
+        (["address='ray://127.0.0.1:10001'"], "address of a Ray client"),
+        (["address='127.0.0.1:1'"], "Ray does not answer at 127.0.0.1:1"),
+    ],
+)
+def test_what_cannot_be_had_is_said_within_seconds(kwargs, text, runs, ray_cluster):
+    began = time.monotonic()
+    process = runs.start(*on(ray_cluster, *kwargs), **ray_cluster.variables)
+    status, said = runs.finish(process, 60)
+    assert status == 1
+    assert text in " ".join(said.split())
+    assert time.monotonic() - began < 30
+    assert not runs.clients()
+
+
+def test_the_run_says_what_its_clients_wait_for(runs, ray_cluster, eventually):
+    first = runs.start(*on(ray_cluster), batches=10_000, pace=0.01, **ray_cluster.variables)
+    runs.wait_for_clients(2, first)
+    log, runs.log = runs.log, runs.folder / "second"
+    kwargs = on(ray_cluster, "num_cpus=1")
+    second = runs.start(*kwargs, batches=2, **ray_cluster.variables)
+    said = "2 of them: it waits for 1 CPU, and Ray has 0 CPU free"
+    eventually(lambda: said in " ".join(runs.log.read_text().split()), 60)
+    first.send_signal(signal.SIGINT)
+    status, said = runs.finish(second)
+    assert status == 0, said
+    runs.log = log
+    runs.finish(first)
+
+
+def test_more_clients_than_processors_share_them(runs, ray_cluster):
+    expected = runs.rows(clients=5)
+    assert runs.same(runs.rows(*on(ray_cluster), clients=5, **ray_cluster.variables), expected)
+
+
+def commands():
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            found.append(path.read_bytes())
+        except OSError:
+            continue
+    return found
