@@ -38,17 +38,23 @@ def register() -> None:
         )
 
 
+_VECTOR_OPTIONS = (
+    *("num_processes", "batch_size", "autoreset_mode", "copy", "timeout"),
+    *("launcher", "launcher_kwargs", "ip_address", "restarts"),
+)
+
+
 def make_vector(id: str, num_envs: int, **options: Any) -> Any:
     """Return a vector environment whose environments run in processes of their own.
 
     Args:
         id: Id of the environment.
         num_envs: Number of environments.
-        options: ``num_processes``, ``batch_size``, ``autoreset_mode``, ``copy`` and ``timeout`` of
+        options: ``num_processes``, ``batch_size``, ``autoreset_mode``, ``copy``, ``timeout``,
+            ``launcher``, ``launcher_kwargs``, ``ip_address`` and ``restarts`` of
             `ParallelVectorEnv`; all others are for each environment.
     """
     from physx_gym.vector.vector_env import ParallelVectorEnv
 
-    names = ("num_processes", "batch_size", "autoreset_mode", "copy", "timeout")
-    own = {name: options.pop(name) for name in names if name in options}
+    own = {name: options.pop(name) for name in _VECTOR_OPTIONS if name in options}
     return ParallelVectorEnv(id, num_envs, env_kwargs=options, **own)

@@ -1,6 +1,7 @@
 """`ParallelVectorEnv` compared with Gymnasium's own vector environments, with real processes."""
 
 import contextlib
+import functools
 import os
 import signal
 
@@ -127,12 +128,19 @@ def same(one, other):
         assert np.asarray(one).dtype == np.asarray(other).dtype
 
 
+@pytest.fixture(params=["shared memory", "physx/subprocess"])
+def launch(request):
+    """Make a vector environment whose processes share memory, or are clients of a launcher."""
+    launcher = None if request.param == "shared memory" else request.param
+    return functools.partial(ParallelVectorEnv, launcher=launcher)
+
+
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_it_returns_what_gymnasium_returns(mode, nothing_stays_behind):
+def test_it_returns_what_gymnasium_returns(mode, launch, nothing_stays_behind):
     def make():
         return gymnasium.make("CartPole-v1", max_episode_steps=7)
 
-    ours = ParallelVectorEnv(
+    ours = launch(
         "CartPole-v1",
         3,
         env_kwargs={"max_episode_steps": 7},
@@ -153,9 +161,9 @@ def test_it_returns_what_gymnasium_returns(mode, nothing_stays_behind):
 
 
 @pytest.mark.parametrize("count", [4, 5])
-def test_infos_whose_layout_changes(count, nothing_stays_behind):
+def test_infos_whose_layout_changes(count, launch, nothing_stays_behind):
     ours, theirs = (
-        ParallelVectorEnv(HERE + "Talker", count, num_processes=2),
+        launch(HERE + "Talker", count, num_processes=2),
         SyncVectorEnv([Talker] * count),
     )
     actions = {"kind": np.zeros(count, int), "size": np.zeros((count, 1), np.float32)}
@@ -165,9 +173,9 @@ def test_infos_whose_layout_changes(count, nothing_stays_behind):
             same(ours.step(actions)[4], theirs.step(actions)[4])
 
 
-def test_nan_and_infinity_are_passed_through(nothing_stays_behind):
+def test_nan_and_infinity_are_passed_through(launch, nothing_stays_behind):
     ours, theirs = (
-        ParallelVectorEnv(HERE + "Broken", 2, num_processes=2),
+        launch(HERE + "Broken", 2, num_processes=2),
         SyncVectorEnv([Broken] * 2),
     )
     actions = {"kind": np.zeros(2, int), "size": np.zeros((2, 1), np.float32)}
@@ -177,10 +185,8 @@ def test_nan_and_infinity_are_passed_through(nothing_stays_behind):
             same(ours.step(actions), theirs.step(actions))
 
 
-def test_nested_spaces_infos_calls_and_attributes(caplog, nothing_stays_behind):
-    env = ParallelVectorEnv(
-        HERE + "Counter", 3, env_kwargs={"render_mode": "rgb_array"}, num_processes=3
-    )
+def test_nested_spaces_infos_calls_and_attributes(caplog, launch, nothing_stays_behind):
+    env = launch(HERE + "Counter", 3, env_kwargs={"render_mode": "rgb_array"}, num_processes=3)
     with contextlib.closing(env):
         observation, infos = env.reset(seed=1, options={"start": 1})
         assert observation["count"].tolist() == [[1.0, 1.0]] * 3
@@ -214,8 +220,8 @@ def test_nested_spaces_infos_calls_and_attributes(caplog, nothing_stays_behind):
         env.reset()
 
 
-def test_disabled_autoreset_with_a_mask(nothing_stays_behind):
-    env = ParallelVectorEnv(
+def test_disabled_autoreset_with_a_mask(launch, nothing_stays_behind):
+    env = launch(
         HERE + "Counter", 2, num_processes=1, autoreset_mode="Disabled", env_kwargs={"length": 9}
     )
     with contextlib.closing(env):
@@ -229,18 +235,18 @@ def test_disabled_autoreset_with_a_mask(nothing_stays_behind):
             env.reset(options={"reset_mask": [True]})
 
 
-def test_mistakes_and_failures_are_reported(nothing_stays_behind):
+def test_mistakes_and_failures_are_reported(launch, nothing_stays_behind):
     with pytest.raises(ConfigError, match=r"CartPole-v7.*CartPole-v1"):
-        ParallelVectorEnv("CartPole-v7", 2)
+        launch("CartPole-v7", 2)
     with pytest.raises(ConfigError, match="do not have a fixed shape"):
-        ParallelVectorEnv(HERE + "Unstorable", 2)
+        launch(HERE + "Unstorable", 2)
     with pytest.raises(ConfigError, match="at least 1"):
-        ParallelVectorEnv("CartPole-v1", 0)
+        launch("CartPole-v1", 0)
     with pytest.raises(ConfigError, match="env_kwargs is 3"):
-        ParallelVectorEnv("CartPole-v1", 1, env_kwargs=3)
+        launch("CartPole-v1", 1, env_kwargs=3)
     with pytest.raises(UnknownOptionError, match="NextStep"):
-        ParallelVectorEnv("CartPole-v1", 1, autoreset_mode="NextStop")
-    env = ParallelVectorEnv(HERE + "Counter", 2, env_kwargs={"fails_at": 2}, num_processes=2)
+        launch("CartPole-v1", 1, autoreset_mode="NextStop")
+    env = launch(HERE + "Counter", 2, env_kwargs={"fails_at": 2}, num_processes=2)
     with contextlib.closing(env):
         env.reset()
         with pytest.raises(ActionError, match=r"shape \(3,\) but need \(2,\)"):

@@ -6,12 +6,13 @@ import math
 import mmap
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
 
 import numpy as np
 
 from physx_core import Field
-from physx_core.typing import Array
+from physx_core.typing import Array, Batch
 
 INFO_BYTES = 512
 """Room for the info of an environment."""
@@ -24,21 +25,13 @@ NEVER = 1 << 62
 SPIN_TIME = 1e-3
 """How long a process looks for what it waits for before it sleeps, in s."""
 
-_Layout: TypeAlias = tuple[tuple[int, ...], Any]
 
-_COUNTERS = ("asked", "done", "idle", "sent")
-_LINE = 64  # bytes of a processor's cache line: counters of several writers lie on different ones
-
-
-class SharedBatch:
-    """Arrays of all environments, and a queue for each worker, in memory that processes share.
-
-    The rows of an environment belong to its worker from when it is asked for a step until that is
-    done, and otherwise to the process with the vector environment. A queue is a ring: the entry of
-    number n, counted from 0 since the start, stands at ``n % capacity``. It is the place of an
-    environment among the worker's own, which is to be stepped, or `COMMAND`.
+@dataclass
+class EnvArrays:
+    """Arrays of environments: what they are told, and what they answer.
 
     Attributes:
+        first: Number of the first environment.
         actions: For each field of an action, an array of shape (environments, *shape).
         observations: The same for each field of an observation.
         finals: The same for the last observations of episodes that are over, if they are kept.
@@ -47,6 +40,34 @@ class SharedBatch:
         truncated: Shape (environments,).
         kinds: The form of each info: see `InfoKind`; shape (environments,).
         infos: The bytes of each info, shape (environments, INFO_BYTES).
+    """
+
+    first: int
+    actions: Batch
+    observations: Batch
+    finals: Batch
+    rewards: Array
+    terminated: Array
+    truncated: Array
+    kinds: Array
+    infos: Array
+
+
+_Layout: TypeAlias = tuple[tuple[int, ...], Any]
+
+_COUNTERS = ("asked", "done", "idle", "sent")
+_LINE = 64  # bytes of a processor's cache line: counters of several writers lie on different ones
+
+
+class SharedBatch(EnvArrays):
+    """Arrays of all environments, and a queue for each worker, in memory that processes share.
+
+    The rows of an environment belong to its worker from when it is asked for a step until that is
+    done, and otherwise to the process with the vector environment. A queue is a ring: the entry of
+    number n, counted from 0 since the start, stands at ``n % capacity``. It is the place of an
+    environment among the worker's own, which is to be stepped, or `COMMAND`.
+
+    Attributes:
         capacity: Number of entries that fit into a queue.
         queues: Shape (workers, capacity).
         asked: For each worker, how many entries its queue has had, or `END`.
@@ -93,14 +114,14 @@ class SharedBatch:
                 **(_table(count, observations, "final ") if has_finals else {}),
             },
         )
-        self.rewards, self.terminated = arrays["rewards"], arrays["terminated"]
-        self.truncated, self.kinds = arrays["truncated"], arrays["kinds"]
-        self.infos, self.queues = arrays["infos"], arrays["queues"]
-        self.actions = {each.name: arrays[each.name] for each in actions}
-        self.observations = {each.name: arrays[each.name] for each in observations}
-        self.finals = {
-            each.name: arrays[f"final {each.name}"] for each in observations if has_finals
-        }
+        self.queues = arrays["queues"]
+        super().__init__(
+            0,
+            {each.name: arrays[each.name] for each in actions},
+            {each.name: arrays[each.name] for each in observations},
+            {each.name: arrays[f"final {each.name}"] for each in observations if has_finals},
+            *(arrays[name] for name in ("rewards", "terminated", "truncated", "kinds", "infos")),
+        )
         # A memoryview reads and writes a number in half the time that an array takes.
         self.asked, self.done, self.idle, self.sent = (
             memoryview(cast(Any, arrays[name][:, 0])) for name in _COUNTERS

@@ -1,73 +1,79 @@
-"""Layout of the rows that a client of a parallel vector environment sends after each step."""
+"""Rows: what a client sends after a step, and the environments' arrays that lie in it."""
 
 from __future__ import annotations
 
-import enum
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from physx_core import Field
-from physx_core.net import decode
-from physx_core.typing import Array
-from physx_gym.spaces import SpaceFields
+from physx_core.typing import Array, Batch
+from physx_gym.vector.batch import INFO_BYTES, EnvArrays
 
 ROW = "row"
-"""Name of the field that holds the records."""
-LENGTH = 8
-"""Bytes of the length in front of a packed value."""
-_INFO_BYTES = 512
-
-
-class InfoKind(enum.IntEnum):
-    """The form in which a record holds an info."""
-
-    NONE = 0
-    """There is no info."""
-    NUMBERS = 1
-    """A record of the layout that the client announced last."""
-    PACKED = 2
-    """A packed value; if that is empty, the client sent the info before the row."""
+"""Name of the field that holds the bytes of a row, whatever is in them."""
+_FINAL = "final "
 
 
 class RowLayout:
-    """Layout of a row, which has a record for each of a client's environments.
+    """Layout of a row, which has a record for each environment of a client.
 
     Attributes:
-        dtype: Type of a record: the fields of the observation; ``reward``, ``terminated``,
-            ``truncated``; if they are sent, the fields of the last observation of a finished
-            episode, prefixed with ``final_``; ``info``: an `InfoKind`; ``infos``: the info's bytes.
-        field: The row as a field of bytes.
+        dtype: Type of a record.
+        field: The row as a field of bytes. Rows of clients with fewer environments end with zeros.
     """
 
-    def __init__(self, observations: SpaceFields, share: int, *, has_finals: bool) -> None:
+    def __init__(self, observations: Sequence[Field], share: int, *, has_finals: bool) -> None:
         """Compute the layout.
 
         Args:
             observations: Fields of an observation.
-            share: Number of environments of a client.
+            share: Largest number of environments of a client.
             has_finals: Whether last observations are sent.
         """
-        entries = [(field.name, field.dtype, field.shape or ()) for field in observations.fields]
-        finals = [(f"final_{name}", *rest) for name, *rest in entries if has_finals]
-        flags = [("terminated", "bool"), ("truncated", "bool")]
-        info = [("info", "uint8"), ("infos", "uint8", (_INFO_BYTES,))]
-        each: list[Any] = [*entries, ("reward", "float64"), *flags, *finals, *info]
-        self.dtype = np.dtype(each, align=True)
+        seen = [(each.name, each.dtype, each.shape or ()) for each in observations]
+        finals = [(_FINAL + name, *rest) for name, *rest in seen if has_finals]
+        self._observations = [name for name, *_ in seen]
+        self._has_finals = has_finals
+        records: list[Any] = [
+            *seen,
+            *finals,
+            ("rewards", "float64"),
+            ("terminated", "bool"),
+            ("truncated", "bool"),
+            ("kinds", "int16"),
+            ("infos", "uint8", (INFO_BYTES,)),
+        ]
+        self.dtype = np.dtype(records, align=True)
         self.field = Field(ROW, (share * self.dtype.itemsize,), "uint8")
 
-    def records(self, rows: Array) -> Array:
-        """Return the records of rows, shape (rows, bytes), as one array, shape (records,)."""
-        return rows.reshape(-1).view(self.dtype)
+    def arrays(self, row: Array, actions: Batch, first: int) -> EnvArrays:
+        """Return the arrays that lie in a row.
+
+        Args:
+            row: Bytes of whole records.
+            actions: Arrays for the actions of the client's environments.
+            first: Number of the first of them.
+        """
+        records = row.view(self.dtype)
+        seen = {name: records[name] for name in self._observations}
+        finals = {n: records[_FINAL + n] for n in self._observations if self._has_finals}
+        names = ("rewards", "terminated", "truncated", "kinds", "infos")
+        return EnvArrays(first, actions, seen, finals, *(records[name] for name in names))
 
 
-def put_packed(target: Array, encoded: bytes) -> None:
-    """Write an encoded value, preceded by its length, to the start of an array of bytes."""
-    whole = len(encoded).to_bytes(LENGTH, "little") + encoded
-    target[: len(whole)] = np.frombuffer(whole, np.uint8)
+def copy_results(source: EnvArrays, target: EnvArrays) -> None:
+    """Copy the results of a client's environments to where those of all environments lie."""
+    for theirs, ours in _pairs(source, target):
+        first = source.first - target.first
+        ours[first : first + len(theirs)] = theirs
 
 
-def unpack(data: Array) -> Any:
-    """Return the value that `put_packed` wrote; None if it is empty."""
-    length = int.from_bytes(data[:LENGTH].tobytes(), "little")
-    return decode(data[LENGTH : LENGTH + length].tobytes()) if length else None
+def _pairs(source: EnvArrays, target: EnvArrays) -> Iterator[tuple[Array, Array]]:
+    for name in source.observations:
+        yield source.observations[name], target.observations[name]
+    for name in source.finals:
+        yield source.finals[name], target.finals[name]
+    for name in ("rewards", "terminated", "truncated", "kinds", "infos"):
+        yield getattr(source, name), getattr(target, name)

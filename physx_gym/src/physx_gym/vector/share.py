@@ -10,11 +10,11 @@ import gymnasium
 from gymnasium.vector import AutoresetMode
 
 from physx_core.errors import ConfigError, EnvironmentFailedError, PhysxError, UsageError
-from physx_core.net import Kind, encode, encode_error, pack
+from physx_core.net import Kind, encode, encode_error
 from physx_core.typing import Array
 from physx_gym.bridge.make_env import make_env
 from physx_gym.spaces import SpaceFields
-from physx_gym.vector.batch import SharedBatch
+from physx_gym.vector.batch import EnvArrays
 from physx_gym.vector.infos import InfoKind, InfoLayout, put_packed
 
 _MOST_LAYOUTS = 100
@@ -23,23 +23,24 @@ _NO_INFO = int(InfoKind.NONE)
 
 
 class Share:
-    """Some of a vector environment's environments; their results go into the shared batch."""
+    """Some of a vector environment's environments; their results go into its arrays."""
 
     def __init__(
-        self, setup: Mapping[str, Any], batch: SharedBatch, send: Callable[[bytes], None]
+        self, setup: Mapping[str, Any], batch: EnvArrays, send: Callable[[Kind, bytes, int], None]
     ) -> None:
         """Keep what to run; `create` makes the environments.
 
         Args:
             setup: What the worker was told.
-            batch: The shared memory.
-            send: Sends a message to the process with the vector environment.
+            batch: Arrays of these environments, and perhaps of others.
+            send: Sends a message to the process with the vector environment: kind, content, number.
         """
         shares, number = setup["shares"], setup["number"]
         self._count, self._first = shares[number], sum(shares[:number])
         self._setup, self._send = setup, send
         self._mode = AutoresetMode(setup["autoreset"])
-        mine = slice(self._first, self._first + self._count)
+        first = self._first - batch.first
+        mine = slice(first, first + self._count)
         self._infos = batch.infos[mine]
         # A memoryview writes a number in half the time that an array takes.
         self._rewards, self._terminated, self._truncated, self._kinds = (
@@ -90,7 +91,7 @@ class Share:
                 results.append(_call(self._envs[place], *arguments))
 
             if all(self._attempt(arguments[0], place, call) for place in range(self._count)):
-                self._send(pack(Kind.ANSWER, encode(results)))
+                self._send(Kind.ANSWER, encode(results), 0)
         else:
             name, values = arguments
 
@@ -118,7 +119,7 @@ class Share:
         env = self._first + place
         known = error if isinstance(error, PhysxError) else self._wrap(error, method, place)
         known.add_note(f"in {method}() of environment {env} of the vector, counted from 0")
-        self._send(pack(Kind.ERROR, encode_error(known), env))
+        self._send(Kind.ERROR, encode_error(known), env)
 
     def _wrap(self, error: Exception, method: str, place: int) -> EnvironmentFailedError:
         step = self._steps[place] - 1 if method == "step" else -1
@@ -195,7 +196,7 @@ class Share:
             return False
         if number > len(self._layouts):
             self._layouts[str(layout.names)] = number
-            self._send(pack(Kind.FIELDS, encode(layout.names), number))
+            self._send(Kind.FIELDS, encode(layout.names), number)
         self._layout, self._layout_number = layout, number
         return True
 
@@ -214,7 +215,7 @@ class Share:
         else:
             self._kinds[place] = InfoKind.SENT
             message = encode({"info": info, "left_out": left_out})
-            self._send(pack(Kind.NOTES, message, self._first + place))
+            self._send(Kind.NOTES, message, self._first + place)
 
 
 def _call(

@@ -23,6 +23,7 @@ from physx_core.typing import Array, Batch
 from physx_gym.bridge.make_env import make_env
 from physx_gym.spaces import SpaceFields
 from physx_gym.vector.batch import SharedBatch
+from physx_gym.vector.client_workers import ClientWorkers
 from physx_gym.vector.infos import InfoKind, InfoLayout, unpack
 from physx_gym.vector.workers import Workers
 
@@ -38,6 +39,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
     ``gymnasium.make_vec("physx/Ant-v0", num_envs=8, num_processes=2)`` creates one. `step` does
     what that of Gymnasium's `AsyncVectorEnv` does. `send` and `recv` do not wait for all of them:
     while the results of `batch_size` environments are looked at, the others go on.
+
+    With ``launcher="cluster/ray"`` the processes run wherever that launcher starts them.
 
     Observations, rewards and ends are written to shared memory by the processes. These end with the
     vector environment, or with this process, however that ends. If an environment raises, the error
@@ -61,6 +64,10 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         copy: bool = True,
         timeout: float = 60.0,
+        launcher: str | type[Any] | None = None,
+        launcher_kwargs: Mapping[str, Any] | None = None,
+        ip_address: str = "127.0.0.1",
+        restarts: int = 0,
     ) -> None:
         """Start the processes.
 
@@ -70,13 +77,21 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             num_envs: Number of environments.
             env_kwargs: Keyword arguments of each environment.
             num_processes: Number of processes that share the environments; None: one for each
-                processor core. There are never more than environments.
+                processor core, or, with a launcher, for each environment. There are never more than
+                environments.
             batch_size: Number of environments whose results `recv` returns; None: all.
             autoreset_mode: What happens after the end of an episode.
             copy: Whether the results of `reset` and `step` are copies; otherwise observations are
                 views of the shared memory, valid until the next call.
             timeout: Longest duration of a step of an environment, in s. To make and to close its
                 environments, a process has this long too, and at least a minute.
+            launcher: Launcher that starts the processes, as ``"cluster/ray"``; None: they are
+                started here, and share memory with this process. Through a launcher they are
+                clients, on any machine, and `recv` waits for all environments that owe a result.
+            launcher_kwargs: Keyword arguments of the launcher.
+            ip_address: Address at which clients reach this process, if the launcher knows none.
+            restarts: How often a launcher's process that ends is started again. It repeats all
+                actions, so its environments must be deterministic; the actions are kept for it.
 
         Raises:
             ConfigError: If a value is out of range, or values of a space do not have a fixed shape.
@@ -84,7 +99,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
             UsageError: If a worker runs a script without ``if __name__ == "__main__":``.
             PhysxError: If an environment or a process fails.
         """
-        workers = min(count_cores() if num_processes is None else num_processes, num_envs)
+        processes = count_cores() if launcher is None else num_envs
+        workers = min(processes if num_processes is None else num_processes, num_envs)
         batch_size = num_envs if batch_size is None else batch_size
         _check(num_envs, workers, batch_size, env_kwargs, autoreset_mode)
         name, options = reference_of(env), dict(env_kwargs or {})
@@ -113,7 +129,18 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         has_finals = self.autoreset_mode is AutoresetMode.SAME_STEP
         with anonymous_file("physx_vector") as file:
             self._batch = SharedBatch(file.fileno(), shares, *fields, has_finals=has_finals)
-            self._workers = Workers(self._batch, file.fileno(), setup, timeout)
+            self._workers: Workers | ClientWorkers
+            if launcher is None:
+                self._workers = Workers(self._batch, file.fileno(), setup, timeout)
+            else:
+                config = {
+                    "launcher": launcher,
+                    "launcher_kwargs": dict(launcher_kwargs or {}),
+                    "ip_address": ip_address,
+                    "restarts": restarts,
+                    "timeout": timeout,
+                }
+                self._workers = ClientWorkers(self._batch, setup, config)
         weakref.finalize(self, self._workers.close, orderly=False).atexit = False
 
     def _describe(self, name: str, options: Mapping[str, Any]) -> None:
@@ -414,7 +441,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
         if workers is not None:
             workers.close(orderly=True)
 
-    def _open(self) -> Workers:
+    def _open(self) -> Workers | ClientWorkers:
         if not self._workers.is_open:
             raise UsageError("This vector environment is closed, or ended with an error.")
         return self._workers

@@ -113,8 +113,8 @@ class Worker:
         if sum(batch.done) >= batch.awaited[0]:
             self._link.sendall(_BELL)
 
-    def _send(self, message: bytes) -> None:
-        self._link.sendall(message)
+    def _send(self, kind: Kind, content: bytes, number: int) -> None:
+        self._link.sendall(pack(kind, content, number))
         self._batch.sent[self._number] += 1
 
     def _command(self) -> Mapping[str, Any]:
