@@ -24,42 +24,6 @@ TOKEN = "a token for these tests"
 CLIENT = [sys.executable, "-m", "physx_core", "client"]
 
 
-@pytest.fixture
-def token(monkeypatch):
-    monkeypatch.setenv("PHYSX_TOKEN", TOKEN)
-
-
-@pytest.fixture
-def by_hand(clients, token, port):
-    """Return a source that waits at the port for clients that know the token."""
-
-    def make(environment="Plain", **options):
-        options = {"launcher": "physx/manual", "port": port, "timeout": 20.0, **options}
-        return clients(environment, **options)
-
-    return make
-
-
-@pytest.fixture
-def join(port, token, nothing_stays_behind):
-    """Return a function that starts ``physx client`` for the port."""
-    with contextlib.ExitStack() as stack:
-
-        def start(*words, prefix=(), address=f"127.0.0.1:{port}", **options):
-            process = subprocess.Popen(
-                [*prefix, *CLIENT, "--connect", address, *words],
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-                **options,
-            )
-            stack.callback(process.communicate)
-            stack.callback(process.kill)
-            return process
-
-        yield start
-
-
 def warnings(caplog):
     return [record.getMessage() for record in caplog.records if record.name == "physx"]
 

@@ -122,7 +122,7 @@ class ClientGroup:
         numbers = list(self._numbers)
         if self._pool is not None:
             address, public = self._address(), self._public_address()
-            self._pool.begin(address, public, self.server.token, self.server.pump)
+            self._pool.begin(address, public, self.server)
         self._launch(numbers)
         if self._is_by_hand:
             count = len(numbers) if self._pool is None else self._pool.least

@@ -8,6 +8,7 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from physx_core.components.launcher import ClientHandle, Launcher
 from physx_core.config import EnvironmentConfig
@@ -30,6 +31,18 @@ _LOG = logging.getLogger("physx")
 
 Progress = Callable[[int], tuple[int, int | None]]
 """Returns how many rows of an instance there are, and how many are missing; None: unknown."""
+
+
+class Serving(Protocol):
+    """What the pool needs of the server."""
+
+    token: str
+
+    def pump(self, timeout: float) -> None:
+        """Handle what has arrived."""
+
+    def listen_to(self, peer: Peer, seconds: float) -> None:
+        """Handle what one client has sent."""
 
 
 class PooledClient:
@@ -70,11 +83,13 @@ class PooledWorker(ClientHandle):
         started: When the client was told to start it, in monotonic s.
     """
 
-    def __init__(self, instance_id: int, ticket: int, pump: Callable[[float], None]) -> None:
+    def __init__(
+        self, instance_id: int, ticket: int, listen: Callable[[Peer, float], None]
+    ) -> None:
         self.instance_id, self.ticket = instance_id, ticket
         self.client: PooledClient | None = None
         self.started = math.inf
-        self._pump = pump
+        self._listen = listen
         self._status: int | None = None
         self._stderr = ""
 
@@ -108,12 +123,12 @@ class PooledWorker(ClientHandle):
             self.end(-signal.SIGKILL, "")
 
     def wait(self, until: float) -> bool:
-        """Serve the run until it ends: see `ClientHandle.wait`."""
+        """Listen to its client until that tells its end: see `ClientHandle.wait`."""
         while self.client is not None and not self.is_orphan and self._status is None:
             left = until - time.monotonic()
             if left <= 0:
                 return False
-            self._pump(min(left, _TICK))
+            self._listen(self.client.peer, left)
         return True
 
     def _stop(self, how: bytes) -> None:
@@ -150,8 +165,8 @@ class ClientPool(Launcher):
             )
         self._config, self._launcher, self.elsewhere = config, launcher, launcher.elsewhere
         self._is_open = is_open or launcher.by_hand
-        self._address, self._token, self._public = "", "", ""
-        self._pump: Callable[[float], None] = lambda seconds: None
+        self._address, self._public = "", ""
+        self._server: Serving | None = None
         self._clients: dict[int, PooledClient] = {}
         self._handles: dict[int, ClientHandle] = {}
         self._workers: dict[int, PooledWorker] = {}
@@ -159,6 +174,7 @@ class ClientPool(Launcher):
         self._starts: Counter[int] = Counter()
         self._restarts: Counter[int] = Counter()
         self._last_host: dict[int, PooledClient] = {}
+        self._orphans: list[int] = []
         self._short_since: float | None = None
         self._said = 0.0
         self._has_begun = False
@@ -174,16 +190,15 @@ class ClientPool(Launcher):
         """End everything that the launcher started: see `Launcher.close`."""
         self._launcher.close()
 
-    def begin(self, address: str, public: str, token: str, pump: Callable[[float], None]) -> None:
+    def begin(self, address: str, public: str, server: Serving) -> None:
         """Start the clients.
 
         Args:
             address: ``HOST:PORT`` of the server.
             public: The same as other machines reach it.
-            token: Secret of the run.
-            pump: Serves the run for a time in s.
+            server: The server, open.
         """
-        self._address, self._public, self._token, self._pump = address, public, token, pump
+        self._address, self._public, self._server = address, public, server
         self._start_clients(range(1, self.most + 1))
 
     @property
@@ -201,6 +216,7 @@ class ClientPool(Launcher):
         Raises:
             ConnectionRefusedByPeerError: If there is no place for it; it is told so.
         """
+        self._bury_lost()
         free = [n for n in range(1, self.most + 1) if n not in self._clients]
         if not free or (wanted and wanted not in free):
             name = f"client {wanted}" if wanted else "another client"
@@ -272,9 +288,10 @@ class ClientPool(Launcher):
                     client.peer.send(pack(Kind.PING))
             elif now - max(client.unanswered, served_since) > self._config.timeout:
                 self._give_up(client)
-        moved = [number for client in [*self._clients.values()] for number in self._bury(client)]
+        self._bury_lost()
         self._replace_absent()
         self._check_count(now, served_since)
+        moved, self._orphans = self._orphans, []
         return moved
 
     def suspects(self, number: int, served_since: float) -> bool:
@@ -302,23 +319,30 @@ class ClientPool(Launcher):
         Args:
             patience: How long the workers may take, in s.
         """
+        if self._server is None:
+            return
         clients, until = [*self._clients.values()], time.monotonic() + patience + 1.0
         try:
             for client in clients:
                 client.peer.send(pack(Kind.CLOSE, number=int(1000 * patience)))
             while any(not client.peer.closed for client in clients) and time.monotonic() < until:
                 try:
-                    self._pump(_TICK)
+                    self._server.pump(_TICK)
                 except Exception:  # of a run that has failed already
                     continue
         finally:
             handles, self._handles = self._handles, {}
             stop(handles.values(), _LEAVE_TIME)
 
+    def _listen(self, peer: Peer, seconds: float) -> None:
+        if self._server is not None:
+            self._server.listen_to(peer, seconds)
+
     def _start_clients(self, numbers: Sequence[int]) -> None:
         if self._launcher.by_hand:
             return
-        for handle in self._launcher.launch(numbers, self._address, self._token):
+        assert self._server is not None
+        for handle in self._launcher.launch(numbers, self._address, self._server.token):
             self._handles[handle.instance_id] = handle
 
     def _give_up(self, client: PooledClient) -> None:
@@ -326,11 +350,14 @@ class ClientPool(Launcher):
         client.peer.offense = f"It has not answered for {seconds:.0f} s: it is stopped, or hangs."
         client.peer.close()
 
-    def _bury(self, client: PooledClient) -> list[int]:
-        """Forget a client if it is lost and ask for another; return the instances that it ran."""
+    def _bury_lost(self) -> None:
+        """Forget the clients that are lost, and have the launcher replace them."""
+        for client in [*self._clients.values()]:
+            if client.peer.closed:
+                self._bury(client)
+
+    def _bury(self, client: PooledClient) -> None:
         peer = client.peer
-        if not peer.closed:
-            return []
         del self._clients[client.number]
         handle = self._handles.pop(client.number, None)
         numbers = sorted(worker.instance_id for worker in client.workers.values())
@@ -345,7 +372,7 @@ class ClientPool(Launcher):
                 how = describe_exit(handle.exit_status() or 0)
                 stderr = handle.stderr()
         self._mourn(_capital(str(client)), how, handle, client.number, numbers, stderr)
-        return numbers
+        self._orphans += numbers
 
     def _replace_absent(self) -> None:
         """Replace the clients whose processes ended before they joined."""
@@ -392,7 +419,7 @@ class ClientPool(Launcher):
         if self._short_since is None:
             self._short_since = now
         waited = now - max(self._short_since, served_since)
-        hopeless = not self._is_open and count + len(self._handles.keys() - self._clients) == 0
+        hopeless = not self._is_open and len(self._handles.keys() | self._clients) < self.least
         if waited > self._config.timeout or hopeless:
             what = "none can come any more" if hopeless else f"no other joined for {waited:.0f} s"
             raise TooFewClientsError(
@@ -423,7 +450,7 @@ class ClientPool(Launcher):
         handles: list[ClientHandle] = []
         for number in instances:
             self._starts[number] += 1
-            worker = PooledWorker(number, make_ticket(number, self._starts[number]), self._pump)
+            worker = PooledWorker(number, make_ticket(number, self._starts[number]), self._listen)
             former = self._workers.get(number)
             if former is not None and former.client is not None:
                 self._last_host[number] = former.client

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import select
 import selectors
 import socket
 import time
@@ -140,6 +141,13 @@ class Server:
         while self._answer_at_once(timeout, spin) and time.monotonic() < until:
             spin = self._spin_time
         self._listener.timers.call_due()
+
+    def listen_to(self, peer: Peer, seconds: float) -> None:
+        """Handle what one client has sent, and nothing else; wait up to `seconds` for it."""
+        poll = select.poll()
+        poll.register(peer.socket, select.POLLIN)
+        if poll.poll(1000 * seconds):
+            self._read(peer)
 
     def _answer_at_once(self, timeout: float, spin: float) -> bool:
         """Handle what has arrived; return whether it was requests, all answered, and nothing else.
