@@ -174,16 +174,29 @@ def _import() -> Any:
     return optuna
 
 
-def _create(module: ModuleType, kind: str, reference: str, kwargs: Mapping[str, Any]) -> Any:
+def known_samplers() -> list[str]:
+    """Return the names of Optuna's samplers; none if it is not installed."""
+    try:
+        return list(_classes(_import().samplers, "Sampler"))
+    except MissingLibraryError:
+        return []
+
+
+def _classes(module: ModuleType, kind: str) -> dict[str, str]:
+    """Return the classes of a kind by the names that users give."""
     found = {_short(name, kind): name for name in dir(module) if name.endswith(kind)}
-    known = [PREFIX + name for name in found if not name.startswith(_UNFIT)]
+    return {PREFIX + name: made for name, made in found.items() if not name.startswith(_UNFIT)}
+
+
+def _create(module: ModuleType, kind: str, reference: str, kwargs: Mapping[str, Any]) -> Any:
+    known = _classes(module, kind)
     if reference not in known:
         others = ["grid", "random", *known] if kind == "Sampler" else known
         raise ConfigError(
             f'There is no {kind.lower()} "{reference}".{nearest(reference, others)} '
             f"There are: {listed(others)}."
         )
-    make = getattr(module, found[reference.removeprefix(PREFIX)])
+    make = getattr(module, known[reference])
     names = inspect.signature(make).parameters
     unknown = kwargs.keys() - names.keys()
     if unknown:

@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from physx_cluster.sweep.definition import Definition
-from physx_cluster.sweep.optuna import PREFIX, OptunaSearch
+from physx_cluster.sweep.optuna import PREFIX, OptunaSearch, known_samplers
 from physx_cluster.sweep.parameters import Parameter, Setting, grid_of
 from physx_cluster.sweep.results import Result, Trial
 from physx_core.errors import ConfigError, listed, nearest
@@ -130,8 +130,6 @@ def _search(definition: Definition, parameters: Mapping[str, Parameter]) -> Sear
         return RandomSearch(parameters, study.seed)
     if study.sampler.startswith(PREFIX):
         return OptunaSearch(study.sampler, study.sampler_kwargs, parameters, study.seed, study.goal)
-    known = ["grid", "random", f"{PREFIX}tpe"]
-    raise ConfigError(
-        f'There is no sampler "{study.sampler}".{nearest(study.sampler, known)} There are: '
-        f"{listed(known)}, and Optuna's others."
-    )
+    known = ["grid", "random", *known_samplers()]
+    guess = nearest(study.sampler, known) or nearest(PREFIX + study.sampler, known)
+    raise ConfigError(f'There is no sampler "{study.sampler}".{guess} There are: {listed(known)}.')
