@@ -2,6 +2,7 @@
 
 from .addresses import check_address as check_address
 from .addresses import format_address as format_address
+from .addresses import is_loopback as is_loopback
 from .addresses import parse_address as parse_address
 from .addresses import retry as retry
 from .connection import Connection as Connection
@@ -16,7 +17,9 @@ from .frames import pack as pack
 from .frames import pack_header as pack_header
 from .handshake import HANDSHAKE_LIMIT as HANDSHAKE_LIMIT
 from .handshake import TOKEN_VARIABLE as TOKEN_VARIABLE
+from .handshake import PlainRefusedError as PlainRefusedError
 from .handshake import ServerHandshake as ServerHandshake
+from .handshake import encrypt as encrypt
 from .handshake import introduce as introduce
 from .listener import Listener as Listener
 from .liveness import VANISHED as VANISHED
@@ -33,6 +36,7 @@ from .spin_wait import spin_until as spin_until
 from .spin_wait import yield_core as yield_core
 from .strangers import Handshakes as Handshakes
 from .strangers import Strangers as Strangers
+from .tls import SecureSocket as SecureSocket
 from .tokens import find_token as find_token
 from .values import decode as decode
 from .values import encode as encode

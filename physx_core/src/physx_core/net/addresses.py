@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ipaddress
+import socket
 import time
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -42,6 +44,26 @@ def check_address(address: Any, port: Any) -> None:
         raise ConfigError(f'address is {address!r} but must be a string such as "127.0.0.1".')
     if type(port) is not int or not 0 <= port <= _LAST_PORT:
         raise ConfigError(f"port is {port!r} but must be an integer from 0 to {_LAST_PORT}.")
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only its own machine can reach a server at an address."""
+    try:
+        found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
+        places = [ipaddress.ip_address(entry[4][0]) for entry in found]
+    except (OSError, ValueError):  # whoever uses it reports what is wrong with it
+        return False
+    return all((getattr(one, "ipv4_mapped", None) or one).is_loopback for one in places)
+
+
+def stays_here(connection: socket.socket) -> bool:
+    """Return whether the other side is on this machine, as far as its address says."""
+    if connection.family not in (socket.AF_INET, socket.AF_INET6):
+        return True
+    try:
+        return is_loopback(connection.getpeername()[0])
+    except OSError:  # it is gone
+        return False
 
 
 def retry(

@@ -27,7 +27,7 @@ class Kind(enum.IntEnum):
     HELLO = 1
     """Client: magic, version, challenge."""
     CHALLENGE = 2
-    """Server: magic, version, challenge, proof."""
+    """Server: magic, version, challenge, proof [1: no proof before the connection is encrypted]."""
     PROOF = 3
     """Client: proof [number of the instance to run or ticket for it, 0: any]."""
     SETUP = 4

@@ -1,8 +1,8 @@
 """Handshake: both sides prove that they know the token before any other message is read.
 
 Each side sends 32 random bytes; the other answers with their HMAC-SHA256 under the token. The
-token itself never travels. What follows is neither encrypted nor signed: across a network that
-others can write to, use a tunnel.
+token itself never travels. Where the connection is encrypted the proofs also cover the fingerprint
+of the server's certificate: see `tls`.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ import struct
 import time
 
 from physx_core.errors import ConnectionRefusedByPeerError, SilentPeerError, UnansweredError
+from physx_core.net.addresses import stays_here
 from physx_core.net.frames import MAX_PAYLOAD, Frame, FrameReader, Kind, pack
 
 TOKEN_VARIABLE = "PHYSX_TOKEN"
 """Environment variable that holds the token of a run."""
 
-VERSION = 1
+VERSION = 2
 """Version of the protocol between client and server."""
 
 HANDSHAKE_LIMIT = 256
@@ -28,10 +29,20 @@ HANDSHAKE_LIMIT = 256
 _OPENING = struct.Struct("<8sI32s")
 _MAGIC = b"physxtcp"
 _PROOF_SIZE = 32
+_NOT_PLAIN = 1
 
 
-def _proof(token: str, side: bytes, first: bytes, second: bytes, instance: int = 0) -> bytes:
-    message = b"|".join([side, struct.pack("<IQ", VERSION, instance), first, second])
+class PlainRefusedError(ConnectionRefusedByPeerError):
+    """A server wants the connection to be encrypted, although its address is on this machine.
+
+    It is that of something that forwards the connection to another machine.
+    """
+
+
+def _proof(
+    token: str, side: bytes, first: bytes, second: bytes, channel: bytes, instance: int = 0
+) -> bytes:
+    message = b"|".join([side, struct.pack("<IQ", VERSION, instance), first, second, channel])
     return hmac.new(token.encode(), message, "sha256").digest()
 
 
@@ -55,36 +66,78 @@ class ServerHandshake:
         self._token = token
         self._own = secrets.token_bytes(32)
         self._other: bytes | None = None
+        self._is_greeted = False
 
-    def answer(self, frame: Frame) -> bytes:
+    def answer(self, frame: Frame, channel: bytes | None = b"") -> bytes:
         """Return what to send back; `instance_id` is set once the client is trusted.
+
+        Args:
+            frame: What the client sent.
+            channel: See `SecureSocket.channel`.
 
         Raises:
             ConnectionRefusedByPeerError: If the client sent nonsense or does not know the token.
         """
-        if frame.kind is Kind.HELLO and self._other is None:
-            magic, version, self._other = _parse_opening(frame.payload)
-            self.since = time.monotonic()
+        if frame.kind is Kind.HELLO and not self._is_greeted:
+            magic, version, other = _parse_opening(frame.payload)
+            self.since, self._is_greeted = time.monotonic(), True
             if magic != _MAGIC:
                 raise ConnectionRefusedByPeerError("What connected is not a physx client.")
             opening = _OPENING.pack(_MAGIC, VERSION, self._own)
             if version != VERSION:  # the client knows both versions now and says what is wrong
                 return pack(Kind.CHALLENGE, opening + bytes(_PROOF_SIZE))
-            proof = _proof(self._token, b"server", self._other, self._own)
+            if channel is None:
+                return pack(Kind.CHALLENGE, opening + bytes(_PROOF_SIZE), _NOT_PLAIN)
+            self._other = other
+            proof = _proof(self._token, b"server", other, self._own, channel)
             return pack(Kind.CHALLENGE, opening + proof)
-        if frame.kind is Kind.PROOF and self._other is not None:
-            wanted = _proof(self._token, b"client", self._own, self._other, frame.number)
+        if frame.kind is Kind.PROOF and self._other is not None and channel is not None:
+            wanted = _proof(self._token, b"client", self._own, self._other, channel, frame.number)
             if hmac.compare_digest(wanted, bytes(frame.payload)):
                 self.instance_id = frame.number
                 return b""
         raise ConnectionRefusedByPeerError("A client connected that does not know the token.")
 
 
+def encrypt(connection: socket.socket, *, always: bool = False) -> socket.socket:
+    """Return a client's connection as it may be used: encrypted if it leaves this machine.
+
+    Args:
+        connection: Connected, blocking socket, which is taken over if it does; its timeout is that
+            of all that is exchanged here.
+        always: Encrypt in any case, because the server wants it.
+
+    Raises:
+        SilentPeerError: If the server does not answer in time.
+        UnansweredError: If the server ended the connection.
+        ConnectionRefusedByPeerError: If the server does not encrypt.
+    """
+    if not always and stays_here(connection):
+        return connection
+    from physx_core.net.tls import SecureSocket  # takes a while to import
+
+    older = (
+        "If it belongs to physx, it is of a version that does not encrypt: install the same "
+        "version of physx-core on both sides."
+    )
+    try:
+        return SecureSocket.of_client(connection)
+    except TimeoutError as error:
+        raise SilentPeerError("The server did not answer in time.") from error
+    except ConnectionAbortedError as error:
+        raise ConnectionRefusedByPeerError(
+            f"What answers at that address does not encrypt as physx does ({error}). {older}"
+        ) from error
+    except OSError as error:
+        raise UnansweredError(f"The server ended the connection ({error}). {older}") from error
+
+
 def introduce(connection: socket.socket, token: str, instance: int) -> FrameReader:
     """Prove to a server that this client knows the token, and have it prove the same.
 
     Args:
-        connection: Blocking socket whose timeout is that of the whole handshake.
+        connection: Blocking socket whose timeout is that of the whole handshake; `encrypt` returns
+            it.
         token: The run's token.
         instance: Number of the instance to run, 0 for any that is free.
 
@@ -94,9 +147,11 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
     Raises:
         SilentPeerError: If the server does not answer in time.
         UnansweredError: If the server ended the connection.
+        PlainRefusedError: If the server wants the connection to be encrypted.
         ConnectionRefusedByPeerError: If the server has another version or another token, or is
             not a physx server.
     """
+    channel: bytes = getattr(connection, "channel", b"")
     reader = FrameReader(HANDSHAKE_LIMIT)
     own = secrets.token_bytes(32)
     try:
@@ -114,15 +169,18 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
             f"The server speaks version {version} of the protocol, this client version {VERSION}. "
             "Install the same version of physx-core on both sides."
         )
+    if frame.number == _NOT_PLAIN and not channel:
+        raise PlainRefusedError("The server takes no connection from here that is not encrypted.")
     if not hmac.compare_digest(
-        _proof(token, b"server", own, other), bytes(frame.payload[-_PROOF_SIZE:])
+        _proof(token, b"server", own, other, channel), bytes(frame.payload[-_PROOF_SIZE:])
     ):
         raise ConnectionRefusedByPeerError(
-            "The server does not know this client's token. Set the environment variable "
-            f"{TOKEN_VARIABLE} to the token of the run to join, or name the "
-            "file that holds it with --token-file."
+            "The server does not know this client's token"
+            + (", or somebody between the two answers in its place" if channel else "")
+            + f". Set the environment variable {TOKEN_VARIABLE} to the token of the run to join, "
+            "or name the file that holds it with --token-file."
         )
-    proof = _proof(token, b"client", other, own, instance)
+    proof = _proof(token, b"client", other, own, channel, instance)
     try:
         connection.sendall(pack(Kind.PROOF, proof, instance))
     except OSError as error:

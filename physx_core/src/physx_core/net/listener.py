@@ -10,10 +10,12 @@ from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 from weakref import WeakSet
 
+from physx_core.net.addresses import is_loopback
 from physx_core.net.connection import Connection
 from physx_core.net.liveness import LOOK_EVERY, has_vanished
 from physx_core.net.spin_wait import spin_until
 from physx_core.net.timers import Timers
+from physx_core.net.tls import Identity, SecureSocket
 
 _ACCEPTED_AT_ONCE = 16
 _BACKLOG = 128
@@ -35,18 +37,23 @@ class Listener(Generic[AnyConnection]):
         self,
         accepted: Callable[[socket.socket, str], Any],
         vanished: Callable[[AnyConnection], Any],
+        *,
+        encrypts: bool = False,
     ) -> None:
         """Start without listening.
 
         Args:
             accepted: Called with each new connection, and its other side as ``host:port``.
             vanished: Called with a connection whose other side's machine no longer answers.
+            encrypts: Whether clients may encrypt, so that `accepted` gets `SecureSocket`.
         """
         self.address = ("", 0)
         self.timers = Timers()
         self._accepted, self._vanished = accepted, vanished
         self._connections: WeakSet[AnyConnection] = WeakSet()
         self._is_watching = self._has_guests = False
+        self._identity = Identity() if encrypts else None
+        self._hidden: set[SecureSocket] = set()
         self._socket: socket.socket | None = None
         self._selector = selectors.DefaultSelector()
         self._waker, self._wakes = socket.socketpair()
@@ -75,6 +82,8 @@ class Listener(Generic[AnyConnection]):
             self._socket = socket.create_server(place, family=family, backlog=_BACKLOG)
         except (OverflowError, UnicodeError, TypeError) as error:
             raise OSError(str(error)) from error
+        if self._identity is not None and not is_loopback(address):
+            self._identity.prepare()
         self._socket.setblocking(False)
         self.address = self._socket.getsockname()[:2]
         self._selector.register(self._socket, selectors.EVENT_READ)
@@ -95,16 +104,26 @@ class Listener(Generic[AnyConnection]):
             spin: How long to look for it without sleeping before that, in s.
         """
         select = self._selector.select
+        hidden = self._find_hidden() if self._hidden else {}
+        if hidden:
+            timeout, spin = 0.0, 0.0
         found = (spin and spin_until(lambda: select(0), spin)) or select(timeout)
         ready = []
         for key, events in found:
             if key.data is not None:
-                ready.append((key.data, events))
+                ready.append((key.data, events | hidden.pop(key.data, 0)))
             elif key.fileobj is self._waker:
                 self._waker.recv(1024)
             else:
                 self._has_guests = True
+        ready += hidden.items()
         return ready
+
+    def _find_hidden(self) -> dict[AnyConnection, int]:
+        """Return connections that may have something to receive that the selector does not see."""
+        watched = self._selector.get_map()
+        keys = [watched[one] for one in self._hidden if one in watched]
+        return {key.data: selectors.EVENT_READ for key in keys if key.events & selectors.EVENT_READ}
 
     def accept(self) -> bool:
         """Accept some of the connections that `select` found; return whether there were any.
@@ -128,6 +147,8 @@ class Listener(Generic[AnyConnection]):
                 self._selector.unregister(self._socket)
                 self.timers.add(_PAUSE, self._accept_again)
                 break
+            if self._identity is not None:
+                connected = SecureSocket.of_server(connected, self._identity, self._hidden)
             with contextlib.suppress(OSError):  # gone already
                 self._accepted(connected, "{}:{}".format(*place[:2]))
         return True

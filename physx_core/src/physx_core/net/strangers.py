@@ -11,6 +11,7 @@ from physx_core.net.frames import Frame
 from physx_core.net.handshake import ServerHandshake
 from physx_core.net.listener import AnyConnection
 from physx_core.net.timers import Timers
+from physx_core.net.tls import SecureSocket
 
 
 class Strangers(Generic[AnyConnection]):
@@ -105,9 +106,12 @@ class Handshakes(Strangers[AnyConnection]):
             ConnectionRefusedByPeerError: If it sent nonsense or does not know the token.
         """
         handshake = self._handshakes[connection]
-        answer = handshake.answer(frame)
+        secure = connection.socket if isinstance(connection.socket, SecureSocket) else None
+        answer = handshake.answer(frame, b"" if secure is None else secure.channel)
         if handshake.instance_id is not None:
             self.forget(connection)
+            if secure is not None:
+                connection.socket = secure.settle()
         return answer, handshake.instance_id
 
     def forget(self, connection: AnyConnection) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import secrets
-import socket
 from pathlib import Path
 
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import ConfigError
+from physx_core.net.addresses import is_loopback
 from physx_core.net.handshake import TOKEN_VARIABLE
 
 _SHORTEST = 16
@@ -89,12 +88,3 @@ def _read(token_file: str) -> str:
             f"chmod 600 {token_file}, and choose another token."
         )
     return text.strip()
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether only its own machine can reach a server at this address."""
-    try:
-        found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
-        return all(ipaddress.ip_address(entry[4][0]).is_loopback for entry in found)
-    except (OSError, ValueError):  # the server reports what is wrong with it later
-        return False

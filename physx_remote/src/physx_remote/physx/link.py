@@ -22,8 +22,10 @@ from physx_core.net import (
     Frame,
     FrameReader,
     Kind,
+    PlainRefusedError,
     decode,
     decode_error,
+    encrypt,
     find_token,
     introduce,
 )
@@ -78,10 +80,11 @@ class PhysxLink(ClientConnection):
                 f"A client of {self.name} needs the token of the service: set {TOKEN_VARIABLE}, or "
                 "give token_file=, the file that holds it, or token=."
             )
-        until = time.monotonic() + connect_timeout
-        self._socket = self._reach(lambda left: _open_socket(address, role, left), connect_timeout)
         try:
-            self._reader = self._handshake(found, role, max(until - time.monotonic(), 1.0))
+            self._reader = self._meet(address, found, role, connect_timeout)
+        except PlainRefusedError:
+            self._reader = self._meet(address, found, role, connect_timeout, encrypted=True)
+        try:
             self._reader.limit = max_answer
             self._begin()
             self.introduction = self._receive_introduction(connect_timeout)
@@ -89,11 +92,35 @@ class PhysxLink(ClientConnection):
             self._socket.close()
             raise
 
-    def _handshake(self, token: str, role: int, patience: float) -> FrameReader:
-        """Authenticate both sides by the token."""
+    def _meet(
+        self,
+        address: tuple[str, int],
+        token: str,
+        role: int,
+        patience: float,
+        *,
+        encrypted: bool = False,
+    ) -> FrameReader:
+        """Connect, and authenticate both sides by the token."""
+        until = time.monotonic() + patience
+        self._socket = self._reach(lambda left: _open_socket(address, role, left), patience)
+        try:
+            return self._authenticate(
+                token, role, max(until - time.monotonic(), 1.0), encrypted=encrypted
+            )
+        except BaseException:
+            self._socket.close()
+            raise
+
+    def _authenticate(
+        self, token: str, role: int, patience: float, *, encrypted: bool
+    ) -> FrameReader:
         self._socket.settimeout(patience)
         try:
+            self._socket = encrypt(self._socket, always=encrypted)
             return introduce(self._socket, token, role)
+        except PlainRefusedError:
+            raise
         except SilentPeerError as error:
             raise RemoteTimeoutError(
                 f"{self.name} did not answer within {patience:.3g} s. It may be stopped, or speak "
@@ -109,7 +136,7 @@ class PhysxLink(ClientConnection):
             raise RemoteError(
                 f"{self.name} cannot be trusted: it does not know this client's token, or is not "
                 "a service of this version of physx. Give the token of the service: "
-                f"{TOKEN_VARIABLE}, token_file= or token=."
+                f"{TOKEN_VARIABLE}, token_file= or token=. ({error})"
             ) from error
 
     def _receive_introduction(self, patience: float) -> dict[str, Any]:

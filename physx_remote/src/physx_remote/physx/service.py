@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -52,6 +52,8 @@ class PhysxService(SocketService):
     Attributes:
         token: The token that clients must know.
     """
+
+    encrypts: ClassVar[bool] = True
 
     def __init__(
         self,

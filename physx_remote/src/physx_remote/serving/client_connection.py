@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import select
 import socket
-from collections.abc import Callable
-from typing import ClassVar
+from collections.abc import Callable, Collection
+from typing import Any, ClassVar
 
 from physx_core.errors import RemoteClosedError, RemoteError, RemoteTimeoutError
 from physx_core.net import VANISHED, is_loss, poll_peer, prepare_connection, retry
@@ -34,6 +34,7 @@ class ClientConnection:
         self.name = "{}:{}".format(*address)
         self._why_closed = ""
         self._readable, self._writable = select.poll(), select.poll()
+        self._hidden: Collection[Any] = ()
 
     def _reach(self, connect: Callable[[float], socket.socket], patience: float) -> socket.socket:
         """Return a connected socket; try again as long as nothing listens.
@@ -56,6 +57,7 @@ class ClientConnection:
         """Prepare the connected socket for `_send` and `_wait`."""
         prepare_connection(self._socket)
         self._socket.setblocking(False)
+        self._hidden = getattr(self._socket, "hidden", ())  # of a socket that encrypts
         self._readable.register(self._socket, select.POLLIN)
         self._writable.register(self._socket, select.POLLOUT)
 
@@ -88,7 +90,7 @@ class ClientConnection:
         Raises:
             OSError: If the server's machine no longer answers.
         """
-        return poll_peer(self._readable, self._socket, patience)
+        return bool(self._hidden) or poll_peer(self._readable, self._socket, patience)
 
     def _late(self, patience: float | None) -> RemoteTimeoutError:
         """Close the connection; return the error for an answer that does not come in time."""

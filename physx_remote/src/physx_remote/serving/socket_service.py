@@ -10,7 +10,7 @@ import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, ClassVar
 
 from physx_core.errors import PhysxError, RemoteClosedError, RemoteError
 from physx_core.net import VANISHED, Listener, Reader, Strangers, is_loss
@@ -39,6 +39,9 @@ class SocketService(Service):
         connections: All open connections.
         log: Log of what the clients do.
     """
+
+    encrypts: ClassVar[bool] = False
+    """Whether the protocol encrypts what leaves this machine, and authenticates."""
 
     def __init__(self, *, max_clients: int = 256) -> None:
         """Start without any connection.
@@ -253,7 +256,7 @@ class SocketService(Service):
         with self._lock:
             if not (self._is_open or self._released):
                 self._is_open = True
-                self._listener = Listener(self._meet, self._give_up)
+                self._listener = Listener(self._meet, self._give_up, encrypts=self.encrypts)
                 self._strangers = self.new_strangers()
 
     def _release(self) -> None:

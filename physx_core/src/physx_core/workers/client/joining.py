@@ -8,7 +8,7 @@ from typing import Any
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError, UnansweredError
 from physx_core.net.addresses import parse_address, retry
 from physx_core.net.frames import Kind
-from physx_core.net.handshake import introduce
+from physx_core.net.handshake import PlainRefusedError, encrypt, introduce
 from physx_core.net.liveness import prepare_connection
 from physx_core.net.remote_errors import decode_error
 from physx_core.net.values import decode
@@ -40,17 +40,21 @@ def join(
     """
 
     def attempt(seconds: float) -> tuple[WorkerLink, dict[str, Any] | None]:
-        return _try_to_join(address, token, instance)
+        try:
+            return _try_to_join(address, token, instance)
+        except PlainRefusedError:
+            return _try_to_join(address, token, instance, encrypted=True)
 
     return retry(attempt, patience, _PAUSE, UnansweredError)
 
 
 def _try_to_join(
-    address: str, token: str, instance: int
+    address: str, token: str, instance: int, *, encrypted: bool = False
 ) -> tuple[WorkerLink, dict[str, Any] | None]:
     connection = _connect(address)
     try:
         prepare_connection(connection)
+        connection = encrypt(connection, always=encrypted)
         reader = introduce(connection, token, instance)
         connection.settimeout(None)
     except BaseException:

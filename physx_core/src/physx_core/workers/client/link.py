@@ -9,7 +9,7 @@ import signal
 import socket
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 from physx_core.net.frames import Frame, FrameReader, Kind
@@ -54,6 +54,7 @@ class WorkerLink:
         self.spins = False
         self._connection = connection
         self._reader = reader
+        self._hidden: Collection[Any] = getattr(connection, "hidden", ())  # see SecureSocket
         self._postponed: deque[Frame] = deque()
         self._requests = 0
         self._poll = select.poll()
@@ -100,7 +101,7 @@ class WorkerLink:
         Args:
             seconds: How long to wait for one, in s.
         """
-        if self._postponed or self._reader.has_buffered:
+        if self._postponed or self._reader.has_buffered or self._hidden:
             return True
         return bool(self._poll.poll(1000 * seconds))
 

@@ -23,7 +23,7 @@ from physx_core.errors import (
 )
 from physx_core.net.addresses import format_address, parse_address
 from physx_core.net.handshake import TOKEN_VARIABLE
-from physx_core.net.tokens import choose_token, find_token, is_loopback
+from physx_core.net.tokens import choose_token, find_token
 from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate

@@ -93,7 +93,7 @@ class Server:
         self._setup, self._replaces, self._skip = setup, replaces, skip
         self._pool = pool
         self._ending = self._has_news = False
-        self._listener = Listener[Peer](self._meet, self._give_up)
+        self._listener = Listener[Peer](self._meet, self._give_up, encrypts=True)
         self._strangers = Handshakes[Peer](
             token, _HANDSHAKE_TIME, _MAX_STRANGERS, self._drop, self._listener.timers
         )

@@ -1,0 +1,388 @@
+"""TLS: encrypts connections between machines; those within one stay plain.
+
+A server makes a certificate for itself that nobody signs. It is trusted because the proofs of the
+token in the handshake cover its fingerprint: whoever stands between the two sides has another
+certificate, and lets proofs pass that do not fit it. So there is nothing to install or to renew,
+and one mechanism serves every Python. (Pre-shared keys would need Python 3.13 on both sides.)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import hashlib
+import socket
+import ssl
+import time
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from physx_core.net.addresses import stays_here
+from physx_core.processes import anonymous_file
+
+_HANDSHAKE = b"\x16"  # first byte of a client that begins TLS; no frame of a stranger begins so
+_PIECE = 1 << 16
+_CHUNK = 1 << 17
+_SMALL = 1 << 14
+_AT_ONCE = getattr(socket, "MSG_DONTWAIT", 0)
+_VALID = datetime.timedelta(days=3650)  # nobody looks at it
+
+
+class Identity:
+    """A server's certificate, made when it is first needed; the key exists in memory only.
+
+    Attributes:
+        fingerprint: SHA-256 of the certificate; empty before it is made.
+    """
+
+    def __init__(self) -> None:
+        """Make nothing yet."""
+        self.fingerprint = b""
+        self._context: ssl.SSLContext | None = None
+
+    def prepare(self) -> ssl.SSLContext:
+        """Return what the server's ends of connections are made with."""
+        if self._context is None:
+            certificate, key, self.fingerprint = _make_certificate()
+            context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+            context.minimum_version = ssl.TLSVersion.TLSv1_3
+            context.num_tickets = 0  # nobody comes back to a session
+            with anonymous_file("certificate") as file:
+                file.write(key + certificate)
+                file.seek(0)
+                context.load_cert_chain(f"/dev/fd/{file.fileno()}")
+            self._context = context
+        return self._context
+
+
+def _make_certificate() -> tuple[bytes, bytes, bytes]:
+    """Return a new certificate and its key as PEM, and the certificate's SHA-256."""
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "physx")])
+    now = datetime.datetime.now(datetime.UTC)
+    certificate = (
+        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
+        .not_valid_before(now - _VALID)
+        .not_valid_after(now + _VALID)
+        .sign(key, hashes.SHA256())
+    )
+    private = key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+    public = certificate.public_bytes(serialization.Encoding.PEM)
+    return public, private, certificate.fingerprint(hashes.SHA256())
+
+
+class SecureSocket(socket.socket):
+    """A socket that encrypts, used like the one that it replaces, blocking or not.
+
+    As with any non-blocking socket, what `send` did not take has to be sent again, beginning with
+    the same bytes: some of them may be encrypted already.
+
+    Attributes:
+        channel: What proofs of the token are bound to: the fingerprint of the server's certificate;
+            nothing if the connection is plain and stays on this machine; None if it is plain and
+            comes from elsewhere, or before anything has arrived.
+        hidden: The sockets, this one or others, that may hold something to receive that the system
+            does not know of, as it was taken from there to be decrypted.
+    """
+
+    def __init__(self, connected: socket.socket, hidden: set[SecureSocket] | None = None) -> None:
+        """Take over a connected socket; see `of_server` and `of_client`.
+
+        Args:
+            connected: The socket.
+            hidden: The set that `hidden` is.
+        """
+        timeout = connected.gettimeout()
+        super().__init__(
+            connected.family, connected.type, connected.proto, fileno=connected.detach()
+        )
+        self.settimeout(timeout)
+        self.channel: bytes | None = None
+        self.hidden = set[SecureSocket]() if hidden is None else hidden
+        self._identity: Identity | None = None
+        self._is_plain = self._is_broken = False
+        self._tls: ssl.SSLObject | None = None
+        self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+        self._unsent = memoryview(b"")  # encrypted
+        self._owed = 0  # bytes that are encrypted and not reported as sent
+
+    @classmethod
+    def of_server(
+        cls, connected: socket.socket, identity: Identity, hidden: set[SecureSocket]
+    ) -> SecureSocket:
+        """Return a server's end of a new connection; its first byte decides whether it encrypts.
+
+        Args:
+            connected: The connected socket, which is taken over.
+            identity: The server's certificate.
+            hidden: See the attribute.
+        """
+        made = cls(connected, hidden)
+        made._identity = identity
+        return made
+
+    @classmethod
+    def of_client(cls, connected: socket.socket) -> SecureSocket:
+        """Return a client's end of a connection, encrypted.
+
+        Args:
+            connected: The connected, blocking socket, which is taken over. Its timeout is that of
+                all that is exchanged here.
+
+        Raises:
+            ConnectionAbortedError: If the server does not encrypt.
+            OSError: If the connection is broken, or the time is over.
+        """
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.minimum_version = ssl.TLSVersion.TLSv1_3
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE  # the proofs of the token verify it
+        made = cls(connected)
+        try:
+            made._tls = context.wrap_bio(made._incoming, made._outgoing)
+            made._shake_hands(made._tls)
+            certificate = made._tls.getpeercert(binary_form=True) or b""
+        except BaseException:
+            made.close()
+            raise
+        made.channel = hashlib.sha256(certificate).digest()
+        return made
+
+    def settle(self) -> socket.socket:
+        """Return what to use from now on, as the other side is trusted: a plain socket if it may.
+
+        This one is then empty.
+        """
+        if not self._is_plain:
+            return self
+        timeout = self.gettimeout()
+        plain = socket.socket(self.family, self.type, self.proto, fileno=self.detach())
+        plain.settimeout(timeout)
+        return plain
+
+    # As a socket ------------------------------------------------------------------------------
+
+    def recv_into(self, buffer: Any, nbytes: int = 0, flags: int = 0) -> int:
+        """Receive as much as there is now, and fits; return how many bytes it is, 0 at the end.
+
+        Raises:
+            OSError: If nothing has arrived, or the connection is broken or was cut.
+        """
+        tls = self._tls or self._choose()
+        if tls is None:
+            return super().recv_into(buffer, nbytes, flags)
+        if self not in self.hidden:
+            self._fetch()
+        view = memoryview(buffer).cast("B")
+        return self._decrypt(tls, view[: nbytes or len(view)])
+
+    def recv(self, bufsize: int, flags: int = 0) -> bytes:
+        """Receive at most so many bytes: see `recv_into`."""
+        buffer = bytearray(bufsize)
+        return bytes(buffer[: self.recv_into(buffer, bufsize, flags)])
+
+    def send(self, data: Any, flags: int = 0) -> int:
+        """Send as much as the connection takes now; return how many bytes it took.
+
+        Raises:
+            OSError: If it takes nothing now, or is broken.
+        """
+        tls = self._tls
+        if tls is None:
+            return super().send(data, flags)
+        view = memoryview(data).cast("B")
+        done = 0
+        try:
+            self._push()
+            done, self._owed = self._owed, 0
+            while done < len(view):
+                end = min(done + _CHUNK, len(view))
+                while done + self._owed < end:
+                    self._owed += tls.write(view[done + self._owed : end])
+                self._push()
+                done, self._owed = end, 0
+        except BlockingIOError:
+            if not done:
+                raise
+        except ssl.SSLError as error:
+            raise self._failed(error) from error
+        return done
+
+    def sendall(self, data: Any, flags: int = 0) -> None:
+        """Send everything."""
+        rest = memoryview(data).cast("B")
+        while rest:
+            rest = rest[self.send(rest, flags) :]
+
+    def sendmsg(self, buffers: Iterable[Any], *rest: Any) -> int:
+        """Send parts as one piece: see `send`."""
+        if self._tls is None:
+            return super().sendmsg(buffers, *rest)
+        sent = 0
+        for block in _blocks(buffers):
+            try:
+                count = self.send(block)
+            except BlockingIOError:
+                if not sent:
+                    raise
+                break
+            sent += count
+            if count < len(block):
+                break
+        return sent
+
+    def shutdown(self, how: int) -> None:
+        """End the connection; only ending the direction of sending says goodbye.
+
+        So any thread may end both.
+        """
+        if how == socket.SHUT_WR:
+            self._say_goodbye(0)
+        super().shutdown(how)
+
+    def close(self) -> None:
+        """Say goodbye, if that needs no waiting, and close the socket."""
+        self.hidden.discard(self)
+        if self.fileno() >= 0:
+            self._say_goodbye(_AT_ONCE)
+        super().close()
+
+    # Encryption -------------------------------------------------------------------------------
+
+    def _choose(self) -> ssl.SSLObject | None:
+        """Look at a client's first byte: does it encrypt?"""
+        if self._is_plain or self._identity is None:
+            return None
+        first = super().recv(1, socket.MSG_PEEK)
+        if first == _HANDSHAKE:
+            context = self._identity.prepare()
+            self._tls = context.wrap_bio(self._incoming, self._outgoing, server_side=True)
+            self.channel = self._identity.fingerprint
+            return self._tls
+        self._is_plain = True
+        self.channel = b"" if stays_here(self) else None
+        return None
+
+    def _shake_hands(self, tls: ssl.SSLObject) -> None:
+        """Do a client's handshake within the timeout."""
+        patience = self.gettimeout()
+        until = None if patience is None else time.monotonic() + patience
+        while True:
+            try:
+                tls.do_handshake()
+            except ssl.SSLWantReadError:
+                self._push()
+                if until is not None:
+                    self.settimeout(max(until - time.monotonic(), 1e-3))
+                self._fetch()
+                continue
+            except ssl.SSLError as error:
+                raise self._failed(error) from error
+            self._push()
+            self.settimeout(patience)
+            self.hidden.add(self)
+            return
+
+    def _decrypt(self, tls: ssl.SSLObject, view: memoryview) -> int:
+        """Fill a buffer as far as possible; return how many bytes it took, 0 at the end.
+
+        If it is full, or the end is near, the socket is `hidden` from now on.
+        """
+        filled, size = 0, len(view)
+        while filled < size:
+            try:
+                count: Any = tls.read(size - filled, view[filled:])
+                if not count:  # the other side said goodbye
+                    break
+                filled += count
+            except ssl.SSLWantReadError:
+                self.hidden.discard(self)
+                self._answer()
+                if filled:
+                    return filled
+                self._fetch()
+            except ssl.SSLZeroReturnError:  # the same, after a goodbye of this side
+                break
+            except ssl.SSLError as error:
+                if filled:  # it comes again
+                    break
+                raise self._failed(error) from error
+        if filled:
+            self.hidden.add(self)
+        else:
+            self.hidden.discard(self)
+        return filled
+
+    def _answer(self) -> None:
+        """Send what TLS itself has to say, be it only a part now."""
+        if self._outgoing.pending:
+            with contextlib.suppress(BlockingIOError):
+                self._push()
+
+    def _fetch(self) -> None:
+        """Take encrypted bytes from the system.
+
+        Raises:
+            OSError: If there are none, or the connection is broken.
+        """
+        if self._is_broken:
+            raise ConnectionAbortedError("its encryption failed before")
+        data = super().recv(_PIECE)
+        if data:
+            self._incoming.write(data)
+        else:
+            self._incoming.write_eof()
+
+    def _push(self) -> None:
+        """Give the system what is encrypted.
+
+        Raises:
+            BlockingIOError: If it does not take all of it now.
+        """
+        if self._outgoing.pending:
+            new = self._outgoing.read()
+            self._unsent = memoryview(bytes(self._unsent) + new if self._unsent else new)
+        while self._unsent:
+            self._unsent = self._unsent[super().send(self._unsent) :]
+
+    def _failed(self, error: ssl.SSLError) -> OSError:
+        """Return the error for a stream that is no TLS, was changed, or ends without a goodbye."""
+        self._is_broken = True
+        if isinstance(error, ssl.SSLEOFError | ssl.SSLZeroReturnError):
+            return ConnectionResetError("it was cut: the other side is gone without a word")
+        reason = (error.reason or str(error)).replace("_", " ").lower()
+        return ConnectionAbortedError(f"its encryption failed: {reason}")
+
+    def _say_goodbye(self, flags: int) -> None:
+        """Tell the other side that nothing follows, unless it lacks some of what came before."""
+        tls, is_complete = self._tls, not (self._unsent or self._owed or self._is_broken)
+        if tls is None or not is_complete:
+            return
+        with contextlib.suppress(OSError, ValueError):
+            with contextlib.suppress(ssl.SSLError):  # it would wait for the other side's goodbye
+                tls.unwrap()
+            super().send(self._outgoing.read(), flags)
+
+
+def _blocks(parts: Iterable[Any]) -> Iterator[bytes | bytearray | memoryview]:
+    """Join small parts, because each piece that is encrypted is longer by 22 bytes."""
+    joined = bytearray()
+    for part in parts:
+        view = memoryview(part).cast("B")
+        if len(view) < _SMALL:
+            joined += view
+            continue
+        if joined:
+            yield joined
+            joined = bytearray()
+        yield view
+    if joined:
+        yield joined
