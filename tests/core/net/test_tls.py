@@ -90,7 +90,9 @@ class Stream(RuleBasedStateMachine):
     def write(self, side, sizes):
         """Send several parts behind what waits, as `Connection` does."""
         self.count += 1
-        parts = [bytes([self.count % 256, number]) * (size // 2) for number, size in enumerate(sizes)]
+        parts = [
+            bytes([self.count % 256, number]) * (size // 2) for number, size in enumerate(sizes)
+        ]
         sent = 0
         if not self.waiting[side] and parts:
             with contextlib.suppress(BlockingIOError):

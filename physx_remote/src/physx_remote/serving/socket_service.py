@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterator
 from typing import Any, ClassVar
 
 from physx_core.errors import PhysxError, RemoteClosedError, RemoteError
-from physx_core.net import VANISHED, Listener, Reader, Strangers, is_loss
+from physx_core.net import VANISHED, Listener, Reader, Strangers, is_loopback, is_loss
 from physx_remote.serving.client_log import ClientLog
 from physx_remote.serving.connection import MOMENT, RequestConnection
 from physx_remote.serving.framing import PrefixReader
-from physx_remote.serving.service import Service
+from physx_remote.serving.service import LOG, Service
 
 _READ = selectors.EVENT_READ
 _SLICE = 0.02
@@ -124,6 +124,7 @@ class SocketService(Service):
             RemoteError: If the address is not one of this machine, or the port is in use.
         """
         self._open()
+        self._warn_of(address)
         try:
             self._listener.listen(address, port)
         except OSError as error:
@@ -137,12 +138,24 @@ class SocketService(Service):
         """Serve a socket that is already connected."""
         self._open()
         host, port = connected.getpeername()[:2]
+        if not self.is_listening:
+            self._warn_of(host)
         connection = RequestConnection(connected, self.new_reader(), f"{host}:{port}")
         self._strangers.add(connection)
         self.connections.append(connection)
         self._listener.add(connection)
         self.on_open(connection)
         return connection
+
+    def _warn_of(self, host: str) -> None:
+        if not (self.encrypts or is_loopback(host)):
+            LOG.warning(
+                "%s is not a loopback address, and this protocol neither encrypts nor "
+                "authenticates: anyone on the way can read and change what travels, and anyone who "
+                "reaches the port can drive the environment. Use a tunnel, or the protocol "
+                '"physx".',
+                host,
+            )
 
     def welcome(self, connection: RequestConnection) -> None:
         """Count a connection as a client from now on.
