@@ -56,7 +56,7 @@ def shake_hands(near, far):
 
 
 def receive_all(end):
-    """Receive to the end, but only what the system or `hidden` tells of; return it and the error."""
+    """Return what arrives until the end, as the system or `hidden` tell, and the error."""
     received = bytearray()
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:

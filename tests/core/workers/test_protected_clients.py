@@ -1,4 +1,4 @@
-"""Clients on other machines: what travels is encrypted, and nobody between the two sides is trusted.
+"""Clients on other machines: what travels is encrypted, and nobody in between is trusted.
 
 The other machine is a network namespace; where a client of this one is enough it uses an address
 that is not a loopback one, and its traffic is protected all the same.

@@ -165,3 +165,11 @@ def test_a_token_file_that_others_may_read(capsys, tmp_path):
     file.chmod(0o644)
     assert main(["serve", "gym/CartPole-v1", "--token-file", str(file)]) == 1
     assert "chmod 600" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0", "127.0.0.1"])
+def test_a_protocol_without_encryption_is_warned_of_beyond_the_loopback_interface(start, address):
+    process, _, _ = start("gym/CartPole-v1", *GODOT, "--address", address)
+    _, _, error = end(process)
+    warned = "neither encrypts nor authenticates" in error
+    assert warned == (address == "0.0.0.0"), error

@@ -1,4 +1,4 @@
-"""The protocol physx between machines: encrypted, bound to the token; the others say what they lack."""
+"""The protocol physx between machines, encrypted; the others say that they are not."""
 
 from __future__ import annotations
 
@@ -85,9 +85,11 @@ def test_on_the_loopback_interface_it_stays_plain(serving, another_machine):
 
 def test_a_client_that_does_not_encrypt_is_refused_and_a_wrong_token_too(serving, here):
     service = serving(Wide, address=here)
-    with socket.create_connection(service.address, PATIENCE) as plain:
-        with pytest.raises(PlainRefusedError):
-            introduce(plain, TOKEN, ACT)
+    with (
+        socket.create_connection(service.address, PATIENCE) as plain,
+        pytest.raises(PlainRefusedError),
+    ):
+        introduce(plain, TOKEN, ACT)
     with pytest.raises(RemoteError, match="cannot be trusted"):
         connect(text(service), token="another token, 16")
     with contextlib.closing(connect(text(service), token=TOKEN)) as env:
