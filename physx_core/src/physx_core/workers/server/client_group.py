@@ -21,7 +21,7 @@ from physx_core.errors import (
     PhysxError,
     ProgramError,
 )
-from physx_core.net.addresses import format_address, parse_address
+from physx_core.net.addresses import format_address, is_loopback, parse_address
 from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.net.tokens import choose_token, find_token
 from physx_core.net.values import encode
