@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physx_core.errors import ConfigError
 from physx_cluster.sweep import Definition
 from physx_cluster.sweep.parameters import Choices, Range, grid_of, read_parameters
+from physx_core.errors import ConfigError
 
 LINEAR = """
 [pipelines.linear.training]

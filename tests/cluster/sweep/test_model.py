@@ -21,10 +21,10 @@ from hypothesis.stateful import (
     rule,
 )
 
-from physx_core.config import read_toml
 from physx_cluster.sweep import Definition, Result, Study, StudyError, run_study
 from physx_cluster.sweep.executors.executor import Executor, Job
 from physx_cluster.sweep.results import FAILURE, RESULT, TRIAL, Failure
+from physx_core.config import read_toml
 
 optuna = pytest.importorskip("optuna")
 

@@ -1,0 +1,89 @@
+"""The same study on Ray and by submitit: the same table."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from sweep_kills import processes, start
+
+pytestmark = pytest.mark.usefixtures("nothing_stays_behind")
+
+
+@pytest.fixture
+def whole(write, training, physx):
+    """The table of a study, run here."""
+    training["network"]["optimization_kwargs"] = {"pause": 0.005}
+    write(run={"parallel": 2})
+    physx("sweep", "sweep.toml", "--study", "studies/whole")
+    return Path("studies/whole/trials.csv").read_bytes()
+
+
+def kill_one(study, deadline=120):
+    """Kill the process of a trial once it has a checkpoint."""
+    end = time.monotonic() + deadline
+    while time.monotonic() < end:
+        for name, pid in processes(study).items():
+            if list(Path(study, name).glob("network/*/checkpoint.toml")):
+                os.kill(pid, signal.SIGKILL)
+                return
+        time.sleep(0.02)
+    pytest.fail("no trial has come to a checkpoint")
+
+
+@pytest.mark.parametrize(
+    ("executor", "options"),
+    [("ray", {"num_cpus": 1, "address": "local"}), ("slurm", {"cluster": "local"})],
+)
+def test_the_table_is_the_same_wherever_trials_run(
+    write, whole, physx, parameters_of, executor, options
+):
+    pytest.importorskip({"ray": "ray", "slurm": "submitit"}[executor])
+    write(run={"parallel": 2, "executor": executor, "options": options})
+    sweep = start("sweep.toml", "studies/there")
+    kill_one("studies/there")
+    assert sweep.wait(200) == 0
+    assert Path("studies/there/trials.csv").read_bytes() == whole
+    assert parameters_of("studies/there") == parameters_of("studies/whole")
+
+
+@pytest.mark.parametrize(
+    ("executor", "options", "texts"),
+    [
+        ("local", {"cpus": 2}, ['The executor "local" has no option "cpus"']),
+        ("ray", {"address": "local", "cpus": 2}, ["Ray refuses the options", "cpus"]),
+        ("ray", {"address": "127.0.0.1:9"}, ["Ray does not answer at 127.0.0.1:9"]),
+        ("slurm", {"cluster": "local", "tiem": 3}, ["submitit refuses the options", "tiem"]),
+        ("slurm", {"cluster": "slrm"}, ["There is no Slurm here", "slrm"]),
+    ],
+)
+def test_options_that_an_executor_does_not_know(write, physx, executor, options, texts):
+    pytest.importorskip({"ray": "ray", "slurm": "submitit"}.get(executor, "physx_core"))
+    write(run={"executor": executor, "options": options})
+    said = physx("sweep", "sweep.toml", status=1)
+    for text in texts:
+        assert text in said
+
+
+@pytest.mark.parametrize(
+    ("executor", "options"),
+    [("ray", {"num_cpus": 1, "address": "local"}), ("slurm", {"cluster": "local"})],
+)
+def test_a_sweep_that_is_asked_to_end_leaves_no_trial_behind(write, training, executor, options):
+    pytest.importorskip({"ray": "ray", "slurm": "submitit"}[executor])
+    training["network"]["optimization_kwargs"] = {"pause": 0.2}
+    write(run={"executor": executor, "options": options})
+    sweep = start("sweep.toml", "studies/there")
+    deadline = time.monotonic() + 120
+    while not list(Path("studies").glob("there/*.batches")):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    sweep.send_signal(signal.SIGINT)
+    assert sweep.wait(60) == 130
+    deadline = time.monotonic() + 30
+    while processes("studies/there"):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    if executor == "ray":  # the trial was asked to write a checkpoint
+        assert list(Path("studies/there").glob("trial_0001/network/*/checkpoint.toml"))
