@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _ORDER = (
     *("generate", "train", "predict", "replay", "info", "stats", "verify"),
-    *("export", "import", "export-network", "client", "include", "plugins", "completion"),
+    *("export", "import", "export-network", "client", "include", "plugins", "new", "completion"),
 )
 """Order of the core's commands in the overview; others follow by name."""
 

@@ -1,0 +1,185 @@
+"""``physx new``: begin a plugin: a package that installs, passes the contract kit, has a README."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from string import Template
+from typing import Annotated, Literal
+
+import tyro
+
+from physx_core import plugins
+from physx_core.cli.output import show
+from physx_core.errors import ConfigError
+from physx_core.files import create_folder, make_folder, remove_folder, rename
+from physx_core.plugins.entries import OFFICIAL, PLUGINS
+
+_NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+_TEMPLATES = resources.files("physx_core.cli") / "templates"
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A component of a new plugin.
+
+    Attributes:
+        summary: What it is, for descriptions.
+        tried: Commands that try it.
+        arguments: Arguments of its contract kit.
+        requires: Distributions that it needs.
+    """
+
+    summary: str
+    tried: str
+    arguments: str = "$class_name"
+    requires: tuple[str, ...] = ("physx-core",)
+
+
+_GENERATE = "physx generate $name --batch-nb 10 --batch-size 100 --environment.num-clients 2"
+_TRAIN = (
+    "physx train sessions/data_generation --network.network $name --network.loss MSELoss \\\n"
+    "    --network.optimizer Adam --network.lr 0.01 --epoch-nb 5 --batch-size 50"
+)
+_SPRING = "physx generate toy/spring --batch-nb 10 --batch-size 100"
+_PARTS = {
+    "environment": _Part("a simulated cart", _GENERATE),
+    "network": _Part(
+        "a network of two layers",
+        f"{_SPRING}\n{_TRAIN}",
+        "$class_name, source=Spring",
+        ("physx-core", "physx-torch"),
+    ),
+    "visualizer": _Part(
+        "a visualizer that writes a text file", f"{_SPRING} --environment.visualizer $name"
+    ),
+    "backend": _Part(
+        "a physics engine for free rigid bodies",
+        'python -c "\n'
+        "from physx_core import Sphere, World, plugins\n\n"
+        "world = World(objects=[Sphere(name='ball', radius=0.1, position=(0, 0, 1))])\n"
+        "with plugins.resolve('backend', '$name').build(world) as simulation:\n"
+        "    simulation.step(100)\n"
+        "    print(simulation.body_poses(['ball']))\n"
+        '"',
+    ),
+}
+_KINDS = {kind: (kind,) for kind in _PARTS} | {"plugin": ("environment", "network")}
+
+
+@dataclass
+class New:
+    """Write the repository of a new plugin: it installs, passes the contract kit, has a README.
+
+    A `plugin` holds an environment and a network that learns from it; any may hold more.
+    """
+
+    kind: Annotated[
+        tyro.conf.Positional[Literal["environment", "network", "visualizer", "backend", "plugin"]],
+        tyro.conf.arg(metavar="KIND"),
+    ]
+    """What the plugin brings: environment, network, visualizer, backend, or plugin."""
+    name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")]
+    """Name of the plugin, by which users select it, as in wave-tank."""
+    folder: Path = Path()
+    """The folder in which that of the plugin, physx-NAME, is created."""
+
+
+def run(words: Sequence[str]) -> None:
+    """Write the files and print what to do next."""
+    options = tyro.cli(New, args=words, prog="physx new")
+    name = options.name
+    _check_name(name)
+    target = options.folder / f"physx-{name}"
+    if target.exists():
+        raise ConfigError(f"{target} exists already. Choose another name, or --folder.")
+    try:
+        _write(target, _render(name, _KINDS[options.kind]))
+    except OSError as error:
+        raise ConfigError(f"{target} cannot be written: {error.strerror or error}.") from error
+    show(f'wrote: {target}\nnext: cd {target} && pip install -e ".[test]" && pytest')
+
+
+def _check_name(name: str) -> None:
+    if not _NAME.fullmatch(name):
+        raise ConfigError(
+            f'NAME is "{name}": it consists of lower-case letters, digits, and single hyphens '
+            "between them, and begins with a letter, as in wave-tank."
+        )
+    taken = plugins.available()
+    if name in taken:
+        owners = " and ".join(taken[name].distributions)
+        raise ConfigError(f'There is a plugin "{name}" already: it is part of {owners}.')
+    package = OFFICIAL.get((PLUGINS, name))
+    if package is not None or f"physx-{name}" in OFFICIAL.values():
+        raise ConfigError(f'"{name}" is the name of {package or f"physx-{name}"}. Choose another.')
+
+
+def _render(name: str, kinds: Sequence[str]) -> dict[str, str]:
+    """Return the path of each file of the plugin, and its content."""
+    package = f"physx_{name.replace('-', '_')}"
+    camel = name.title().replace("-", "")
+    parts = [_PARTS[kind] for kind in kinds]
+    common = {"name": name, "package": package, "distribution": f"physx-{name}"}
+    each = [
+        {**common, "kind": kind, "class_name": camel.removesuffix(kind.title()) + kind.title()}
+        for kind in kinds
+    ]
+
+    def fill(template: str, values: dict[str, str]) -> str:
+        text = (_TEMPLATES / f"{template}.template").read_text(encoding="utf-8")
+        return Template(text).substitute(values)
+
+    requires = list(dict.fromkeys(one for part in parts for one in part.requires))
+    summary = "A plugin of physx: " + " and ".join(part.summary for part in parts) + "."
+    listed = "\n".join(
+        f"| `src/{package}/{kind}.py` | the class `{values['class_name']}`: {part.summary} |"
+        for kind, part, values in zip(kinds, parts, each, strict=True)
+    )
+    whole = common | {
+        "summary": summary,
+        "dependencies": ", ".join(f'"{one}"' for one in requires),
+        "usage": Template(_usage(kinds)).substitute(common),
+        "contents": listed,
+    }
+    tests = [
+        fill("test.py", values | {"arguments": Template(part.arguments).substitute(values)})
+        for part, values in zip(parts, each, strict=True)
+    ]
+    imports = [f"from {package}.{v['kind']} import {v['class_name']}" for v in each]
+    kit = ", ".join(f"check_{kind}" for kind in kinds)
+    head = ['"""The components keep the contracts that physx and its users rely on."""\n']
+    head += [f"from physx_core.testing import {kit}", *imports]
+    source = f"src/{package}"
+    return {
+        "pyproject.toml": fill("pyproject.toml", whole),
+        "README.md": fill("README.md", whole),
+        ".gitignore": fill("gitignore", whole),
+        f"{source}/__init__.py": "",
+        f"{source}/plugin.py": fill("plugin.py", whole)
+        + "".join(fill("hook.py", values) for values in each),
+        "tests/test_contract.py": "\n".join(head) + "\n" + "".join(tests),
+    } | {f"{source}/{values['kind']}.py": fill(f"{values['kind']}.py", values) for values in each}
+
+
+def _usage(kinds: Sequence[str]) -> str:
+    return f"{_GENERATE}\n{_TRAIN}" if len(kinds) > 1 else _PARTS[kinds[0]].tried
+
+
+def _write(target: Path, files: dict[str, str]) -> None:
+    """Write the files under a hidden name, and rename the folder when it is complete."""
+    hidden = target.with_name(f".{target.name}.new")
+    make_folder(target.parent)
+    remove_folder(hidden)  # of a process that was killed
+    create_folder(hidden)
+    try:
+        for name, text in files.items():
+            make_folder((hidden / name).parent)
+            (hidden / name).write_text(text, encoding="utf-8")
+        rename(hidden, target)
+    except BaseException:
+        remove_folder(hidden)
+        raise
