@@ -30,12 +30,14 @@ class _Part:
         summary: What it is, for descriptions.
         tried: Commands that try it.
         arguments: Arguments of its contract kit.
+        options: Options of ``physx check``, likewise.
         requires: Distributions that it needs.
     """
 
     summary: str
     tried: str
     arguments: str = "$class_name"
+    options: str = ""
     requires: tuple[str, ...] = ("physx-core",)
 
 
@@ -50,7 +52,8 @@ _PARTS = {
     "network": _Part(
         "a network of two layers",
         f"{_SPRING}\n{_TRAIN}",
-        "$class_name, source=Spring",
+        "$class_name, fields=FIELDS",
+        " --fields state=2 force=1 next_state=2",
         ("physx-core", "physx-torch"),
     ),
     "visualizer": _Part(
@@ -67,6 +70,8 @@ _PARTS = {
         '"',
     ),
 }
+_FIELDS = """
+FIELDS = [Field("state", (2,)), Field("force", (1,)), Field("next_state", (2,))]"""
 _KINDS = {kind: (kind,) for kind in _PARTS} | {"plugin": ("environment", "network")}
 
 
@@ -144,6 +149,7 @@ def _render(name: str, kinds: Sequence[str]) -> dict[str, str]:
         "dependencies": ", ".join(f'"{one}"' for one in requires),
         "usage": Template(_usage(kinds)).substitute(common),
         "contents": listed,
+        "options": "".join(part.options for part in parts),
     }
     tests = [
         fill("test.py", values | {"arguments": Template(part.arguments).substitute(values)})
@@ -152,7 +158,9 @@ def _render(name: str, kinds: Sequence[str]) -> dict[str, str]:
     imports = [f"from {package}.{v['kind']} import {v['class_name']}" for v in each]
     kit = ", ".join(f"check_{kind}" for kind in kinds)
     head = ['"""The components keep the contracts that physx and its users rely on."""\n']
+    head += ["from physx_core import Field"] if "network" in kinds else []
     head += [f"from physx_core.testing import {kit}", *imports]
+    head += [_FIELDS] if "network" in kinds else []
     source = f"src/{package}"
     return {
         "pyproject.toml": fill("pyproject.toml", whole),
