@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import resources
+from importlib import metadata, resources
 from pathlib import Path
 from string import Template
 from typing import Annotated, Literal
@@ -118,9 +118,17 @@ def _check_name(name: str) -> None:
     if name in taken:
         owners = " and ".join(taken[name].distributions)
         raise ConfigError(f'There is a plugin "{name}" already: it is part of {owners}.')
-    package = OFFICIAL.get((PLUGINS, name))
-    if package is not None or f"physx-{name}" in OFFICIAL.values():
-        raise ConfigError(f'"{name}" is the name of {package or f"physx-{name}"}. Choose another.')
+    official = OFFICIAL.get((PLUGINS, name), f"physx-{name}")
+    if official in OFFICIAL.values() or _is_installed(official):
+        raise ConfigError(f'"{name}" is the name of {official}. Choose another.')
+
+
+def _is_installed(distribution: str) -> bool:
+    try:
+        metadata.distribution(distribution)
+    except metadata.PackageNotFoundError:
+        return False
+    return True
 
 
 def _render(name: str, kinds: Sequence[str]) -> dict[str, str]:
