@@ -156,6 +156,10 @@ class ComponentNotFoundError(PhysxError):
         )
 
 
+class ContractError(PhysxError):
+    """A component does not do what physx and its users expect of one of its kind."""
+
+
 class ReferenceFormError(PhysxError):
     """The reference to a component has an invalid form, or names what is no such component."""
 

@@ -192,6 +192,8 @@ class Linear(Network):
 class LeastSquares(Optimization):
     """Solves for the weights that fit all batches so far; the loss is the mean square."""
 
+    state_file = "normal_equations.npz"
+
     def set_loss(self, loss: str | type[Any] | None) -> None:
         """Accept the mean square only."""
         if loss is not None:
@@ -225,6 +227,37 @@ class LeastSquares(Optimization):
         self._normal = normal if self._normal is None else self._normal + normal
         self._right = right if self._right is None else self._right + right
         self._network.weights = np.linalg.lstsq(self._normal, self._right, rcond=None)[0]
+
+    def save_state(self, path: Path) -> None:
+        """Write the normal equations of all batches so far."""
+        nothing = np.zeros((0, 0))
+        with path.open("wb") as file:
+            np.savez(
+                file,
+                normal=nothing if self._normal is None else self._normal,
+                right=nothing if self._right is None else self._right,
+            )
+
+    def load_state(self, path: Path) -> None:
+        """Read the normal equations."""
+        size, outputs = self._network.weights.shape
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                if sum(item.file_size for item in stored.zip.infolist()) > (
+                    size * (size + outputs) * _WIDEST + 2 * _LONGEST_HEADER
+                ):
+                    raise ValueError("it is too large")
+                normal, right = stored["normal"], stored["right"]
+        except _UNREADABLE as error:
+            raise CheckpointError(
+                f"{path} does not contain a state of toy/least-squares: {error}."
+            ) from error
+        if not normal.size:
+            self._normal = self._right = None
+        elif (normal.shape, right.shape) == ((size, size), (size, outputs)):
+            self._normal, self._right = normal, right
+        else:
+            raise CheckpointError(f"{path} is the state of a training with other fields.")
 
 
 @hookimpl

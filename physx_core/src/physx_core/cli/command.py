@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 _ORDER = (
     *("generate", "train", "predict", "replay", "info", "stats", "verify"),
-    *("export", "import", "export-network", "client", "include", "plugins", "new", "completion"),
+    *("export", "import", "export-network", "client", "include", "plugins", "new", "check"),
+    "completion",
 )
 """Order of the core's commands in the overview; others follow by name."""
 

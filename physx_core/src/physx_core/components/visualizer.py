@@ -97,9 +97,9 @@ class Observer:
         """Called at the end of the run, also after a failure."""
 
     def outputs(self) -> Sequence[str]:
-        """Return a line for each file that it left in this run, for example ``recording: PATH``.
+        """Return a line for each file or folder that it left, for example ``recording: PATH``.
 
-        A command that shows the file follows the path in brackets. Called after `close`.
+        A command that shows it follows the path in brackets. Called after `close`.
         """
         return ()
 

@@ -1,6 +1,7 @@
 """Child processes and temporary folders that go with this process, and signals that end it."""
 
 from .child import ChildProcess as ChildProcess
+from .descendants import children as children
 from .descendants import kill_descendants as kill_descendants
 from .folder import TemporaryFolder as TemporaryFolder
 from .interrupt import Interrupt as Interrupt

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, get_args
 
 Status = Literal["passed", "failed", "expected", "skipped"]
 
@@ -33,10 +32,12 @@ class Report:
     """The results of all checks of a component.
 
     Attributes:
-        component: What was checked.
+        kind: Kind of the component, as ``environment``.
+        component: What was checked: its reference.
         checks: The results.
     """
 
+    kind: str
     component: str
     checks: tuple[Check, ...]
 
@@ -48,52 +49,30 @@ class Report:
 
     def counts(self) -> dict[str, int]:
         """Return how many checks there are of each status."""
-        names = ("passed", "failed", "expected", "skipped")
+        names = get_args(Status)
         return {name: sum(check.status == name for check in self.checks) for name in names}
 
-    def __str__(self) -> str:
-        """Return a line for each check that did not pass, and the counts."""
-        lines = [
-            f"{check.status:8}  {check.name}: {check.reason}"
-            for check in self.checks
-            if check.status != "passed"
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as plain data: kind, component, ok, counts, and the checks."""
+        checks = [asdict(check) for check in self.checks]
+        named = {"kind": self.kind, "component": self.component, "ok": self.ok}
+        return {**named, "counts": self.counts(), "checks": checks}
+
+    def findings(self) -> list[Check]:
+        """Return the checks that did not pass; of those left out for one reason a single one."""
+        found: dict[tuple[str, str], list[Check]] = {}
+        for check in self.checks:
+            if check.status != "passed":
+                same = check.reason if check.status == "skipped" else check.name
+                found.setdefault((check.status, same), []).append(check)
+        several = {key: f"{len(checks)} checks" for key, checks in found.items() if checks[1:]}
+        return [
+            replace(checks[0], name=several.get(key, checks[0].name))
+            for key, checks in found.items()
         ]
+
+    def __str__(self) -> str:
+        """Return the counts, and a line for each of the `findings`."""
+        lines = [f"{check.status:8}  {check.name}: {check.reason}" for check in self.findings()]
         counts = ", ".join(f"{number} {name}" for name, number in self.counts().items() if number)
-        return "\n".join([f"{self.component}: {counts}", *lines])
-
-
-def run_checks(
-    component: str,
-    checks: Mapping[str, Callable[[], None]],
-    expected_failures: Mapping[str, str] | None = None,
-) -> Report:
-    """Run checks, each of which raises if it fails, and return what they found.
-
-    Args:
-        component: What is checked.
-        checks: Name of each check, a sentence, and the check.
-        expected_failures: Names of checks that may fail, and why.
-
-    Raises:
-        KeyError: If there is no check of an expected name.
-    """
-    expected = dict(expected_failures or {})
-    unknown = expected.keys() - checks.keys()
-    if unknown:
-        raise KeyError(f"There are no checks {sorted(unknown)}. There are: {sorted(checks)}.")
-    found = []
-    for name, check in checks.items():
-        try:
-            check()
-        except NotApplicableError as reason:
-            found.append(Check(name, "skipped", str(reason)))
-        except Exception as error:  # whatever a component raises is what the report is about
-            status: Status = "expected" if name in expected else "failed"
-            found.append(Check(name, status, expected.get(name) or f"{_kind(error)}{error}"))
-        else:
-            found.append(Check(name, "passed"))
-    return Report(component, tuple(found))
-
-
-def _kind(error: Exception) -> str:
-    return "" if isinstance(error, AssertionError) else f"{type(error).__name__}: "
+        return "\n".join([f"{self.kind} {self.component}: {counts}", *lines])

@@ -16,9 +16,10 @@ import numpy as np
 
 from physx_core.components import Event, Factory, Visualizer
 from physx_core.errors import VisualizerError
-from physx_core.processes import TemporaryFolder
-from physx_core.testing.report import NotApplicableError, Report, run_checks
+from physx_core.testing.report import NotApplicableError, Report
+from physx_core.testing.running import TIMEOUT, run_checks
 from physx_core.testing.scene import OBJECTS, add_all, move_all
+from physx_core.testing.subject import Check, Subject, refuses_unknown_options
 
 Make = Callable[[], Visualizer]
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
@@ -26,22 +27,32 @@ _PATIENCE = 5.0
 """Seconds within which what a visualizer started must have ended after `close`."""
 
 
-def check_visualizer(make: Make, *, expected_failures: Mapping[str, str] | None = None) -> Report:
+def check_visualizer(
+    component: str | type[Any] | Callable[..., Visualizer],
+    *,
+    expected_failures: Mapping[str, str] | None = None,
+    timeout: float = TIMEOUT,
+    **kwargs: Any,
+) -> Report:
     """Check that a visualizer keeps the contract of `Visualizer`, without a display.
 
     Args:
-        make: Returns a new visualizer, as ``MyVisualizer`` or ``lambda: MyVisualizer(size=3)``.
+        component: Its class, a function that returns it, or a reference.
         expected_failures: Names of checks that may fail, and why.
+        timeout: Time in s after which a check that has not ended has failed.
+        kwargs: Arguments of its constructor.
+
+    Raises:
+        UsageError: If there is no check of an expected name, or no other process can find the
+            component or take its arguments.
     """
-    component = type(make()).__name__
-    checks = {f"draws {kind}": functools.partial(_draws, kind) for kind in OBJECTS} | _CHECKS
-    with TemporaryFolder("check-") as folder, _no_display():
-        in_folders = {}
-        for number, (name, check) in enumerate(checks.items()):
-            own = Path(folder.path, str(number))
-            own.mkdir()
-            in_folders[name] = functools.partial(check, make, own)
-        return run_checks(component, in_folders, expected_failures)
+    return run_checks(
+        "visualizer",
+        component,
+        kwargs,
+        expected_failures=expected_failures,
+        timeout=timeout,
+    )
 
 
 @contextlib.contextmanager
@@ -142,8 +153,9 @@ def _outputs(make: Make, folder: Path) -> None:
     for line in lines:
         what, colon, rest = line.partition(": ")
         path = Path(rest.partition("  (")[0])
-        if not (what and colon and path.is_file() and path.stat().st_size):
-            raise AssertionError(f'"{line}" does not name a file that it left, as "what: PATH"')
+        content = any(path.iterdir()) if path.is_dir() else path.is_file() and path.stat().st_size
+        if not (what and colon and content):
+            raise AssertionError(f'"{line}" does not name what it left, as "what: PATH"')
 
 
 def _changes_nothing(make: Make, folder: Path) -> None:
@@ -209,7 +221,17 @@ def _outputs_or_none(make: Make, folder: Path) -> None:
         _outputs(make, folder)
 
 
-_CHECKS: dict[str, Callable[[Make, Path], None]] = {
+def _check(check: Callable[[Make, Path], None]) -> Check:
+    """Return a check of a subject, that runs without a display."""
+
+    def checked(subject: Subject) -> None:
+        with _no_display():
+            check(subject.make, subject.folder)
+
+    return checked
+
+
+_OTHERS: dict[str, Callable[[Make, Path], None]] = {
     "draws many objects at once": _many,
     "ignores or refuses a kind that it does not know": _unknown,
     "draws several instances": _several_instances,
@@ -220,4 +242,10 @@ _CHECKS: dict[str, Callable[[Make, Path], None]] = {
     "takes numbers that are not finite": _numbers,
     "shows motion in its pictures": _pictures,
     "leaves no thread behind": _leaves_nothing,
+}
+
+CHECKS: dict[str, Check] = {
+    "refuses unknown options": refuses_unknown_options,
+    **{f"draws {kind}": _check(functools.partial(_draws, kind)) for kind in OBJECTS},
+    **{name: _check(check) for name, check in _OTHERS.items()},
 }

@@ -1,0 +1,68 @@
+"""All checks of engines, by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from physx_core.simulation import Backend
+from physx_core.testing.backend import contacts, dynamics, features, motion, state
+from physx_core.testing.backend.worlds import build, busy
+from physx_core.testing.process_state import unchanged
+from physx_core.testing.report import Report
+from physx_core.testing.running import TIMEOUT, run_checks
+from physx_core.testing.subject import Check, Subject
+
+
+def check_backend(
+    component: str | type[Any] | Callable[..., Backend],
+    *,
+    expected_failures: Mapping[str, str] | None = None,
+    timeout: float = TIMEOUT,
+    **kwargs: Any,
+) -> Report:
+    """Check that an engine keeps the contract of `Backend` and `Simulation`.
+
+    What its simulations do not claim in `Simulation.features` is left out.
+
+    Args:
+        component: Its class, a function that returns it, or a reference.
+        expected_failures: Names of checks that may fail, and why.
+        timeout: Time in s after which a check that has not ended has failed.
+        kwargs: Arguments of its constructor.
+
+    Raises:
+        UsageError: If there is no check of an expected name, or no other process can find the
+            component or take its arguments.
+    """
+    return run_checks(
+        "backend",
+        component,
+        kwargs,
+        expected_failures=expected_failures,
+        timeout=timeout,
+    )
+
+
+def _quiet(subject: Subject) -> None:
+    for tries in range(2):
+        if not tries:
+            _run(subject)
+            continue
+        with unchanged(subject.before):
+            _run(subject)
+
+
+def _run(subject: Subject) -> None:
+    with build(subject, busy()) as simulation:
+        simulation.step(50)
+
+
+CHECKS: dict[str, Check] = {
+    **state.CHECKS,
+    **motion.CHECKS,
+    **dynamics.CHECKS,
+    **contacts.CHECKS,
+    **features.CHECKS,
+    "leaves its process as it was": _quiet,
+}

@@ -1,0 +1,119 @@
+"""What a component may change in its process only for the time that it works, if at all."""
+
+from __future__ import annotations
+
+import contextlib
+import locale
+import os
+import signal
+import sys
+import tempfile
+import threading
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from physx_core.processes import children
+
+_VARIABLES = "the environment variables"
+_LASTING = (
+    "the working directory",
+    "the folder of temporary files",
+    "the umask",
+    "the handlers of signals",
+    "the locale",
+    "sys.excepthook",
+)
+"""What is compared with the state before the component was imported."""
+_PATIENCE = 5.0
+"""Seconds within which threads and processes that were ended must be gone."""
+
+
+def process_state() -> dict[str, Any]:
+    """Return what belongs to the whole process, by its name in messages."""
+    mask = os.umask(0o077)
+    os.umask(mask)
+    name, keys, place, *gauss = np.random.get_state(legacy=True)  # noqa: NPY002 - whether it moved
+    return {
+        "the working directory": _working_directory(),
+        _VARIABLES: dict(os.environ),
+        "the folder of temporary files": tempfile.tempdir,
+        "the umask": mask,
+        "the handlers of signals": {
+            number.name: signal.getsignal(number)
+            for number in sorted(signal.valid_signals())
+            if isinstance(number, signal.Signals)
+        },
+        "the state of NumPy's global random numbers": (
+            name,
+            np.asarray(keys).tobytes(),
+            place,
+            gauss,
+        ),
+        "the state of Python's global random numbers": _python_random(),
+        "NumPy's handling of floating-point errors": np.geterr(),
+        "NumPy's way to print": np.get_printoptions(),
+        "the locale": locale.setlocale(locale.LC_ALL),
+        "the filters of warnings": list(warnings.filters),
+        "the recursion limit": sys.getrecursionlimit(),
+        "sys.excepthook": sys.excepthook,
+        "standard output": sys.stdout,
+        "standard error": sys.stderr,
+    }
+
+
+@contextlib.contextmanager
+def unchanged(before: Mapping[str, Any] | None = None) -> Iterator[None]:
+    """Check that what happens in this context leaves the process as it was.
+
+    Args:
+        before: The state before the component was imported, with which the working directory and
+            the like are compared; None: that at the beginning.
+
+    Raises:
+        AssertionError: If something has changed, or a thread or child process is left.
+    """
+    kept = process_state()
+    if before is not None:
+        kept |= {what: before[what] for what in _LASTING}
+        kept[_VARIABLES] |= before[_VARIABLES]  # libraries add some of their own
+    threads, processes = set(threading.enumerate()), children()
+    yield
+    for what, value in process_state().items():
+        if value != kept[what]:
+            raise AssertionError(f"it changed {what}{_difference(kept[what], value)}")
+    _await(lambda: [each.name for each in set(threading.enumerate()) - threads], "threads")
+    _await(lambda: sorted(children() - processes), "child processes")
+
+
+def _await(left: Any, what: str) -> None:
+    until = time.monotonic() + _PATIENCE
+    while found := left():
+        if time.monotonic() > until:
+            raise AssertionError(f"{what} are left: {found}")
+        time.sleep(0.02)
+
+
+def _working_directory() -> str:
+    try:
+        return str(os.getcwd())  # noqa: PTH109 - a text, to be compared
+    except FileNotFoundError:
+        return "(removed)"
+
+
+def _python_random() -> Any:
+    import random
+
+    return random.getstate()
+
+
+def _difference(before: Any, after: Any) -> str:
+    if isinstance(before, str | int | None):
+        return f": {before!r} became {after!r}"
+    if isinstance(before, dict):
+        names = [key for key in {**before, **after} if before.get(key) != after.get(key)]
+        return f": {', '.join(map(str, names[:5]))}"
+    return ""

@@ -1,0 +1,137 @@
+"""Subject: the component that is checked, and what its checks need to create it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from physx_core.components import Parameter
+from physx_core.config import NetworkConfig, from_plain
+from physx_core.errors import ConfigError, PhysxError, UnknownOptionError
+from physx_core.fields import Field
+from physx_core.plugins import resolve
+from physx_core.typing import Batch
+
+_UNKNOWN = "no_option_has_this_name"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A component to check.
+
+    Attributes:
+        kind: Its kind, as ``environment``.
+        reference: Its reference.
+        arguments: Keyword arguments of its constructor.
+        options: What else its kind of check needs, as plain data: ``fields`` of a network, the
+            ``network`` of an optimization or transformation, the ``parameters`` of a sampler.
+        folder: An empty folder of this check.
+        before: State of the process before the component was imported.
+    """
+
+    kind: str
+    reference: str
+    arguments: Mapping[str, Any]
+    options: Mapping[str, Any] = field(default_factory=dict)
+    folder: Path = Path()
+    before: Mapping[str, Any] | None = None
+
+    def make(self, **more: Any) -> Any:
+        """Return a new component; `more` are further arguments of its constructor."""
+        made = resolve(self.kind, self.reference)
+        return made(**self.arguments, **more) if callable(made) else made
+
+    @property
+    def fields(self) -> list[Field]:
+        """The fields that were given; empty: none were."""
+        return [Field(**plain) for plain in self.options.get("fields", ())]
+
+    @property
+    def network(self) -> NetworkConfig | None:
+        """The network that was given; None: none was."""
+        plain = self.options.get("network")
+        return None if plain is None else from_plain(NetworkConfig, plain)
+
+    @property
+    def parameters(self) -> list[Parameter]:
+        """The parameters that were given; empty: none were."""
+        return [Parameter.from_dict(plain) for plain in self.options.get("parameters", ())]
+
+
+Check: TypeAlias = Callable[[Subject], None]
+"""Raises if the component does not do what the check's name says."""
+
+
+def refuses_unknown_options(subject: Subject) -> None:
+    """Check that a misspelt option is an error, and not swallowed."""
+    try:
+        made = subject.make(**{_UNKNOWN: 1})
+    except (TypeError, UnknownOptionError, ConfigError):
+        return
+    except PhysxError as error:
+        if _UNKNOWN in str(error):
+            return
+        raise
+    close = getattr(made, "close", None)
+    if callable(close):
+        close()
+    raise AssertionError(
+        "its constructor takes an option that nobody knows, so a user's misspelling would have no "
+        "effect: name the options, and hand **kwargs to super().__init__()"
+    )
+
+
+def expect(condition: Any, message: str) -> None:
+    """Raise an `AssertionError` with a message unless a condition holds."""
+    if not condition:
+        raise AssertionError(message)
+
+
+def expect_equal(found: Batch, wanted: Batch, what: str) -> None:
+    """Raise an `AssertionError` unless the arrays are the same, bit for bit.
+
+    Args:
+        found: Arrays by name.
+        wanted: What they should be.
+        what: What differs, for the message: "the rows of the second run differ".
+    """
+    expect(found.keys() == wanted.keys(), f"{what}: {sorted(found)}, not {sorted(wanted)}")
+    for name, values in wanted.items():
+        one, other = np.asarray(found[name]), np.asarray(values)
+        expect(one.shape == other.shape, f'{what}: "{name}" has {one.shape}, not {other.shape}')
+        same = _bits(one) == _bits(other)
+        if not same:
+            places: Sequence[int] = np.flatnonzero(np.ravel(one) != np.ravel(other)).tolist()
+            place = places[0] if places else 0
+            expect(
+                False,
+                f'{what}: "{name}" first at element {place}: {np.ravel(one)[place]!r}, not '
+                f"{np.ravel(other)[place]!r}",
+            )
+
+
+def expect_close(found: Any, wanted: Any, relative: float, what: str) -> None:
+    """Raise an `AssertionError` unless numbers agree, relative to the largest one.
+
+    Args:
+        found: Numbers.
+        wanted: What they should be, of the same shape.
+        relative: Largest difference over the largest number, which counts as 1e-9 at least.
+        what: What differs, for the message.
+    """
+    one, other = np.asarray(found, np.float64), np.asarray(wanted, np.float64)
+    expect(one.shape == other.shape, f"{what}: shape {one.shape}, not {other.shape}")
+    if not one.size:
+        return
+    expect(np.isfinite(one).all(), f"{what}: there are values that are not finite")
+    scale = max(float(np.abs(other).max()), 1e-9)
+    difference = float(np.abs(one - other).max()) / scale
+    expect(difference <= relative, f"{what} by {difference:.2g} relative; allowed: {relative:g}")
+
+
+def _bits(array: Any) -> bytes:
+    return bytes(np.ascontiguousarray(array).tobytes())
