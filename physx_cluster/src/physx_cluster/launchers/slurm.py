@@ -45,6 +45,10 @@ _TIMEOUTS = 1_000  # after which submitit starts a job again
 _LEAVE_TIME = 10.0  # for jobs to leave the queue
 _PAUSE = 0.05
 _INTERRUPTED = -15
+_ADVICE = (
+    "What a job asks for are launcher_kwargs, such as timeout_min, mem_gb, cpus_per_task and "
+    'slurm_partition; "sinfo" says what there is.'
+)
 
 
 class SlurmLauncher(Launcher):
@@ -180,9 +184,7 @@ class SlurmLauncher(Launcher):
             reason = " ".join(str(e).split()[-60:])
             raise ClientError(
                 instances[0],
-                f"was refused by Slurm: {reason}. What a job asks for are launcher_kwargs, such as "
-                'timeout_min, mem_gb, cpus_per_task and slurm_partition; "sinfo" says what there '
-                "is.",
+                f"was refused by Slurm: {reason}. {_ADVICE}",
             ) from e
         return dict(zip(instances, jobs, strict=True))
 
@@ -298,6 +300,11 @@ class JobHandle(ClientHandle):
         if self._status is not None:
             return self._status
         state = self.look(max_age)
+        if state.is_hopeless:
+            self._launcher.cancel(self.job)
+            text = f"Slurm cannot give job {self.job.job_id} what it asks for ({state.reason})."
+            self._end(1, f"{text} {_ADVICE}")
+            return self._status
         noted = self._read_note() if max_age < _RARELY or state.is_over else None
         if state.runs > self._runs:
             self._end(_INTERRUPTED, f"Slurm interrupted job {self.job.job_id} and runs it again.")

@@ -14,7 +14,11 @@ from physx_core.errors import ConfigError
 _SOON = ("PENDING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED", "SPECIAL_EXIT", "CONFIGURING")
 _NOW = ("RUNNING", "SUSPENDED", "STOPPED", "SIGNALING", "STAGE_OUT", "RESIZING")
 _LEAVING = ("COMPLETING", "PREEMPTED")
-_SECONDS = 30.0  # that a command of Slurm may take
+_NEVER = (
+    *("BadConstraints", "PartitionConfig", "PartitionNodeLimit", "PartitionTimeLimit"),
+    *("InvalidAccount", "InvalidQOS"),
+)  # reasons to wait that do not pass
+_SECONDS = 10.0  # that a command of Slurm may take
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,11 @@ class JobState:
     def is_queued(self) -> bool:
         """Whether it waits for its turn."""
         return self.name in _SOON
+
+    @property
+    def is_hopeless(self) -> bool:
+        """Whether it waits for what it cannot get."""
+        return self.is_queued and self.reason in _NEVER
 
     @property
     def is_over(self) -> bool:
