@@ -9,7 +9,7 @@ import numpy as np
 
 from physx_core.engines.models.parts import Mover
 from physx_core.engines.resistance import Resistance
-from physx_core.rotations import Triple, cross, rotate_back
+from physx_core.rotations import Triple, cross, rotate, rotate_back
 from physx_core.typing import Vector
 
 
@@ -108,3 +108,25 @@ def base_accelerations(
     a, b, c = rotate_back(orientation, *linear)
     x, y, z = cross(p, q, r, u, v, w)
     return a - x, b - y, c - z
+
+
+def twist_change(
+    earlier: Sequence[float], before: Vector, now: Sequence[float], after: Vector, period: float
+) -> Vector:
+    """Return the change of a base's twist in a step over the period, shape (6,).
+
+    Args:
+        earlier: Quaternion x, y, z, w of the base before the step.
+        before: Its velocities then: linear along the world's axes, angular along its own; more may
+            follow.
+        now: Quaternion after the step.
+        after: Velocities after the step, likewise.
+        period: Length of the step, in s.
+    """
+    pace, linear = 1 / period, after[:3].tolist()
+    twist = np.array([*rotate_back(now, *linear), *after[3:6].tolist()])
+    p, q, r = twist[3:].tolist()
+    x, y, z = rotate_back(now, *rotate(earlier, *before[3:6].tolist()))
+    change = ((after[:3] - before[:3]) / period).tolist()
+    spin = pace * (p - x), pace * (q - y), pace * (r - z)
+    return np.array([*base_accelerations(now, change, twist), *spin])

@@ -368,14 +368,12 @@ class RobotSimulation(Simulation, Generic[Engine]):
 
     def contacts(self) -> Records:
         """Return the contacts of the last physics step: an array of `CONTACT` records, a copy."""
-        self._check_open()
-        if "contacts" not in self.features:
-            raise self._lacks("contacts")
+        self._check_has("contacts")
         return self.read_contacts() if self._stepped else np.zeros(0, CONTACT)
 
     def joint_wrenches(self) -> Vector:
         """Return the reactions of joints in the last step, shape (joints, 6)."""
-        self._check_open()
+        self._check_has("joint_wrenches")
         q, v, a = self.positions(), self.velocities(), self.accelerations()
         return self._algorithms.joint_wrenches(q, v, a, self._outer(q))
 
@@ -485,6 +483,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self, positions: Vector, velocities: Vector, torques: Vector
     ) -> tuple[Vector, Vector, Vector]:
         """Return the derivatives of `forward_dynamics` by positions, velocities, and torques."""
+        self._check_has("derivatives")
         return self._algorithms.forward_dynamics_derivatives(
             *self._checked_state(positions, velocities, torques=torques)
         )
@@ -508,7 +507,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         processes: int = 1,
     ) -> Vector:
         """Return gradients of weighted sums of `forward_dynamics`, shape (3, n, nv)."""
-        self._check_open()
+        self._check_has("derivatives")
         processes = integer("processes", processes, 1)
         q, v, a, w = self._checks.rows(
             positions, velocities=velocities, accelerations=accelerations, weights=weights
@@ -527,8 +526,14 @@ class RobotSimulation(Simulation, Generic[Engine]):
     @property
     def _algorithms(self) -> Algorithms:
         if self._made_algorithms is None:
+            self._check_open()
             self._made_algorithms = self.make_algorithms()
         return self._made_algorithms
+
+    def _check_has(self, feature: str) -> None:
+        self._check_open()
+        if feature not in self.features:
+            raise self._lacks(feature)
 
     def _check_open(self) -> None:
         if self._closed:

@@ -16,8 +16,8 @@ import numpy as np
 import pinocchio
 from numpy import add, multiply
 
-from physx_core.engines import Mover, RobotEngine, Static, base_accelerations, rk4_step
-from physx_core.rotations import rotate, rotate_back, to_matrix
+from physx_core.engines import Mover, RobotEngine, Static, rk4_step, twist_change
+from physx_core.rotations import rotate_back, to_matrix
 from physx_core.simulation import CONTACT, World
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.constraints import Constraints, Warmth, constrained, limited
@@ -293,11 +293,7 @@ class PinocchioRobot(RobotEngine):
         if not self.base:
             return a
         earlier, now = self._earlier[3:7].tolist(), self._positions[3:7].tolist()
-        x, y, z = rotate_back(now, *rotate(earlier, *self._before[3:6].tolist()))
-        p, q, r = self._velocities[3:6].tolist()
-        change = base_accelerations(now, a[:3].tolist(), self.velocities())
-        pace = 1 / self._period
-        a[:6] = (*change, pace * (p - x), pace * (q - y), pace * (r - z))
+        a[:6] = twist_change(earlier, self._before, now, self._velocities, self._period)
         return a
 
     def write(self, positions: Vector, velocities: Vector) -> None:

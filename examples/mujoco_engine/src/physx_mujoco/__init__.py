@@ -1,0 +1,1 @@
+"""physx plugin `mujoco`: simulations with MuJoCo."""

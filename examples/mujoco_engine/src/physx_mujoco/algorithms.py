@@ -1,0 +1,164 @@
+"""MuJoCo's algorithms for a world in any state.
+
+Its velocities differ from those of physx in floating bases: their linear part is along the world's
+axes, not the base's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import mujoco
+import numpy as np
+
+from physx_core.engines import (
+    Algorithms,
+    Parts,
+    Resistance,
+    base_accelerations,
+    layout_of,
+    static_poses,
+)
+from physx_core.rotations import cross, to_matrix
+from physx_core.typing import Vector
+from physx_mujoco.model import WorldModel
+from physx_mujoco.robot import INWARDS, outwards
+
+
+class MujocoAlgorithms(Algorithms):
+    """MuJoCo's kinematics and dynamics of a world, without contacts and limits."""
+
+    def __init__(self, parts: Parts, world: WorldModel) -> None:
+        layout = layout_of(parts)
+        self.nq, self.nv = layout.nq, layout.nv
+        self._model, self._bodies = world.model, world.bodies
+        self._data, self._statics = mujoco.MjData(world.model), static_poses(parts)
+        places = list(layout.parts.values())
+        bases = [place for place in places if place.floating]
+        self._bases = [(place.positions.start, place.velocities.start) for place in bases]
+        tables = [Resistance.of(mover).table for mover in parts.movers]
+        self._resistance = Resistance(np.concatenate(tables, axis=1))
+        ends = [np.arange(p.positions.stop - p.nv, p.positions.stop) for p in places]
+        self._stretched = np.concatenate(ends).astype(np.intp)
+
+    def body_poses(self, q: Vector, bodies: Sequence[int]) -> Vector:
+        self._place(q)
+        return np.array([self._pose(body) for body in bodies]).reshape(-1, 7)
+
+    def motions(self, q: Vector, v: Vector, a: Vector, bodies: Sequence[int]) -> Vector:
+        self._move(q, v, a)
+        found, six = np.zeros((len(bodies), 19)), np.zeros(6)
+        model, data, kind = self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY
+        for row, body in zip(found, bodies, strict=True):
+            row[:7] = self._pose(body)
+            if body < len(self._bodies):
+                mujoco.mj_objectVelocity(model, data, kind, self._bodies[body], six, 0)
+                row[7:10], row[10:13] = six[3:], six[:3]
+                mujoco.mj_objectAcceleration(model, data, kind, self._bodies[body], six, 0)
+                row[13:16], row[16:19] = six[3:] + model.opt.gravity, six[:3]
+        return found
+
+    def forward_dynamics(self, q: Vector, v: Vector, tau: Vector) -> Vector:
+        self._move(q, v)
+        bias, resisted = np.zeros(self.nv), tau - self._resistance.torques(q[self._stretched], v)
+        mujoco.mj_rne(self._model, self._data, 0, bias)
+        mass = self._mass()
+        scale = 1 / np.sqrt(np.diag(mass))
+        torques = scale * (self._turned(q, resisted, inwards=True) - bias)
+        a: Vector = scale * np.linalg.solve(scale * mass * scale[:, None], torques)
+        for x, y in self._bases:
+            orientation, linear = q[x + 3 : x + 7].tolist(), a[y : y + 3].tolist()
+            a[y : y + 3] = base_accelerations(orientation, linear, v[y : y + 6])
+        return a
+
+    def inverse_dynamics(self, q: Vector, v: Vector, acceleration: Vector) -> Vector:
+        model, data, tau = self._model, self._data, np.zeros(self.nv)
+        self._move(q, v, acceleration)
+        mujoco.mj_rne(model, data, 1, tau)
+        tau += model.dof_armature * data.qacc
+        found: Vector = self._turned(q, tau) + self._resistance.torques(q[self._stretched], v)
+        return found
+
+    def mass_matrix(self, q: Vector) -> Vector:
+        self._place(q)
+        return self._turned(q, self._turned(q, self._mass()).T.copy())
+
+    def jacobian(self, body: int, q: Vector, point: Vector) -> Vector:
+        found, data = np.zeros((6, self.nv)), self._data
+        if body < len(self._bodies):
+            self._place(q)
+            place = self._bodies[body]
+            at = data.xpos[place] + data.xmat[place].reshape(3, 3) @ point
+            mujoco.mj_jac(self._model, data, found[:3], found[3:], at, place)
+        return self._turned(q, found)
+
+    def joint_wrenches(
+        self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
+    ) -> Vector:
+        model, data = self._model, self._data
+        self._place(q)
+        data.xfrc_applied[:] = 0.0
+        for body, wrench in outer.items():
+            place = self._bodies[body]
+            arm = data.xipos[place] - data.xpos[place]
+            data.xfrc_applied[place] = wrench
+            data.xfrc_applied[place, 3:] -= np.cross(arm, wrench[:3])
+        self._move(q, v, a)
+        moving = model.jnt_bodyid[model.jnt_type != mujoco.mjtJoint.mjJNT_FREE]
+        found = np.zeros((len(moving), 6))
+        for row, body in zip(found, moving, strict=True):
+            torque, force = data.cfrc_int[body, :3], data.cfrc_int[body, 3:]
+            arm = data.xpos[body] - data.subtree_com[model.body_rootid[body]]
+            turn = data.xmat[body].reshape(3, 3)
+            row[:3], row[3:] = force @ turn, (torque - np.cross(arm, force)) @ turn
+        return found
+
+    def _mass(self) -> Vector:
+        """Return the mass matrix in MuJoCo's convention, as a sum over the bodies, after `_place`.
+
+        MuJoCo computes its own about the center of mass of the whole robot, where the inertia of a
+        small part is lost to rounding.
+        """
+        model, data, found = self._model, self._data, np.diag(self._model.dof_armature)
+        linear, angular = np.zeros((2, 3, self.nv))
+        for body in self._bodies:
+            mujoco.mj_jacBodyCom(model, data, linear, angular, body)
+            turning = data.ximat[body].reshape(3, 3).T @ angular
+            found += model.body_mass[body] * linear.T @ linear
+            found += turning.T @ (model.body_inertia[body][:, None] * turning)
+        return found
+
+    def _place(self, q: Vector) -> None:
+        """Place the bodies."""
+        data = self._data
+        data.qpos[:] = q
+        for x, _ in self._bases:
+            data.qpos[x : x + 7] = q[x : x + 7][INWARDS]
+        mujoco.mj_kinematics(self._model, data)
+        mujoco.mj_comPos(self._model, data)
+
+    def _move(self, q: Vector, v: Vector, a: Vector | None = None) -> None:
+        """Place the bodies, and compute how they move with velocities and accelerations."""
+        model, data = self._model, self._data
+        self._place(q)
+        data.qvel[:] = self._turned(q, v.copy(), inwards=True)
+        mujoco.mj_comVel(model, data)
+        if a is not None:
+            a = a.copy()
+            for _, y in self._bases:
+                a[y : y + 3] += cross(*v[y + 3 : y + 6].tolist(), *v[y : y + 3].tolist())
+            data.qacc[:] = self._turned(q, a, inwards=True)
+            mujoco.mj_rnePostConstraint(model, data)
+
+    def _pose(self, body: int) -> Vector:
+        if body >= len(self._bodies):
+            return np.array(self._statics[body - len(self._bodies)])
+        place, data = self._bodies[body], self._data
+        return outwards(np.concatenate([data.xpos[place], data.xquat[place]]))
+
+    def _turned(self, q: Vector, rows: Vector, *, inwards: bool = False) -> Vector:
+        """Turn bases' linear parts of rows from the world's axes to their own, or `inwards`."""
+        for x, y in self._bases:
+            turn = to_matrix(q[x + 3 : x + 7])
+            rows[..., y : y + 3] = rows[..., y : y + 3] @ (turn.T if inwards else turn)
+        return rows

@@ -1,0 +1,65 @@
+"""Servos, imposed velocities, and velocity limits, which MuJoCo does not have.
+
+A step is repeated with other torques until the velocities at its end are the wanted ones.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from physx_core.simulation import Layout
+from physx_core.typing import Vector
+from physx_mujoco.robot import Running
+
+_MOST, _EXACT = 30, 1e-10
+"""Most repetitions of a step, and the relative error of a velocity that ends them."""
+
+
+class Drives:
+    """The joints whose velocities are controlled or limited; `idle` if there are none."""
+
+    def __init__(self, layout: Layout, running: Running) -> None:
+        self._running, modes = running, np.array(layout.modes)
+        self._driven = modes != "force"
+        self._places = np.array(list(layout.velocity_index.values()), np.intp)
+        self._fastest = np.where(self._driven, np.inf, layout.max_velocity)
+        self._strongest = np.where(modes == "velocity", np.inf, layout.max_torque)
+        self.idle = not (self._driven.any() or np.isfinite(self._fastest).any())
+
+    def step(self) -> None:
+        """Simulate a physics step; the forces of driven joints are their wanted velocities."""
+        running, at, driven = self._running, self._places, self._driven
+        model, data = running.model, running.data
+        q, v = running.positions, running.velocities
+        q[:], v[:], warm = data.qpos, data.qvel, data.qacc_warmstart.copy()
+        wanted, torques, inverse = data.qfrc_applied[at].copy(), np.zeros(len(at)), None
+        for _ in range(_MOST):
+            data.qfrc_applied[at] = np.where(driven, 0.0, wanted) + torques
+            data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = q, v, warm
+            mujoco.mj_step(model, data)
+            now = data.qvel[at]
+            side = -np.copysign(1.0, np.where(torques, torques, -now))  # of a limit
+            active = driven | (side * now > self._fastest) | (torques != 0)
+            goal = np.where(driven, wanted, np.where(active, side * self._fastest, now))
+            low = np.where(driven, -self._strongest, np.where(side > 0, -np.inf, 0.0))
+            high = np.where(driven, self._strongest, np.where(side > 0, 0.0, np.inf))
+            error = goal - now
+            stuck = ((torques <= low) & (error < 0)) | ((torques >= high) & (error > 0))
+            free = np.flatnonzero(active & ~stuck)
+            if not (np.abs(error[free]) > _EXACT * (1 + np.abs(now[free]))).any():
+                break
+            inverse = self._inverse() if inverse is None else inverse
+            more = np.linalg.solve(inverse[np.ix_(free, free)], error[free] / model.opt.timestep)
+            torques[free] = np.clip(torques[free] + more, low[free], high[free])
+        data.qfrc_applied[at] = wanted
+
+    def _inverse(self) -> Vector:
+        """Return the inverse of the mass matrix with implicit damping, shape (joints, joints)."""
+        model, period = self._running.model, self._running.model.opt.timestep
+        mass = np.diag(period * model.dof_damping)
+        mass += np.diag(period**2 * model.jnt_stiffness[model.dof_jntid])
+        plain = np.zeros_like(mass)
+        mujoco.mj_fullM(model, self._running.data, plain)
+        found: Vector = np.linalg.inv(plain + mass)[np.ix_(self._places, self._places)]
+        return found

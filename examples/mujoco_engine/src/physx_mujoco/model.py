@@ -1,0 +1,203 @@
+"""MuJoCo's model of a world, built from what physx read of its files.
+
+MuJoCo's own URDF loader is not used: it merges links, rejects moments of inertia that no body of
+positive density has, and ignores what physx adds to a file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from physx_core.engines import (
+    CollisionShape,
+    Mover,
+    Parts,
+    RigidBody,
+    Static,
+    read_vertices,
+    rigid_bodies,
+)
+from physx_core.errors import ModelError
+from physx_core.rotations import to_matrix
+from physx_core.simulation import Ground, HeightField, Stairs
+from physx_core.typing import Vector
+
+_SHAPES = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "mesh": mujoco.mjtGeom.mjGEOM_MESH,
+}
+_ALL, _STATIC, _MOVING, _OWN = (1 << 31) - 1, 1, 2, 2
+"""Bits of MuJoCo's collision masks: static things, what moves, and from `_OWN` on each robot."""
+_STEPS, _DAMPING, _IMPEDANCE = 2.0, 2.0, (0.9999, 0.9999, 0.001, 0.5, 2.0)
+"""Time constant in steps, damping ratio, and impedance of constraints, which are almost rigid."""
+_DEEP = 10.0
+"""Depth of a height field below its lowest point, in m."""
+
+
+@dataclass(frozen=True)
+class WorldModel:
+    """A world in MuJoCo.
+
+    Attributes:
+        model: MuJoCo's model.
+        bodies: Its body of each link and object, in the order of `Layout.bodies`.
+        owners: Place in `Layout.names` of what each of its shapes belongs to.
+    """
+
+    model: Any
+    bodies: Vector
+    owners: Vector
+
+
+class ModelBuilder:
+    """Builds a `WorldModel` from the parts of a world."""
+
+    def __init__(self, parts: Parts) -> None:
+        self._parts, self._spec = parts, mujoco.MjSpec()
+        self._spec.compiler.degree = False
+        self._hard = {"solref": (_STEPS * parts.world.period, _DAMPING), "solimp": _IMPEDANCE}
+        self._moments: list[Vector] = []
+        self._owners: list[int] = []
+        shapes = [shape for mover in parts.movers for shape in mover.model.shapes]
+        frictions = {float(x.friction) for x in (*shapes, *(each.what for each in parts.statics))}
+        # Of two shapes MuJoCo takes the friction of the one with the higher priority.
+        self._priorities = {mu: i for i, mu in enumerate(sorted(frictions, reverse=True))}
+
+    def build(self) -> WorldModel:
+        """Return the model, with MuJoCo's default options."""
+        for place, mover in enumerate(self._parts.movers):
+            self._add_mover(place, mover)
+        count = len(self._moments)
+        if self._parts.world.contacts != "none":
+            for place, static in enumerate(self._parts.statics):
+                self._add_static(static, count + place)
+        try:
+            model = self._spec.compile()
+        except ValueError as error:
+            raise ModelError(f"MuJoCo cannot load this world: {error}.") from error
+        bodies = np.array([model.body(str(place)).id for place in range(count)], np.intp)
+        owners = np.array([self._owners[int(model.geom(i).name)] for i in range(model.ngeom)])
+        model.body_inertia[bodies] = self._moments
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        return WorldModel(model, bodies, owners)
+
+    # Robots and objects ---------------------------------------------------------------------
+
+    def _add_mover(self, place: int, mover: Mover) -> None:
+        first, added = len(self._moments), []
+        for body in rigid_bodies(mover.model):
+            if body.parent < 0:
+                turn = to_matrix(mover.orientation)
+                new = self._add_body(self._spec.worldbody, body, np.array(mover.position), turn)
+                if not mover.fixed_base:
+                    new.add_freejoint()
+            else:
+                pose, parent = body.pose, added[body.parent]
+                new = self._add_body(parent, body, pose[:3, 3], pose[:3, :3])
+            if body.joint is not None:
+                self._add_joint(new, body)
+                if body.parent == 0 and mover.fixed_base:  # MuJoCo lets it touch such a parent
+                    self._spec.add_exclude(bodyname1=new.parent.name, bodyname2=new.name)
+            added.append(new)
+        masks = self._masks(place, mover)
+        for shape in mover.model.shapes:
+            link = 0 if mover.is_object else mover.model.links.index(shape.body)
+            self._add_shape(added[link], shape, first + link, **masks)
+
+    def _add_body(self, parent: Any, body: RigidBody, position: Vector, turn: Vector) -> Any:
+        """Add a link with its mass; its moments of inertia, whatever they are, are set later."""
+        new = parent.add_body(name=str(len(self._moments)), pos=position, quat=_quaternion(turn))
+        moments, axes = np.linalg.eigh(body.inertia)
+        axes[:, 2] *= np.linalg.det(axes)  # a rotation, not a reflection
+        new.explicitinertial, new.mass, new.inertia = True, body.mass, (1.0, 1.0, 1.0)
+        new.ipos, new.iquat = body.center, _quaternion(axes)
+        self._moments.append(moments)
+        return new
+
+    def _add_joint(self, new: Any, body: RigidBody) -> None:
+        joint, kind = body.joint, mujoco.mjtJoint
+        extra = joint.settings
+        added = new.add_joint(axis=body.axis, frictionloss=joint.friction, armature=extra.armature)
+        added.type = kind.mjJNT_SLIDE if joint.unit == "m" else kind.mjJNT_HINGE
+        added.damping, added.springref = (joint.damping, 0.0, 0.0), extra.rest
+        added.stiffness = (extra.stiffness, 0.0, 0.0)
+        if np.isfinite(joint.upper) and extra.mode != "velocity":
+            added.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+            added.range = joint.lower, joint.upper
+        for option, value in self._hard.items():
+            setattr(added, f"{option}_limit", value)
+            setattr(added, f"{option}_friction", value)
+
+    def _masks(self, place: int, mover: Mover) -> dict[str, int]:
+        if self._parts.world.contacts == "static":
+            return {"contype": 0, "conaffinity": _STATIC}
+        if mover.is_object or mover.self_collisions:
+            return {"contype": _MOVING, "conaffinity": _ALL}
+        if place + _OWN > 30:
+            raise ModelError("MuJoCo has room for 29 robots. Use contacts='static' or 'none'.")
+        own = 1 << place + _OWN
+        return {"contype": own, "conaffinity": _ALL & ~own}
+
+    # Shapes ---------------------------------------------------------------------------------
+
+    def _add_static(self, static: Static, owner: int) -> None:
+        what, world = static.what, self._spec.worldbody
+        more: dict[str, Any] = {"contype": _STATIC | _MOVING, "conaffinity": 0}
+        if isinstance(what, CollisionShape):
+            turn = _quaternion(to_matrix(static.orientation))
+            frame = world.add_frame(pos=static.position, quat=turn)
+            self._add_shape(world, what, owner, **more).set_frame(frame)
+        elif isinstance(what, HeightField):
+            self._add_heights(what, owner, **more)
+        else:
+            plane = what if isinstance(what, Ground) else Ground()
+            quat, normal = np.zeros(4), np.array(plane.normal)
+            mujoco.mju_quatZ2Vec(quat, normal)
+            pose = {"size": (0.0, 0.0, 1.0), "pos": plane.height * normal, "quat": quat}
+            kind = mujoco.mjtGeom.mjGEOM_PLANE
+            self._add_geom(world, kind, owner, what.friction, **pose, **more)
+            for center, size in what.boxes() if isinstance(what, Stairs) else ():
+                pose = {"size": 0.5 * np.array(size), "pos": center}
+                self._add_geom(world, _SHAPES["box"], owner, what.friction, **pose, **more)
+
+    def _add_heights(self, field: HeightField, owner: int, **more: Any) -> None:
+        (rows, columns), (x, y) = field.heights.T.shape, field.corner()
+        low, high = float(field.heights.min()), float(field.heights.max())
+        half = 0.5 * (np.array(field.heights.shape) - 1) * field.spacing
+        added = self._spec.add_hfield(name="ground", nrow=rows, ncol=columns)
+        added.size, added.userdata = (*half, max(high - low, 1e-9), _DEEP), field.heights.T.ravel()
+        more |= {"pos": (x + half[0], y + half[1], low), "hfieldname": "ground"}
+        kind = mujoco.mjtGeom.mjGEOM_HFIELD
+        self._add_geom(self._spec.worldbody, kind, owner, field.friction, **more)
+
+    def _add_shape(self, body: Any, shape: CollisionShape, owner: int, **more: Any) -> Any:
+        more |= {"pos": shape.position, "quat": _quaternion(shape.rotation)}
+        if shape.mesh is not None:
+            more["meshname"] = f"mesh {len(self._owners)}"
+            vertices = read_vertices(shape.mesh, shape.size)
+            self._spec.add_mesh(name=more["meshname"], uservert=vertices.ravel())
+        else:  # MuJoCo takes half the edges and lengths, but radii
+            halves = 0.5 * np.array(shape.size)
+            halves[0] *= 1 if shape.kind == "box" else 2
+            more["size"] = [*halves, 0.0, 0.0][:3]
+        return self._add_geom(body, _SHAPES[shape.kind], owner, shape.friction, **more)
+
+    def _add_geom(self, body: Any, kind: Any, owner: int, friction: float, **more: Any) -> Any:
+        more |= {"name": str(len(self._owners)), "friction": (float(friction), 0.0, 0.0)}
+        self._owners.append(owner)
+        priority = self._priorities[float(friction)]
+        return body.add_geom(type=kind, condim=3, priority=priority, **self._hard, **more)
+
+
+def _quaternion(rotation: Vector) -> Vector:
+    """Return the quaternion w, x, y, z of a rotation matrix."""
+    found = np.zeros(4)
+    mujoco.mju_mat2Quat(found, rotation.ravel())
+    return found

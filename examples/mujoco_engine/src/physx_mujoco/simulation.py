@@ -1,0 +1,145 @@
+"""The engine MuJoCo: contacts, limits and friction are constraints of its solver.
+
+Steps are semi-implicit Euler, with damping and springs implicit (MuJoCo's integrator `discrete`).
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+
+from physx_core.engines import (
+    RK4_LACKS,
+    Algorithms,
+    Parts,
+    RobotBackend,
+    RobotSimulation,
+    check_rk4,
+    layout_of,
+    read_parts,
+)
+from physx_core.errors import FeatureNotSupportedError, SimulationError, UnknownOptionError
+from physx_core.simulation import CONTACT, FEATURES, Simulation, World
+from physx_core.typing import Records
+from physx_mujoco.algorithms import MujocoAlgorithms
+from physx_mujoco.drives import Drives
+from physx_mujoco.model import ModelBuilder, WorldModel
+from physx_mujoco.robot import MujocoRobot, Running
+
+_SOLVERS = {
+    "newton": mujoco.mjtSolver.mjSOL_NEWTON,
+    "cg": mujoco.mjtSolver.mjSOL_CG,
+    "pgs": mujoco.mjtSolver.mjSOL_PGS,
+}
+_INTEGRATORS = {
+    "euler": mujoco.mjtIntegrator.mjINT_DISCRETE,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+_FULL = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
+
+
+class MujocoBackend(RobotBackend):
+    """MuJoCo. Contact solvers: ``newton`` (default), ``cg`` and ``pgs``; one detector.
+
+    Meshes collide as their convex hulls. Nothing bounces. MuJoCo's log, a file in the working
+    directory, is switched off in this process: what it warns of is an error here.
+    """
+
+    def build(self, world: World, seed: int | None = None) -> Simulation:
+        """Build a simulation; MuJoCo is deterministic, so the seed has no effect.
+
+        Raises:
+            ModelError: If a robot or mesh cannot be loaded; the message says why.
+            FeatureNotSupportedError: If the world needs a feature that MuJoCo does not have.
+            UnknownOptionError: If there is no solver of that name.
+        """
+        return MujocoSimulation(world)
+
+
+class MujocoSimulation(RobotSimulation[MujocoRobot]):
+    """A world of MuJoCo."""
+
+    engine = "mujoco"
+    lacks: ClassVar[frozenset[str]] = frozenset({"derivatives", "raycast", "restitution"})
+
+    def __init__(self, world: World) -> None:
+        """Build the world; errors are those of the backend's `build`."""
+        if world.solver is not None and world.solver not in _SOLVERS:
+            raise UnknownOptionError("World.solver for mujoco", [world.solver], tuple(_SOLVERS))
+        parts = read_parts(world)
+        self._check_features(parts)
+        log = mujoco.MjLogConfig.get()
+        log.logto_file = log.logto_console = False
+        log.set()
+        self._world: WorldModel = ModelBuilder(parts).build()
+        model = self._world.model
+        _set_options(model, world)
+        data = mujoco.MjData(model)
+        self._running = Running(model, data, data.qpos.copy(), data.qvel.copy())
+        layout = layout_of(parts)
+        robots = [
+            MujocoRobot(mover, part, self._world.bodies[part.bodies], self._running)
+            for mover, part in zip(parts.movers, layout.parts.values(), strict=True)
+        ]
+        self._drives = Drives(layout, self._running)
+        super().__init__(parts, robots, () if world.integrator == "euler" else RK4_LACKS)
+
+    def _check_features(self, parts: Parts) -> None:
+        world, features = parts.world, frozenset(FEATURES) - self.lacks
+        if world.detector is not None:
+            raise FeatureNotSupportedError(self.engine, f"detector {world.detector}", features)
+        if world.integrator == "rk4":
+            check_rk4(parts, self.engine, features)
+        shapes = [shape for mover in parts.movers for shape in mover.model.shapes]
+        if any(shape.restitution for shape in shapes):
+            raise FeatureNotSupportedError(self.engine, "restitution", features)
+
+    def make_algorithms(self) -> Algorithms:
+        return MujocoAlgorithms(self.parts, self._world)
+
+    def advance(self, n: int) -> None:
+        running = self._running
+        data = running.data
+        if self._drives.idle:
+            if n > 1:
+                mujoco.mj_step(running.model, data, n - 1)
+            running.positions[:], running.velocities[:] = data.qpos, data.qvel
+            mujoco.mj_step(running.model, data)
+        else:
+            for _ in range(n):
+                self._drives.step()
+        if any(data.warning[kind].number for kind in _FULL):
+            raise SimulationError("MuJoCo's memory is too small for the contacts of this world.")
+
+    def forget(self) -> None:
+        self._running.data.qacc_warmstart[:] = 0.0
+
+    def read_contacts(self) -> Records:
+        model, data = self._running.model, self._running.data
+        found, force = np.zeros(data.ncon, CONTACT), np.zeros(6)
+        for number, (row, contact) in enumerate(zip(found, data.contact, strict=True)):
+            frame = contact.frame.reshape(3, 3)
+            mujoco.mj_contactForce(model, data, number, force)
+            first, second = self._world.owners[contact.geom].tolist()
+            sign = -1.0 if first < second else 1.0  # MuJoCo's force acts on the second one
+            row["body_a"], row["body_b"] = sorted((first, second))
+            row["point"], row["depth"] = contact.pos, -contact.dist
+            row["normal"], row["force"] = sign * frame[0], sign * (force[:3] @ frame)
+        return found
+
+    def close(self) -> None:
+        if not self._closed:
+            super().close()
+            del self._running, self._drives, self._world
+
+
+def _set_options(model: mujoco.MjModel, world: World) -> None:
+    option = model.opt
+    option.timestep, option.gravity[:] = world.period, world.gravity
+    option.integrator = _INTEGRATORS[world.integrator]
+    option.solver = _SOLVERS[world.solver or "newton"]
+    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0
+    option.iterations = world.iterations or option.iterations
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
