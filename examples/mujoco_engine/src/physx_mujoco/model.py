@@ -14,6 +14,7 @@ import numpy as np
 
 from physx_core.engines import (
     CollisionShape,
+    Joint,
     Mover,
     Parts,
     RigidBody,
@@ -24,7 +25,7 @@ from physx_core.engines import (
 from physx_core.errors import ModelError
 from physx_core.rotations import to_matrix
 from physx_core.simulation import Ground, HeightField, Stairs
-from physx_core.typing import Vector
+from physx_core.typing import Index, Vector
 
 _SHAPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
@@ -52,8 +53,8 @@ class WorldModel:
     """
 
     model: Any
-    bodies: Vector
-    owners: Vector
+    bodies: Index
+    owners: Index
 
 
 class ModelBuilder:
@@ -83,7 +84,9 @@ class ModelBuilder:
         except ValueError as error:
             raise ModelError(f"MuJoCo cannot load this world: {error}.") from error
         bodies = np.array([model.body(str(place)).id for place in range(count)], np.intp)
-        owners = np.array([self._owners[int(model.geom(i).name)] for i in range(model.ngeom)])
+        owners = np.array(
+            [self._owners[int(model.geom(i).name)] for i in range(model.ngeom)], np.intp
+        )
         model.body_inertia[bodies] = self._moments
         mujoco.mj_setConst(model, mujoco.MjData(model))
         return WorldModel(model, bodies, owners)
@@ -91,7 +94,8 @@ class ModelBuilder:
     # Robots and objects ---------------------------------------------------------------------
 
     def _add_mover(self, place: int, mover: Mover) -> None:
-        first, added = len(self._moments), []
+        added: list[Any] = []
+        first = len(self._moments)
         for body in rigid_bodies(mover.model):
             if body.parent < 0:
                 turn = to_matrix(mover.orientation)
@@ -102,7 +106,7 @@ class ModelBuilder:
                 pose, parent = body.pose, added[body.parent]
                 new = self._add_body(parent, body, pose[:3, 3], pose[:3, :3])
             if body.joint is not None:
-                self._add_joint(new, body)
+                self._add_joint(new, body.joint, body.axis)
                 if body.parent == 0 and mover.fixed_base:  # MuJoCo lets it touch such a parent
                     self._spec.add_exclude(bodyname1=new.parent.name, bodyname2=new.name)
             added.append(new)
@@ -121,10 +125,9 @@ class ModelBuilder:
         self._moments.append(moments)
         return new
 
-    def _add_joint(self, new: Any, body: RigidBody) -> None:
-        joint, kind = body.joint, mujoco.mjtJoint
-        extra = joint.settings
-        added = new.add_joint(axis=body.axis, frictionloss=joint.friction, armature=extra.armature)
+    def _add_joint(self, new: Any, joint: Joint, axis: Vector) -> None:
+        extra, kind = joint.settings, mujoco.mjtJoint
+        added = new.add_joint(axis=axis, frictionloss=joint.friction, armature=extra.armature)
         added.type = kind.mjJNT_SLIDE if joint.unit == "m" else kind.mjJNT_HINGE
         added.damping, added.springref = (joint.damping, 0.0, 0.0), extra.rest
         added.stiffness = (extra.stiffness, 0.0, 0.0)

@@ -11,7 +11,7 @@ import numpy as np
 from physx_core.engines import Mover, RobotEngine, twist_change
 from physx_core.rotations import rotate, rotate_back
 from physx_core.simulation import Part
-from physx_core.typing import Vector
+from physx_core.typing import Index, Vector
 
 INWARDS = [0, 1, 2, 6, 3, 4, 5]
 """Order of a floating base's positions in MuJoCo, whose quaternions are w, x, y, z."""
@@ -38,7 +38,7 @@ class Running:
 class MujocoRobot(RobotEngine):
     """The part of a world's state that belongs to a robot or object, as views."""
 
-    def __init__(self, mover: Mover, part: Part, bodies: Vector, running: Running) -> None:
+    def __init__(self, mover: Mover, part: Part, bodies: Index, running: Running) -> None:
         super().__init__(mover)
         self._running, self._bodies = running, bodies
         self._q, self._v = running.data.qpos[part.positions], running.data.qvel[part.velocities]
@@ -50,13 +50,13 @@ class MujocoRobot(RobotEngine):
         self._torques[:] = commands
 
     def positions(self) -> Vector:
-        q = self._q.copy()
+        q: Vector = self._q.copy()
         if self.base:
             q[:7] = outwards(q[:7])
         return q
 
     def velocities(self) -> Vector:
-        v = self._v.copy()
+        v: Vector = self._v.copy()
         if self.base:
             v[:3] = rotate_back(self.positions()[3:7].tolist(), *v[:3].tolist())
         return v

@@ -33,10 +33,6 @@ _SOLVERS = {
     "cg": mujoco.mjtSolver.mjSOL_CG,
     "pgs": mujoco.mjtSolver.mjSOL_PGS,
 }
-_INTEGRATORS = {
-    "euler": mujoco.mjtIntegrator.mjINT_DISCRETE,
-    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
-}
 _FULL = (mujoco.mjtWarning.mjWARN_CONTACTFULL, mujoco.mjtWarning.mjWARN_CNSTRFULL)
 
 
@@ -138,7 +134,8 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
 def _set_options(model: mujoco.MjModel, world: World) -> None:
     option = model.opt
     option.timestep, option.gravity[:] = world.period, world.gravity
-    option.integrator = _INTEGRATORS[world.integrator]
+    kinds = mujoco.mjtIntegrator
+    option.integrator = kinds.mjINT_RK4 if world.integrator == "rk4" else kinds.mjINT_DISCRETE
     option.solver = _SOLVERS[world.solver or "newton"]
     option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0
     option.iterations = world.iterations or option.iterations
