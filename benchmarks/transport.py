@@ -308,6 +308,29 @@ def generation_working(root: Path, milliseconds: float, target: float) -> bool:
     return claim("ratio", float(np.median(alone / with_samples)), at_least=target)
 
 
+def generation_by_clients(root: Path) -> bool:
+    """Compare large samples that pass through the server with those that clients write themselves.
+
+    On one machine both end on the same disk; what the server spends on a sample is what bounds how
+    many clients it can have.
+    """
+    values, rows = 60_000, 480
+
+    def of(writers: str) -> Work:
+        dataset = DatasetConfig(writers=writers, max_file_size=0.05)
+        return lambda: generation(root, Rows, {"values": values}, rows, 48, 2, dataset)
+
+    candidates = {"through the server": of("server"), "written by clients": of("clients")}
+    print("Generation of 480 kB samples with 2 clients, to one disk")
+    for name, each in rates(candidates, FEWER).items():
+        median = statistics.median(each)
+        print(f"  {name:28} {median:12,.0f} samples/s {8e-6 * values * median:10,.0f} MB/s")
+    print("Processor time of the server for each of them")
+    measured = rates(candidates, FEWER, time.process_time)
+    ratio = times_as_long(measured, "written by clients", "through the server")
+    return claim("the server's time for a sample, written by clients", ratio, at_most=0.5)
+
+
 def generation_sleeping(root: Path) -> bool:
     """Compare 8 clients whose steps sleep with one."""
     rows = 80
@@ -373,6 +396,7 @@ def main() -> None:
         met.append(predictions_in_process(root))
         met.append(generation_small(root))
         met.append(generation_large(root))
+        met.append(generation_by_clients(root))
         met.append(generation_working(root, 0.5, 0.9))
         met.append(generation_working(root, 5, 0.98))
         met.append(generation_sleeping(root))

@@ -173,6 +173,7 @@ def test_a_client_that_was_killed_continues_its_partitions(step, nothing_stays_b
     assert_same(rows(folder), wanted)
 
 
+@pytest.mark.faults
 def test_clients_that_are_killed_at_any_moments(nothing_stays_behind, process_ids):
     wanted = rows(generate("server", "server", batches=30))
     chance, ended = random.Random(5), threading.Event()

@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 from physx_core import files
 from physx_core.dataset.repair.aside import FOLDER, keep, set_aside
@@ -18,6 +20,7 @@ from physx_core.dataset.store.partition.format import (
     FORMAT,
     MAGIC,
     SIGNATURE,
+    Identity,
     Inspection,
     inspect,
     open_partition,
@@ -323,6 +326,7 @@ def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
         if path.name == identity.file_name:
             key = identity.mode, identity.session, identity.index
             groups.setdefault(key, {})[identity.field.name] = found
+    before = _stripes_before(groups)
     for (mode_name, session, index), group in sorted(groups.items(), key=_order):
         identity = next(iter(group.values())).identity
         if not identity.stripe and not all(found.rows for found in group.values()):
@@ -333,13 +337,41 @@ def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
             continue  # a part of what was being removed, or not part of this dataset
         mode = manifest.modes.setdefault(mode_name, Mode(fields))
         mode.partitions.append(
-            Partition(mode_name, session, index, identity.first_row, stripe=identity.stripe)
+            Partition(
+                mode_name,
+                session,
+                index,
+                identity.first_row,
+                stripe=identity.stripe,
+                follows=before.get(_place(identity)) if identity.stripe else None,
+            )
         )
         mode.fields |= {
             name: field
             for name, field in fields.items()
             if name not in mode.fields or mode.fields[name].shape is None
         }
+
+
+def _stripes_before(
+    groups: Mapping[tuple[str, str, int], Group],
+) -> dict[tuple[Any, ...], tuple[int, int]]:
+    """Return which partition of stripes comes before which place, and how many rows fit into it.
+
+    Only the files of one that was not filled have space for more rows than it has.
+    """
+    found = {}
+    for group in groups.values():
+        capacity = max(inspection.capacity for inspection in group.values())
+        identity = next(iter(group.values())).identity
+        if identity.stripe is not None:
+            last = identity.first_row + capacity * identity.stripe.of
+            found[_place(replace(identity, first_row=last))] = identity.index, capacity
+    return found
+
+
+def _place(identity: Identity) -> tuple[Any, ...]:
+    return identity.mode, identity.session, identity.stripe, identity.first_row
 
 
 def _fits(mode: Mode, fields: Mapping[str, Field]) -> bool:

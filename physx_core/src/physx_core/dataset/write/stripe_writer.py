@@ -30,6 +30,7 @@ class StripeWriter(Closeable):
     Attributes:
         rows: How many rows the stripe has, in all its partitions.
         fields: The fields of the rows.
+        capacity: How many rows fit into a partition.
     """
 
     def __init__(self, directory: Path, fields: Sequence[Field], capacity: int) -> None:
@@ -42,7 +43,7 @@ class StripeWriter(Closeable):
         """
         self.rows = 0
         self.fields = list(fields)
-        self._directory, self._capacity = directory, capacity
+        self.capacity, self._directory = capacity, directory
         self._fields = {field.name: field for field in fields}
         self._entries: dict[int, Partition] = {}
         self._opened: OpenPartition | None = None
@@ -60,16 +61,16 @@ class StripeWriter(Closeable):
         The rows of its partitions that are not sealed are compared with their digests.
 
         Args:
-            told: How many rows it is said to have.
+            told: How many rows it is said to have; it may have more, or have lost some.
 
         Returns:
-            How many rows it has. The others have to be written again.
+            How many rows it has.
         """
         self.rows = told
         with files.storing("The rows of an earlier process"):
             for number, entry in sorted(self._entries.items()):
-                begin = number * self._capacity
-                rows = min(max(0, told - begin), self._capacity, self._count(entry))
+                begin = number * self.capacity
+                rows = self._count(entry)
                 self.rows = begin + rows
                 self._opened = self._open(number, rows)
                 if self._opened.free:
@@ -80,7 +81,7 @@ class StripeWriter(Closeable):
     @property
     def room(self) -> int:
         """How many rows more fit into the partitions that are known."""
-        known = (max(self._entries) + 1) * self._capacity if self._entries else 0
+        known = (max(self._entries) + 1) * self.capacity if self._entries else 0
         return max(0, known - self.rows)
 
     def append(self, rows: Batch, count: int) -> None:
@@ -94,7 +95,7 @@ class StripeWriter(Closeable):
             self._syncer.check()
             while done < count:
                 if self._opened is None:
-                    self._opened = self._open(self.rows // self._capacity, 0)
+                    self._opened = self._open(self.rows // self.capacity, 0)
                 part = min(self._opened.free, count - done)
                 self._opened.append(rows, done, part)
                 done, self.rows = done + part, self.rows + part
@@ -121,8 +122,8 @@ class StripeWriter(Closeable):
             rows: How many rows the stripe keeps. Those of earlier partitions stay in any case.
         """
         if self._opened is not None:
-            number = (self.rows - self._opened.partition.rows) // self._capacity
-            keep = min(max(0, rows - number * self._capacity), self._opened.partition.rows)
+            number = (self.rows - self._opened.partition.rows) // self.capacity
+            keep = min(max(0, rows - number * self.capacity), self._opened.partition.rows)
             if keep:
                 self._retire(keep)
         return self.take_sealed(wait=True)
@@ -157,7 +158,7 @@ class StripeWriter(Closeable):
             for part in parts.values():
                 part.close()
             raise
-        return OpenPartition(entry, self._capacity, parts, self._syncer)
+        return OpenPartition(entry, self.capacity, parts, self._syncer)
 
     def _retire(self, rows: int | None = None) -> None:
         """Close the open partition, and have it sealed in the background."""
@@ -165,7 +166,7 @@ class StripeWriter(Closeable):
         if opened is None:
             return
         self._opened, entry = None, opened.partition
-        number = (self.rows - entry.rows) // self._capacity
+        number = (self.rows - entry.rows) // self.capacity
         opened.close()
         entry = replace(entry, rows=entry.rows if rows is None else rows)
         work = self._sealer.submit(seal, self._directory, self._fields, entry)

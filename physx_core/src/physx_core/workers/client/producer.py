@@ -61,7 +61,7 @@ class Producer:
         self._sent_at = 0.0
 
     def open(self) -> None:
-        """Begin to write: rows that the server has, but not the sink, are put there once more."""
+        """Begin with the rows that are where they go: these are generated again, but not put."""
         self._skip = self._sink.open(self._skip)
 
     def run(self) -> None:
@@ -100,6 +100,8 @@ class Producer:
             if count:
                 self._sink.put(rows, count, buffer.fields)
             self.made += count
+        if self._announced:
+            self._sink.tell()
         self._sent_at = time.monotonic()
         if self.failure is not None:
             raise RunEnded

@@ -40,6 +40,9 @@ class RowSink(Protocol):
     def put(self, rows: Batch, count: int, fields: list[Field]) -> None:
         """Take a block of rows, in their order."""
 
+    def tell(self) -> None:
+        """Tell the server of rows that it does not know of, if there are any."""
+
     def take(self, frame: Frame) -> bool:
         """Handle a message that is meant for it; return whether it was."""
 
@@ -62,6 +65,9 @@ class SentRows:
     def put(self, rows: Batch, count: int, fields: list[Field]) -> None:
         """Send a block of rows."""
         self._link.send_parts(pack_rows(rows, count))
+
+    def tell(self) -> None:
+        """Do nothing: the server has all rows."""
 
     def take(self, frame: Frame) -> bool:
         """No message is meant for it."""
@@ -115,9 +121,15 @@ class StripedRows:
             try:
                 writer.append({name: rows[name][done : done + part] for name in rows}, part)
             finally:
-                self._tell()
+                self.tell()
             done += part
-        self._report_sealed()
+            self._send_sealed(writer, writer.take_sealed())
+
+    def tell(self) -> None:
+        """Tell the server how many rows there are, if it does not know."""
+        if self._writer is not None and self._writer.rows > self._told:
+            self._told = self._writer.rows
+            self._link.send(pack(Kind.WRITTEN, number=self._told))
 
     def take(self, frame: Frame) -> bool:
         """Handle a message about partitions; return whether it was one."""
@@ -126,7 +138,7 @@ class StripedRows:
         elif frame.kind is Kind.SEAL:
             self.ended = True
             if self._writer is not None:
-                self._send_sealed(self._writer.finish(frame.number))
+                self._send_sealed(self._writer, self._writer.finish(frame.number))
         return frame.kind in (Kind.PARTITION, Kind.SEAL)
 
     def close(self) -> None:
@@ -177,23 +189,16 @@ class StripedRows:
         if self.ended:
             raise RunEnded
 
-    def _tell(self) -> None:
-        if self._writer is not None and self._writer.rows > self._told:
-            self._told = self._writer.rows
-            self._link.send(pack(Kind.WRITTEN, number=self._told))
-
-    def _report_sealed(self) -> None:
-        if self._writer is not None:
-            self._send_sealed(self._writer.take_sealed())
-
-    def _send_sealed(self, sealed: list[tuple[int, Partition]]) -> None:
+    def _send_sealed(self, writer: StripeWriter, sealed: list[tuple[int, Partition]]) -> None:
         for number, partition in sealed:
+            if number * writer.capacity + partition.rows > self._told:
+                continue  # the server, which does not know of all these rows, seals it
             plain = {
                 "rows": partition.rows,
                 "checksums": partition.checksums,
                 "statistics": {
                     field.name: _plain_statistics(partition.running[field.name])
-                    for field in (self._writer.fields if self._writer else ())
+                    for field in writer.fields
                     if has_statistics(field)
                 },
             }

@@ -1,0 +1,510 @@
+"""Stripes: rows that several processes write in turn, in random histories against lists in memory.
+
+Every row has a number of its own, from which its values are made. The writers are in this process:
+one that is killed has its files closed, and nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import tempfile
+import warnings
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+
+from physx_core import Dataset, Field
+from physx_core.dataset.read import reader as reading
+from physx_core.dataset.read.strategies import disk, prefetch, windows
+from physx_core.dataset.store import locks, manifest_file
+from physx_core.dataset.store.partition import commits
+from physx_core.dataset.store.partition import format as partition_format
+from physx_core.dataset.store.partition.format import inspect
+from physx_core.dataset.store.partition.spans import FlatIndex, Span
+from physx_core.dataset.write.stripe_writer import StripeWriter
+from physx_core.errors import DatasetError
+
+FIELDS = [Field("n", (), "int64"), Field("x", (3,), unit="m"), Field("f", (), "bool")]
+QUICK = settings(database=None, deadline=None, max_examples=4, stateful_step_count=30)
+LONG = settings(QUICK, max_examples=15, stateful_step_count=50)
+
+
+@pytest.fixture(autouse=True)
+def little_at_a_time(monkeypatch):
+    """A few rows fill blocks and windows, and a few partitions all files that may be open."""
+    monkeypatch.setattr(reading, "rows_per_block", lambda nbytes: max(1, 200 // max(1, nbytes)))
+    monkeypatch.setattr(disk, "_OPEN_FILES", 3)
+    monkeypatch.setattr(prefetch, "_AHEAD", 200)
+    monkeypatch.setattr(windows, "_BLOCK", 200)
+    monkeypatch.setattr(windows, "_WINDOW_BLOCKS", 3)
+    for name in ("fsync", "fdatasync"):
+        monkeypatch.setattr(os, name, lambda descriptor: None)
+
+
+def values(numbers):
+    numbers = np.asarray(numbers, np.int64)
+    x = numbers[:, None] + np.array([0.0, 0.25, 0.5])
+    return {"n": numbers, "x": x, "f": numbers % 3 == 0}
+
+
+def size(capacity):
+    """`max_file_size` of partitions of so many rows."""
+    return (2**14 + 24 * capacity + 0.5) * 1e-9
+
+
+def interleaved(parts):
+    """The rows of partitions that take turns, up to the first that is missing."""
+    found = []
+    for place in range(max(map(len, parts), default=0)):
+        for part in parts:
+            if place >= len(part):
+                return found
+            found.append(part[place])
+    return found
+
+
+def check(dataset, numbers):
+    """All ways to read give these rows."""
+    assert dataset.num_samples("training") == len(numbers)
+    if not numbers:
+        return
+    wanted, view = values(numbers), dataset["training"]
+    for name, rows in wanted.items():
+        np.testing.assert_array_equal(view[name][:], rows)
+    order = np.random.default_rng(len(numbers)).permutation(len(numbers))
+    np.testing.assert_array_equal(view["x"][order], wanted["x"][order])
+    np.testing.assert_array_equal(view["n"][1::3], wanted["n"][1::3])
+    middle = slice(len(numbers) // 3, len(numbers) // 3 * 2 + 1)
+    np.testing.assert_array_equal(view["x"][middle], wanted["x"][middle])
+    for strategy in ("memory", "disk exact", "disk windowed"):
+        for shuffle in (False, True):
+            options = {"shuffle": shuffle, "seed": 0, "strategy": strategy}
+            batches = [
+                {name: rows.copy() for name, rows in batch.items()}
+                for batch in dataset.batches("training", 4, **options)
+            ]
+            found = np.concatenate([batch["n"] for batch in batches])
+            assert sorted(found) == sorted(numbers) and (shuffle or list(found) == numbers)
+            x = np.concatenate([batch["x"] for batch in batches])
+            np.testing.assert_array_equal(x, values(found)["x"])
+    mean = dataset.normalization["x"].mean
+    np.testing.assert_allclose(mean, wanted["x"].mean(axis=0), rtol=1e-12)
+    assert dataset.verify() == []
+
+
+class Machine(RuleBasedStateMachine):
+    """One dataset, whose rows come from its own writer and from runs of several others."""
+
+    def __init__(self):
+        super().__init__()
+        self.root = Path(tempfile.mkdtemp(dir=Path.cwd()))
+        self.folder, self.copies = self.root / "data", 0
+        self.groups = []  # of partitions, as lists of numbers, by the partition's index
+        self.dataset, self.stripes, self.writers, self.made = None, None, [], []
+        self.next_number = self.committed = 0
+
+    def teardown(self):
+        for writer in self.writers:
+            writer.close()
+        if self.dataset is not None:
+            self.dataset.close()
+        shutil.rmtree(self.root)
+
+    @property
+    def numbers(self):
+        """The rows that were there before the run."""
+        return [n for group in self.groups for n in interleaved(list(group.values()))]
+
+    @property
+    def run_rows(self):
+        """The rows of the run that are in its files, up to the first that is missing."""
+        count = len(self.made)
+        total = min(made * count + place for place, made in enumerate(self.made))
+        return list(range(self.first, self.first + total))
+
+    idle = precondition(lambda self: self.stripes is None)
+    running = precondition(lambda self: self.stripes is not None)
+
+    def opened(self, capacity):
+        if self.folder.exists():
+            return Dataset.open(self.folder, writable=True, max_file_size=size(capacity))
+        return Dataset.create(self.folder, max_file_size=size(capacity))
+
+    # Between runs -----------------------------------------------------------------------------
+
+    @idle
+    @rule(capacity=st.integers(1, 4), count=st.integers(1, 9))
+    def append(self, capacity, count):
+        numbers = list(range(self.next_number, self.next_number + count))
+        self.next_number += count
+        with self.opened(capacity) as dataset:
+            dataset.define_fields("training", FIELDS)
+            dataset.append("training", values(numbers))
+        plain = self.listed()[-math.ceil(count / capacity) :]
+        for place, entry in enumerate(plain):
+            self.groups.append({entry["index"]: numbers[place * capacity :][:capacity]})
+
+    @idle
+    @precondition(lambda self: self.groups)
+    @rule(which=st.integers(0, 50))
+    def remove_partition(self, which):
+        listed = [(group, index) for group in self.groups for index in group]
+        group, index = listed[which % len(listed)]
+        with self.opened(3) as dataset:
+            assert dataset.remove_partition("training", index) == len(group.pop(index))
+        self.groups = [group for group in self.groups if group]
+
+    @idle
+    @precondition(lambda self: self.numbers)
+    @rule(which=st.integers(0, 50), count=st.integers(1, 9))
+    def update(self, which, count):
+        index = sorted({(which + 7 * step) % len(self.numbers) for step in range(count)})
+        with self.opened(3) as dataset:
+            kept = {name: view[index] for name, view in dataset["training"].items()}
+            dataset.update("training", index, values(np.arange(-len(index), 0)))
+            np.testing.assert_array_equal(
+                dataset["training"]["n"][index], np.arange(-len(index), 0)
+            )
+            dataset.update("training", index, kept)
+
+    @idle
+    @precondition(lambda self: self.numbers)
+    @rule(capacity=st.integers(1, 4))
+    def merge(self, capacity):
+        """Into a dataset that has rows; which then is the dataset."""
+        other = self.root / f"merged-{self.next_number}"
+        first, self.next_number = self.next_number, self.next_number + 2
+        with Dataset.create(other, max_file_size=size(capacity)) as dataset:
+            dataset.define_fields("training", FIELDS)
+            dataset.append("training", values([first, first + 1]))
+            dataset.merge(self.folder)
+        shutil.rmtree(self.folder)
+        other.rename(self.folder)
+        own = math.ceil(2 / capacity)
+        indices = iter([entry["index"] for entry in self.listed()])
+        groups = [{next(indices): [first + k]} for k in range(2)] if own == 2 else []
+        groups = groups or [{next(indices): [first, first + 1]}]
+        self.groups = groups + [
+            {next(indices): part for part in group.values()} for group in self.groups
+        ]
+
+    @idle
+    @precondition(lambda self: self.numbers)
+    @rule()
+    def rebuild(self):
+        Dataset.rebuild(self.folder)
+
+    def listed(self):
+        return json.loads((self.folder / "dataset.json").read_text())["modes"]["training"][
+            "partitions"
+        ]
+
+    # Runs -------------------------------------------------------------------------------------
+
+    @idle
+    @rule(count=st.integers(1, 4), capacity=st.integers(1, 4))
+    def begin(self, count, capacity):
+        self.dataset = self.opened(capacity)
+        self.stripes = self.dataset.stripes("training", count)
+        self.stripes.define(FIELDS)
+        assert self.stripes.capacity == capacity
+        self.capacity, self.first = capacity, self.next_number
+        self.next_number += 100_000
+        self.made, self.indices, self.committed = [0] * count, [], 0
+        self.writers = [StripeWriter(self.folder, FIELDS, capacity) for _ in range(count)]
+
+    @running
+    @rule(place=st.integers(0, 3), count=st.integers(1, 9), tells=st.booleans())
+    def write(self, place, count, tells):
+        place %= len(self.made)
+        writer, made = self.writers[place], self.made[place]
+        while self.stripes.begun * self.capacity < made + count:
+            number = self.stripes.begun
+            self.stripes.begin()
+            entries = [self.stripes.entries(p)[number] for p in range(len(self.made))]
+            self.indices.append([entry.index for entry in entries])
+            for each, entry in zip(self.writers, entries, strict=True):
+                each.add(number, entry)
+        rows = [self.first + (made + k) * len(self.made) + place for k in range(count)]
+        writer.append(values(rows), count)
+        self.made[place] += count
+        assert writer.rows == self.made[place]
+        if tells:
+            self.stripes.note(place, writer.rows)
+            self.accept(place, writer.take_sealed(wait=True))
+
+    @running
+    @rule()
+    def commit(self):
+        self.committed = max(self.committed, self.stripes.whole)
+        self.stripes.commit(self.committed)
+
+    @running
+    @rule(place=st.integers(0, 3))
+    def kill_writer(self, place):
+        """Another one continues with the rows that are there, whether they were told or not."""
+        place %= len(self.made)
+        told = self.stripes._written[place]
+        abandon(self.writers[place])
+        writer = StripeWriter(self.folder, FIELDS, self.capacity)
+        for number, entry in self.stripes.entries(place).items():
+            writer.add(number, entry)
+        assert writer.resume(told) == self.made[place]
+        self.writers[place] = writer
+
+    @running
+    @rule(place=st.integers(0, 3))
+    def lose_rows_of_a_machine(self, place):
+        """Rows that were told, but not synced, are gone with a writer's machine."""
+        place %= len(self.made)
+        told = self.made[place]
+        self.stripes.note(place, told)
+        entries = self.stripes.entries(place)
+        number = (told - 1) // self.capacity
+        if not told or number not in entries:
+            return
+        abandon(self.writers[place])
+        path = self.folder / entries[number].file_name("x")
+        found = inspect(path)
+        if found.commits[0].base == found.commits[0].rows:
+            return  # it has been sealed: it is on the disk
+        with path.open("r+b") as file:
+            file.seek(found.data_offset)
+            file.write(bytes(found.rows * 24))
+        writer = StripeWriter(self.folder, FIELDS, self.capacity)
+        for each, entry in entries.items():
+            writer.add(each, entry)
+        have = writer.resume(told)
+        assert have <= told and (have == told or not have % self.capacity)
+        rows = [self.first + k * len(self.made) + place for k in range(have, told)]
+        if rows:
+            writer.append(values(rows), len(rows))
+        self.writers[place], self.made[place] = writer, told
+
+    @running
+    @rule(orderly=st.booleans())
+    def end(self, orderly):
+        for place, writer in enumerate(self.writers):
+            self.stripes.note(place, writer.rows)
+            self.accept(place, writer.take_sealed(wait=True))
+        rows = self.run_rows
+        for place, writer in enumerate(self.writers):
+            if orderly:
+                share = len(rows[place :: len(self.made)])
+                self.accept(place, writer.finish(share))
+            writer.close()
+        self.dataset.close()
+        self.keep(rows)
+        assert not (self.folder / "dataset.clients").exists()
+
+    @running
+    @rule()
+    def kill_all(self):
+        folder = self.copy()
+        for writer in self.writers:
+            abandon(writer)
+        self.dataset.close()
+        shutil.rmtree(self.folder)
+        folder.rename(self.folder)
+        rows = self.run_rows
+        with self.opened(2) as dataset:
+            check(dataset, self.numbers + rows)
+        self.keep(rows)
+
+    @running
+    @rule()
+    def look(self):
+        """Whoever opens the folder sees what is in the files; so do those who repair it."""
+        wanted = self.numbers + self.run_rows
+        with Dataset.open(self.folder) as dataset:
+            if "training" in dataset:
+                check(dataset, wanted)
+        folder = self.copy()
+        assert not [text for text in Dataset.repair(folder) if "damaged" in text]
+        with Dataset.open(folder) as dataset:
+            check(dataset, wanted)
+        folder = self.copy()
+        (folder / "dataset.json").unlink()
+        if list(folder.glob("*_training_*.h5")):
+            with Dataset.open(folder, writable=True) as dataset:
+                check(dataset, wanted)
+
+    @running
+    @rule(place=st.integers(0, 3), field=st.sampled_from(["n", "x", "f"]), torn=st.integers(1, 9))
+    def cut_power(self, place, field, torn):
+        """Rows that no sync has brought to the disk are lost; no gap and no other value shows."""
+        if not self.stripes.begun:
+            return
+        place %= len(self.made)
+        folder = self.copy()
+        number = self.stripes.begun - 1
+        index = self.indices[number][place]
+        path = next(folder.glob(f"*_training_{field}_{index}.h5"))
+        found = inspect(path)
+        size_of = found.identity.field.nbytes
+        lost = min(torn, found.rows)
+        if found.commits[0].base == found.commits[0].rows:
+            lost = 0  # sealed: everything is on the disk
+        content = bytearray(path.read_bytes())
+        begin = found.data_offset + (found.rows - lost) * size_of
+        end = found.data_offset + found.rows * size_of
+        content[begin:end] = bytes(b ^ 0x5A for b in content[begin:end])
+        path.write_bytes(content)
+        with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            for module in (commits, partition_format):
+                patch.setattr(module, "boot_id", lambda: "another")
+            with Dataset.open(folder) as dataset:
+                if "training" not in dataset:
+                    return
+                count = dataset.num_samples("training")
+                have = dataset["training"]["n"][:].tolist() if count else []
+            wanted = self.numbers + self.run_rows
+            assert have == wanted[:count] and count >= len(self.numbers)
+            with Dataset.open(folder, writable=True) as dataset:
+                assert dataset.num_samples("training") == count
+            with Dataset.open(folder) as dataset:
+                check(dataset, wanted[:count])
+
+    @invariant()
+    def reads(self):
+        if self.stripes is not None:
+            check(self.dataset, self.numbers + self.run_rows[: self.committed])
+        elif self.folder.exists():
+            with Dataset.open(self.folder) as dataset:
+                check(dataset, self.numbers)
+            entries = self.listed()
+            if self.numbers and "stripe" in str(entries):
+                with h5py.File(self.folder / f"{entries[-1]['session']}.h5") as virtual:
+                    found = virtual["training"]["n"][:].tolist()
+                assert found == self.numbers
+
+    # --------------------------------------------------------------------------------------------
+
+    def accept(self, place, sealed):
+        for number, entry in sealed:
+            running = {"x": entry.running["x"]}
+            assert self.stripes.accept(place, number, entry.rows, entry.checksums, running)
+
+    def keep(self, rows):
+        """Add what the run left to the model."""
+        count = len(self.made)
+        for number, indices in enumerate(self.indices):
+            here = rows[number * self.capacity * count :][: self.capacity * count]
+            parts = {index: here[place::count] for place, index in enumerate(indices)}
+            if here:
+                self.groups.append({index: part for index, part in parts.items() if part})
+        self.dataset = self.stripes = None
+        self.writers = []
+
+    def copy(self):
+        self.copies += 1
+        return Path(shutil.copytree(self.folder, self.root / f"copy-{self.copies}"))
+
+
+def abandon(writer):
+    """Have a writer end as if its process were killed."""
+    writer._sealer.shutdown()
+    opened, writer._opened = writer._opened, None
+    if opened is not None:
+        for file in opened.files.values():
+            file.close()
+    writer._digester.close()
+    writer._syncer._end.set()
+
+
+def test_random_histories():
+    run_state_machine_as_test(Machine, settings=QUICK)
+
+
+@pytest.mark.faults
+def test_many_random_histories():
+    run_state_machine_as_test(Machine, settings=LONG)
+
+
+# Details ----------------------------------------------------------------------------------------
+
+
+def test_the_flat_index_finds_what_the_spans_say():
+    spans = [
+        Span(0, 3),
+        Span(3, 3, 3, 0),
+        Span(4, 2, 3, 1),
+        Span(5, 2, 3, 2),
+        Span(10, 0),
+        Span(10, 2),
+    ]
+    index = FlatIndex(spans)
+    wanted = {
+        span.start + k * span.stride: (number, k)
+        for number, span in enumerate(spans)
+        for k in range(span.rows)
+    }
+    assert sorted(wanted) == list(range(12))
+    found = zip(*index.locate(np.arange(12)), strict=True)
+    assert {row: tuple(map(int, place)) for row, place in enumerate(found)} == wanted
+    assert {row: index.find(row)[:2] for row in range(12)} == wanted
+    for start in range(12):
+        for stop in range(start, 13):
+            rows = [None] * (stop - start)
+            for number, span in enumerate(spans):
+                first, count = span.inside(start, stop)
+                if count:
+                    rows[span.among(first, count, start)] = [
+                        (number, first + k) for k in range(count)
+                    ]
+            assert rows == [wanted[row] for row in range(start, stop)]
+
+
+def test_a_file_has_one_writer_at_a_time(folder, monkeypatch):
+    monkeypatch.setattr(locks, "_PATIENCE", 0.1)
+    with Dataset.create(folder) as dataset:
+        stripes = dataset.stripes("training", 2)
+        stripes.define(FIELDS)
+        stripes.begin()
+        writers = [StripeWriter(folder, FIELDS, stripes.capacity) for _ in range(2)]
+        for writer in writers:
+            writer.add(0, stripes.entries(0)[0])
+        with writers[0], writers[1]:
+            writers[0].append(values([0]), 1)
+            with pytest.raises(DatasetError, match="still written by an earlier client"):
+                writers[1].append(values([0]), 1)
+
+
+def test_manifests_with_impossible_stripes_are_refused(folder):
+    with Dataset.create(folder, max_file_size=size(2)) as dataset:
+        stripes = dataset.stripes("training", 3)
+        stripes.define(FIELDS)
+        stripes.begin()
+        for place in range(3):
+            with StripeWriter(folder, FIELDS, 2) as writer:
+                writer.add(0, stripes.entries(place)[0])
+                writer.append(values([place, place + 3]), 2)
+            stripes.note(place, 2)
+    path = folder / "dataset.json"
+    text = path.read_text()
+    plain = json.loads(text)
+    assert plain["format_version"] == 2
+    for place, stripe in [(0, [1, 3]), (1, [0, 3]), (2, [2, 4]), (0, [3, 3]), (0, [0, 1]), (1, 7)]:
+        changed = json.loads(text)
+        changed["modes"]["training"]["partitions"][place]["stripe"] = stripe
+        path.write_text(json.dumps(changed))
+        with pytest.raises(DatasetError, match="stripe"):
+            manifest_file.load(folder, edited=True)
+    path.write_text(text)
+    with Dataset.open(folder) as dataset:
+        check(dataset, list(range(6)))
