@@ -84,6 +84,19 @@ def test_an_environment_generates_samples_with_it_in_clients(run, tmp_path):
         np.testing.assert_allclose(values, rows["dart"][name], rtol=1e-6, atol=1e-6, err_msg=name)
 
 
+def test_it_keeps_the_contract_of_engines(run):
+    (report,) = json.loads(run("-m", "physx_core", "check", "mujoco", "--json"))["reports"]
+    skipped = {each["name"] for each in report["checks"] if each["status"] == "skipped"}
+    assert report["component"] == "mujoco/mujoco" and report["ok"]
+    assert report["counts"]["failed"] == report["counts"]["expected"] == 0
+    assert report["counts"]["passed"] > 30
+    assert skipped == {
+        "has derivatives that agree with finite differences",
+        "bounces by its restitution",
+        "hits with rays",
+    }
+
+
 def test_it_is_small_and_imports_faces_only():
     files = sorted(ENGINE.rglob("*.py"))
     texts = [file.read_text() for file in (*files, ENGINE / "pyproject.toml")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -307,6 +308,24 @@ def test_a_state_that_is_not_finite_is_an_error_and_leaves_no_log(backend, tmp_p
         with pytest.raises(SimulationError, match="no longer finite, or faster"):
             simulation.step(100)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("memory", "said"), [(16, "cannot simulate"), (18, "too small")])
+def test_contacts_that_do_not_fit_into_memory_are_an_error(backend, monkeypatch, memory, said):
+    """MuJoCo itself would leave some of them out, and write that into a log."""
+    make = mujoco.MjSpec
+
+    def make_small():
+        spec = make()
+        spec.memory = 1 << memory
+        return spec
+
+    monkeypatch.setattr(mujoco, "MjSpec", make_small)
+    size = {"size": (1.0, 1.0, 1.0), "mass": 1.0}
+    things = [Box(name=f"b{i}", position=(0.1 * i, 0, 0), **size) for i in range(20)]
+    simulation = backend.build(World(objects=things, ground=Ground()))
+    with simulation, pytest.raises(SimulationError, match=said):
+        simulation.step()
 
 
 def test_a_closed_simulation_says_so(backend):

@@ -96,8 +96,15 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         return MujocoAlgorithms(self.parts, self._world)
 
     def advance(self, n: int) -> None:
-        running = self._running
-        data = running.data
+        try:
+            self._run(n)
+        except mujoco.FatalError as error:
+            raise SimulationError(f"MuJoCo cannot simulate this world: {error}") from error
+        if any(self._running.data.warning[kind].number for kind in _FULL):
+            raise SimulationError("MuJoCo's memory is too small for the contacts of this world.")
+
+    def _run(self, n: int) -> None:
+        running, data = self._running, self._running.data
         if self._drives.idle:
             if n > 1:
                 mujoco.mj_step(running.model, data, n - 1)
@@ -106,8 +113,6 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         else:
             for _ in range(n):
                 self._drives.step()
-        if any(data.warning[kind].number for kind in _FULL):
-            raise SimulationError("MuJoCo's memory is too small for the contacts of this world.")
 
     def forget(self) -> None:
         self._running.data.qacc_warmstart[:] = 0.0
