@@ -55,6 +55,28 @@ def test_a_killed_node_is_replaced_and_the_rows_stay_the_same(runs, ray_cluster,
     eventually(runs.nothing_is_left)
 
 
+def test_an_elastic_run_goes_on_without_some_of_its_clients(runs, ray_cluster, eventually):
+    """Of four clients two find a place, of which one is lost with its node."""
+    expected = runs.rows(batches=30)
+    lost = ray_cluster.nodes.pop()
+    process = runs.start(
+        *on(ray_cluster, "num_cpus=1"),
+        *("--environment.min-clients", "1", "--environment.max-clients", "4"),
+        batches=30,
+        pace=0.05,
+        **ray_cluster.variables,
+    )
+    node = str(ray_cluster.raylet_of(lost))
+    eventually(lambda: node in {there for *_, there in runs.clients()} or process.poll())
+    ray_cluster.kill(lost)
+    status, said = runs.finish(process)
+    ray_cluster.nodes.append(ray_cluster.add_node())
+    assert status == 0, said
+    assert "another client takes over" in said
+    assert runs.same(runs.stored(), expected)
+    eventually(runs.nothing_is_left)
+
+
 @pytest.mark.parametrize("way", ["error", "SIGINT", "SIGTERM", "SIGKILL"])
 def test_nothing_is_left_on_any_node(way, runs, ray_cluster, eventually):
     fail_at = 5 if way == "error" else -1

@@ -44,7 +44,8 @@ class RayLauncher(Launcher):
     What the clients need is reserved as one placement group. On each node an actor, the agent,
     starts those that Ray put there as child processes, and follows them. If a node is lost, Ray
     moves its part of the group to another one, where the run starts the clients again
-    (`EnvironmentConfig.restarts`); the rows are the same.
+    (`EnvironmentConfig.restarts`); the rows are the same. In an elastic run each client has a group
+    of its own, and waits for a place alone.
     """
 
     elsewhere = True
@@ -100,8 +101,9 @@ class RayLauncher(Launcher):
         """Start the clients: see `Launcher.launch`."""
         assert self._nodes is not None and self._connection is not None
         without = [number for number in instances if number not in self._nodes.places]
-        if without:
-            self._reserve(without)
+        groups = [[number] for number in without] if self.elastic else [without]
+        for group in groups if without else ():
+            self._reserve(group, len(without))
         return [self._nodes.start(number, address, token) for number in instances]
 
     def close(self) -> None:
@@ -113,17 +115,21 @@ class RayLauncher(Launcher):
         if connection is not None:
             connection.close()
 
-    def _reserve(self, instances: Sequence[int]) -> None:
-        """Reserve what the clients need; Ray says where when it has found nodes."""
+    def _reserve(self, instances: Sequence[int], total: int) -> None:
+        """Reserve what some of all clients need; Ray says where when it has found nodes."""
         assert self._nodes is not None and self._connection is not None
         found = self._connection.nodes()
         needs = dict(self._needs)
         if needs["CPU"] is None:
-            needs["CPU"] = share_of_processors(found, len(instances))
+            needs["CPU"] = share_of_processors(found, total)
         bundle: Bundle = {name: float(need) for name, need in needs.items() if need}
         group = placement_group([bundle] * len(instances), strategy=self._strategy)
         self._nodes.add(group, instances, bundle)
-        if not group.wait(_LOOK_TIME) and (misfit := self._find_reason(group, bundle)):
+        if self.elastic:
+            misfit = find_misfit(found, bundle)
+        else:
+            misfit = "" if group.wait(_LOOK_TIME) else self._find_reason(group, bundle)
+        if misfit:
             raise ClientError(
                 instances[0],
                 f"has no place on Ray: {misfit}. Ask for less with "

@@ -65,10 +65,13 @@ class Launcher(ABC):
         elsewhere: Whether clients may run on other machines, to which the launcher brings the
             token. Then the server listens at the address that `open` returns, unless
             `EnvironmentConfig.ip_address` is another one than the loopback address.
+        elastic: Whether the run begins, and goes on, without some of the clients; set before
+            `open`. Clients for which there is no place yet may wait for one.
     """
 
     by_hand: bool = False
     elsewhere: bool = False
+    elastic: bool = False
 
     def open(self) -> str | None:
         """Reach what starts the clients; called once, before the server listens.

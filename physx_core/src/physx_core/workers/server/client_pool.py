@@ -72,6 +72,7 @@ class ClientPool(Launcher):
                 f"{self.most} join: the run could not begin."
             )
         self._config, self._launcher, self.elsewhere = config, launcher, launcher.elsewhere
+        launcher.elastic = True
         self._is_open = is_open or launcher.by_hand
         self._address, self._public = "", ""
         self._server: Serving | None = None
