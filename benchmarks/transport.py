@@ -4,6 +4,8 @@ Samples of 48 B hold 6 numbers, samples of 48 kB hold 6000, of float64 in two fi
 turn with its baseline does as much in each round; clients are started anew for each round wherever
 they run ahead, so that none of their work is done in another's time. Starting them does not count
 but in the line that is about it.
+
+``--costs [PAGE]`` prints what clients and rows cost, and nothing else: the table of docs/scale.md.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ import torch
 from cores import on_core, two_cores
 from measure import claim, finish, rates, report
 from raw_tcp import raw_answers, raw_blocks, raw_client, raw_stream
+from transport_costs import print_costs
 from transport_environments import Asking, Rows, Sleeping, Working, compute
 
 from physx_core import (
@@ -392,6 +395,10 @@ def main() -> None:
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
+        if "--costs" in sys.argv:
+            pages = sys.argv[sys.argv.index("--costs") + 1 :]
+            print_costs(root, Path(pages[0]) if pages else None)
+            return
         met = all_predictions_over_tcp(root)
         met.append(predictions_in_process(root))
         met.append(generation_small(root))
