@@ -85,6 +85,18 @@ def test_a_stopped_client_is_given_up(local, clients, process_ids, taking, said,
     assert re.search(r"was cut off. It has not answered for \d+ s: it is stopped, or hangs", text)
 
 
+def test_a_client_that_stops_at_the_end_ends_nothing(clients, process_ids, taking, said, unhurried):
+    settings = {"num_clients": 2, "max_clients": 1, "timeout": unhurried(2.0)}
+    with clients(WANDERER, run_ahead=0, **settings) as source:
+        taking(source).take(8)
+        (client,) = process_ids().values()
+        for pid in (client, *process_ids(client).values()):
+            os.kill(pid, signal.SIGSTOP)
+    (text,) = said()
+    assert re.match(f"Client 1 on {HOST} was cut off. It has not answered for", text)
+    assert text.endswith("The run was at its end, and all its rows are there.")
+
+
 def test_clients_that_cannot_start_end_the_run_at_once(clients, monkeypatch, said):
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with (

@@ -291,11 +291,11 @@ class ClientGroup:
 
     def _check_clients(self, now: float) -> None:
         """Have others run the instances of clients that are lost, or that have too many."""
-        if self._pool is None or self._closing:
+        if self._pool is None:
             return
-        for number in self._pool.check(now, self._began):
+        for number in self._pool.check(now, self._began, ending=self._closing):
             self._replace(number, self._handles.pop(number, None))
-        while (moved := self._pool.find_move(self._progress)) is not None:
+        while not self._closing and (moved := self._pool.find_move(self._progress)) is not None:
             handle = self._handles.pop(moved)
             handle.kill()
             self._replace(moved, handle)

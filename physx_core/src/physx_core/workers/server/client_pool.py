@@ -86,7 +86,7 @@ class ClientPool(Launcher):
         self._orphans: list[int] = []
         self._short_since: float | None = None
         self._said = 0.0
-        self._has_begun = False
+        self._has_begun = self._is_ending = False
         self._lost = ""  # how the last client was lost
 
     # Clients -----------------------------------------------------------------------------------
@@ -177,12 +177,13 @@ class ClientPool(Launcher):
                 f"It sent {frame.kind.name}, which a client that runs workers may not send now."
             )
 
-    def check(self, now: float, served_since: float) -> list[int]:
+    def check(self, now: float, served_since: float, *, ending: bool = False) -> list[int]:
         """Ask the clients whether they are there; replace those that are not.
 
         Args:
             now: Monotonic s.
             served_since: Since when the run has listened to its clients, in monotonic s.
+            ending: Whether all rows are there, so that nobody has to be replaced.
 
         Returns:
             The instances that such clients ran: others must start them.
@@ -197,9 +198,11 @@ class ClientPool(Launcher):
                     client.peer.send(pack(Kind.PING))
             elif now - max(client.unanswered, served_since) > self._config.timeout:
                 self._give_up(client)
+        self._is_ending = ending
         self._bury_lost()
-        self._replace_absent()
-        self._check_count(now, served_since)
+        if not ending:
+            self._replace_absent()
+            self._check_count(now, served_since)
         moved, self._orphans = self._orphans, []
         return moved
 
@@ -304,14 +307,18 @@ class ClientPool(Launcher):
         """Say how a client was lost, and have the launcher replace it."""
         self._lost = f"{name} {how}."
         text = self._lost
-        if instances:
+        if self._is_ending:
+            text += " The run was at its end, and all its rows are there."
+        elif instances:
             several = "s" if len(instances) > 1 else ""
             text += (
                 f" Instance{several} {', '.join(map(str, instances))}: another client takes over."
             )
         if handle is not None:
             stop([handle], 0.0)
-            if self._restarts[number] < self._config.restarts:
+            if self._is_ending:
+                pass
+            elif self._restarts[number] < self._config.restarts:
                 self._restarts[number] += 1
                 text += f" Restart {self._restarts[number]} of {self._config.restarts}."
                 self._start_clients([number])
