@@ -37,9 +37,9 @@ MuJoCo is the engine of [examples/mujoco_engine](../examples/mujoco_engine).
 Each robot floats freely (or is fixed, if its root link has no mass), is loaded without collision
 shapes, and simulated for {steps} steps of 1 ms without torques from its neutral configuration.
 *Agreement* is the largest difference of an engine's accelerations from Pinocchio's in {states}
-random states, relative to the largest acceleration of the state. *dof* counts the joints' degrees of
-freedom, *mass* is in kg, *load* is the CPU time in ms, the minimum of {loads} loads. With meshes as
-*collisions*, `Robot(collisions="boxes")` or `"capsules"` is many times faster.
+random states, relative to the largest acceleration of the state. *dof* counts the degrees of
+freedom of the joints, *mass* is in kg, *load* is the CPU time in ms, the minimum of {loads} loads.
+With meshes as *collisions*, `Robot(collisions="boxes")` or `"capsules"` is many times faster.
 
 | robot | dof | mass | collisions | load {engines} | steps {engines} | agreement {others} |
 |---|---|---|---|---|---|---|
