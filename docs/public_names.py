@@ -42,7 +42,7 @@ FACES = {
         "tasks.randomizations",
     ),
     "physx_remote": ("",),
-    "physx_cluster": ("",),
+    "physx_cluster": ("", "sweep"),
 }
 MODULES = [f"{root}.{name}".rstrip(".") for root, names in FACES.items() for name in names]
 

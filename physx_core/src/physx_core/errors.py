@@ -322,6 +322,10 @@ class SessionError(PhysxError):
     """A session folder is missing, or does not fit the pipeline."""
 
 
+class StudyError(PhysxError):
+    """A study cannot be begun, continued or shown, or trials of it ended without a result."""
+
+
 class DatasetError(PhysxError):
     """A dataset is missing, damaged, or lacks the requested data."""
 

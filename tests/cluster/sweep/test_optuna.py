@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from physx_cluster.sweep import Definition, Result, StudyError, run_study
+from physx_cluster.sweep import Definition, Result, run_study
 from physx_cluster.sweep.optuna import OptunaSearch, Pruning
 from physx_cluster.sweep.parameters import Choices, Range
 from physx_cluster.sweep.plan import Plan
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, StudyError
 
 pytest.importorskip("optuna")
 

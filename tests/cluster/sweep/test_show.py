@@ -5,10 +5,10 @@ from typing import ClassVar
 
 import pytest
 
-from physx_cluster.sweep import Definition, Study, StudyError, run_study
+from physx_cluster.sweep import Definition, Study, run_study
 from physx_cluster.sweep.show import draw_figure, record_curves, summary
 from physx_core import Visualizer
-from physx_core.errors import UsageError
+from physx_core.errors import StudyError, UsageError
 
 
 class Noted(Visualizer):

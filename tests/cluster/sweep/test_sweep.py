@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from physx_cluster.sweep import Definition, Study, StudyError, run_study
+from physx_cluster.sweep import Definition, Study, run_study
 from physx_core import Dataset, NetworkConfig, Training
 from physx_core.config import DatasetConfig
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, StudyError
 
 
 def table(folder):

@@ -10,11 +10,10 @@ from typing import Any
 
 import tomli_w
 
-from physx_cluster.sweep.errors import StudyError
 from physx_cluster.sweep.parameters import Setting
 from physx_core import files
 from physx_core.config import read_toml
-from physx_core.errors import PhysxError
+from physx_core.errors import PhysxError, StudyError
 
 TRIAL, RESULT, FAILURE = "trial.toml", "result.toml", "failure.toml"
 LOCK, OUTPUT = "trial.lock", "output.txt"

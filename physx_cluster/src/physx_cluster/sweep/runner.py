@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from physx_cluster.sweep.definition import Definition
-from physx_cluster.sweep.errors import StudyError
 from physx_cluster.sweep.executors.executor import Executor, Job
 from physx_cluster.sweep.plan import Plan
 from physx_cluster.sweep.results import FAILED, FAILURE, OUTPUT, Failure, Result, Trial
 from physx_cluster.sweep.study import Study
 from physx_core import files
-from physx_core.errors import PhysxError
+from physx_core.errors import PhysxError, StudyError
 
 Say = Callable[[str], None]
 Start = Callable[[Definition], Executor]

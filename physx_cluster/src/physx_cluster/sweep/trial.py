@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from physx_cluster.sweep.definition import StudyOptions, build_stage
-from physx_cluster.sweep.errors import StudyError
 from physx_cluster.sweep.optuna import Pruning
 from physx_cluster.sweep.results import (
     COMPLETE,
@@ -48,6 +47,7 @@ from physx_core.errors import (
     PluginNotFoundError,
     ReferenceFormError,
     SessionError,
+    StudyError,
     UsageError,
     listed,
     nearest,

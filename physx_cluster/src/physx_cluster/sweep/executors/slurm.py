@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from physx_cluster.sweep.errors import StudyError
 from physx_cluster.sweep.executors.executor import (
     PATIENCE,
     Executor,
@@ -17,7 +16,7 @@ from physx_cluster.sweep.executors.executor import (
     variables_of,
 )
 from physx_cluster.sweep.results import OUTPUT
-from physx_core.errors import ConfigError, MissingLibraryError
+from physx_core.errors import ConfigError, MissingLibraryError, StudyError
 from physx_core.processes import ChildProcess
 
 _FOLDER = "jobs"
