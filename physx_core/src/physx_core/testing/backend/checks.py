@@ -54,7 +54,7 @@ def _quiet(subject: Subject) -> None:
 
 
 def _run(subject: Subject) -> None:
-    with build(subject, busy()) as simulation:
+    with build(subject, busy(subject)) as simulation:
         simulation.step(50)
 
 

@@ -13,8 +13,8 @@ from physx_core.testing.subject import Check, Subject, expect, expect_close
 
 
 def _rests(subject: Subject) -> None:
+    need(subject, "contacts")
     with build(subject, box(0.11)) as simulation:
-        need(simulation, "contacts")
         expect(len(simulation.contacts()) == 0, "a box in the air has contacts")
         simulation.step(1500)
         height = float(simulation.positions()[2])
@@ -43,11 +43,11 @@ def _tilted(angle: float) -> tuple[float, float, float]:
 
 
 def _slides(subject: Subject) -> None:
+    need(subject, "contacts")
     friction, steps = 0.5, 400
     for factor in (0.9, 1.3):
         angle = math.atan(factor * friction)
         with build(subject, box(friction=friction, gravity=_tilted(angle))) as simulation:
-            need(simulation, "contacts")
             simulation.step(steps)
             way = float(simulation.positions()[0])
         pull = GRAVITY * (math.sin(angle) - friction * math.cos(angle))
@@ -60,8 +60,7 @@ def _slides(subject: Subject) -> None:
 
 
 def _bounces(subject: Subject) -> None:
-    with build(subject, ball(ground=Ground())) as simulation:
-        need(simulation, "restitution")
+    need(subject, "restitution")
     for restitution in (0.0, 0.6):
         thrown = Sphere(
             name="ball", radius=0.1, mass=0.5, position=(0, 0, 0.6), restitution=restitution
@@ -81,11 +80,10 @@ def _bounces(subject: Subject) -> None:
 
 
 def _stacks(subject: Subject) -> None:
+    need(subject, "body_contacts")
     low = Box(name="low", size=(0.3, 0.3, 0.2), mass=4.0, position=(0, 0, 0.1))
     high = Box(name="high", size=(0.2, 0.2, 0.2), mass=1.0, position=(0, 0, 0.301))
     world = World(objects=[low, high], ground=Ground(), period=PERIOD)
-    with build(subject, box()) as simulation:
-        need(simulation, "body_contacts")
     with build(subject, world) as simulation:
         simulation.step(800)
         places = {name: float(simulation.body_poses([name])[0][2]) for name in ("low", "high")}
@@ -103,8 +101,8 @@ def _stacks(subject: Subject) -> None:
 
 
 def _limits(subject: Subject) -> None:
+    need(subject, "limits")
     with build(subject, arm(gravity=(0.0, 0.0, 0.0))) as simulation:
-        need(simulation, "limits")
         for sign, limits in ((1, simulation.layout.upper), (-1, simulation.layout.lower)):
             simulation.set_torques(sign * np.array([3.0, 2.0, 5.0]))
             simulation.step(1500)
@@ -119,9 +117,13 @@ def _limits(subject: Subject) -> None:
             )
 
 
+def _ball_on_ground() -> World:
+    return dataclasses.replace(ball(), ground=Ground(), contacts="all")
+
+
 def _rays(subject: Subject) -> None:
-    with build(subject, ball(ground=Ground())) as simulation:
-        need(simulation, "raycast")
+    need(subject, "raycast")
+    with build(subject, _ball_on_ground()) as simulation:
         simulation.step()  # some engines place shapes then
         begins, ends = [[0, 0, 4.0], [3, 0, 4.0], [0, 0, 4.0]], [[0, 0, 1.0], [3, 0, -1], [0, 0, 5]]
         hits = simulation.raycast(np.array(begins), np.array(ends))
@@ -136,6 +138,7 @@ def _rays(subject: Subject) -> None:
 
 
 def _untouched(subject: Subject) -> None:
+    need(subject, "contacts")
     with build(subject, box(contacts="none")) as simulation:
         simulation.step(100)
         _expect_falling(simulation)

@@ -25,9 +25,9 @@ def _torques(simulation: Simulation, seed: int) -> Vector:
 
 
 def _agree(subject: Subject) -> None:
+    need(subject, "inverse_dynamics")
+    need(subject, "forward_dynamics")
     for simulation in _both(subject):
-        need(simulation, "forward_dynamics")
-        need(simulation, "inverse_dynamics")
         for seed in range(5):
             q, v = state_of(simulation, seed)
             torques = _torques(simulation, seed)
@@ -43,8 +43,8 @@ def _agree(subject: Subject) -> None:
 
 
 def _mass(subject: Subject) -> None:
+    need(subject, "mass_matrix")
     for simulation in _both(subject):
-        need(simulation, "mass_matrix")
         q, v = state_of(simulation, 1)
         matrix = simulation.mass_matrix(q)
         expect_close(matrix, matrix.T, 1e-10, "the mass matrix is not symmetric")
@@ -59,8 +59,8 @@ def _mass(subject: Subject) -> None:
 
 
 def _jacobian(subject: Subject) -> None:
+    need(subject, "jacobian")
     for simulation in _both(subject):
-        need(simulation, "jacobian")
         q, v = state_of(simulation, 2)
         matrix = simulation.jacobian("hand", q)
         (wanted,) = simulation.body_velocities(["hand"], q, v)
@@ -82,8 +82,8 @@ def _jacobian(subject: Subject) -> None:
 
 
 def _derivatives(subject: Subject) -> None:
+    need(subject, "derivatives")
     with build(subject, arm()) as simulation:
-        need(simulation, "derivatives")
         q, v = state_of(simulation, 4)
         state = [q, v, _torques(simulation, 4)]
         found = simulation.forward_dynamics_derivatives(q, v, state[2])
@@ -105,8 +105,8 @@ def _derivatives(subject: Subject) -> None:
 
 
 def _batches(subject: Subject) -> None:
+    need(subject, "forward_dynamics")
     for simulation in _both(subject):
-        need(simulation, "forward_dynamics")
         states = [state_of(simulation, seed) for seed in range(4)]
         q, v = (np.array(rows) for rows in zip(*states, strict=True))
         torques = np.array([_torques(simulation, seed) for seed in range(4)])

@@ -74,20 +74,20 @@ _WORLDS: Mapping[str, Callable[[], World]] = {
 
 
 def _known(subject: Subject) -> None:
-    with build(subject, busy()) as simulation:
+    with build(subject, busy(subject)) as simulation:
         unknown = simulation.features - FEATURES.keys()
         expect(not unknown, f"there are no features {sorted(unknown)}: see FEATURES")
         expect(simulation.engine, "its simulations have no name of their engine")
 
 
 def _honest(subject: Subject) -> None:
-    with build(subject, busy()) as simulation:
+    with build(subject, busy(subject)) as simulation:
         for feature, call in _CALLS.items():
             _try(feature, simulation.features, functools.partial(call, simulation))
 
 
 def _builds(subject: Subject) -> None:
-    with build(subject, busy()) as simulation:
+    with build(subject, busy(subject)) as simulation:
         features = simulation.features
     for feature, world in _WORLDS.items():
         _try(feature, features, functools.partial(_run, subject, world))

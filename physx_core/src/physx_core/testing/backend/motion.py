@@ -79,8 +79,7 @@ def _swings(subject: Subject) -> None:
 
 
 def _swings_precisely(subject: Subject) -> None:
-    with build(subject, pendulum()) as simulation:
-        need(simulation, "rk4")
+    need(subject, "rk4")
     with build(subject, pendulum(integrator="rk4")) as simulation:
         simulation.set_state(np.array([1.0]), np.zeros(1))
         begin = _energy(simulation)
@@ -111,7 +110,7 @@ def _one_step(subject: Subject) -> None:
 
 
 def _many_steps(subject: Subject) -> None:
-    with build(subject, busy()) as one, build(subject, busy()) as other:
+    with build(subject, busy(subject)) as one, build(subject, busy(subject)) as other:
         one.step(60)
         for _ in range(60):
             other.step()
@@ -165,8 +164,8 @@ def _places(subject: Subject) -> None:
 
 
 def _accelerations(subject: Subject) -> None:
+    need(subject, "accelerations")
     with build(subject, arm()) as simulation:
-        need(simulation, "accelerations")
         expect(
             not simulation.accelerations().any(), "before the first step accelerations are not 0"
         )
@@ -182,9 +181,9 @@ def _accelerations(subject: Subject) -> None:
 
 
 def _wrenches(subject: Subject) -> None:
+    need(subject, "wrenches")
     world = ball(gravity=(0.0, 0.0, 0.0))
     with build(subject, world) as simulation:
-        need(simulation, "wrenches")
         number = simulation.apply_wrench(Wrench("ball", force=(1.0, 0.0, 2.0)))
         simulation.step(100)
         simulation.remove_wrench(number)
@@ -198,8 +197,8 @@ def _wrenches(subject: Subject) -> None:
 
 
 def _hooks(subject: Subject) -> None:
+    need(subject, "hooks")
     with build(subject, ball()) as simulation:
-        need(simulation, "hooks")
         called: list[int] = []
 
         def hook(given: Simulation) -> None:

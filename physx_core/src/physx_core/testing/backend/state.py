@@ -75,7 +75,7 @@ def _copies(subject: Subject) -> None:
 
 
 def _restores(subject: Subject) -> None:
-    with build(subject, busy()) as simulation, build(subject, busy()) as other:
+    with build(subject, busy(subject)) as simulation, build(subject, busy(subject)) as other:
         torques = np.array([2.0, -1.0, 1.0])
         simulation.set_torques(torques)
         simulation.step(120)
@@ -107,8 +107,8 @@ def _restores(subject: Subject) -> None:
 
 
 def _state_alone(subject: Subject) -> None:
-    with build(subject, busy()) as simulation:
-        need(simulation, "exact_restore")
+    need(subject, "exact_restore")
+    with build(subject, busy(subject)) as simulation:
         simulation.step(150)  # the box and the ball touch the ground
         positions, velocities = simulation.positions().copy(), simulation.velocities().copy()
         found = []
@@ -128,7 +128,7 @@ def _state_alone(subject: Subject) -> None:
 def _repeats(subject: Subject) -> None:
     found = []
     for _ in range(2):
-        with build(subject, busy()) as simulation:
+        with build(subject, busy(subject)) as simulation:
             simulation.set_torques(np.array([2.0, -1.0, 1.0]))
             simulation.step(200)
             found.append(_now(simulation))
@@ -136,10 +136,13 @@ def _repeats(subject: Subject) -> None:
 
 
 def _independent(subject: Subject) -> None:
-    with build(subject, busy()) as alone:
+    with build(subject, busy(subject)) as alone:
         alone.step(100)
         wanted = _now(alone)
-    with build(subject, busy()) as one, build(subject, pendulum(gravity=(0.0, 0.0, -1.0))) as other:
+    with (
+        build(subject, busy(subject)) as one,
+        build(subject, pendulum(gravity=(0.0, 0.0, -1.0))) as other,
+    ):
         for _ in range(10):
             one.step(10)
             other.set_state(np.array([1.0]), np.array([3.0]))
@@ -207,7 +210,7 @@ def _ends(subject: Subject) -> None:
 
 
 def _keeps_world(subject: Subject) -> None:
-    world = busy()
+    world = busy(subject)
     before = copy.deepcopy(world)
     with build(subject, world) as simulation:
         simulation.step(5)
