@@ -58,7 +58,7 @@ def test_a_new_plugin_works_until_it_is_removed(call, tmp_path, kind):
     finally:
         call("pip", "uninstall", *options, "--yes", f"physx-{name}")
     assert name not in call("physx_core", "plugins")
-    assert "no plugin" in call("physx_core", "check", name, ok=False)
+    assert f'No plugin "{name}"' in call("physx_core", "check", name, ok=False)
 
 
 def use(call, kind, name, folder):

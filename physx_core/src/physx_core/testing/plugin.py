@@ -27,7 +27,7 @@ def check_plugin(
     expected_failures: Mapping[str, str] | None = None,
     timeout: float = TIMEOUT,
 ) -> Iterator[Report]:
-    """Check the components that a name stands for; yield the report of each when it is there.
+    """Check the components that a name stands for, one at each step of the iterator.
 
     Args:
         name: Name of a plugin, all of whose components are checked; or a reference,
@@ -53,23 +53,29 @@ def check_plugin(
             f"{', '.join(f'{each} {reference}' for each, reference in found)}: name one of them, "
             "and its kind if need be."
         )
-    for each, reference in found:
-        options = plain_options(fields=fields)
-        if each in _WITH_NETWORK:
-            chosen = network or _network_of(each, reference)
-            if chosen is not None:
-                options["network"] = to_plain(chosen)
-            elif each == "optimization":
-                yield Report(each, reference, (_NO_NETWORK,))
-                continue
-        yield run_checks(
-            each,
-            reference,
-            arguments or {},
-            options=options,
-            expected_failures=expected_failures,
-            timeout=timeout,
-        )
+    common = {"expected_failures": expected_failures, "timeout": timeout}
+    return (
+        _check(each, reference, arguments or {}, network, fields, common)
+        for each, reference in found
+    )
+
+
+def _check(
+    kind: str,
+    reference: str,
+    arguments: Mapping[str, Any],
+    network: NetworkConfig | None,
+    fields: Sequence[Field],
+    common: Mapping[str, Any],
+) -> Report:
+    options = plain_options(fields=fields)
+    if kind in _WITH_NETWORK:
+        chosen = network or _network_of(kind, reference)
+        if chosen is not None:
+            options["network"] = to_plain(chosen)
+        elif kind == "optimization":
+            return Report(kind, reference, (_NO_NETWORK,))
+    return run_checks(kind, reference, arguments, options=options, **common)
 
 
 _NO_NETWORK = Check(
