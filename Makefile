@@ -46,6 +46,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/idle_threads.py
 	$(BIN)/python benchmarks/remote.py
 	$(BIN)/python benchmarks/viewer.py
+	$(BIN)/python benchmarks/cluster.py
 
 clean:
 	rm -rf docs/_build .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

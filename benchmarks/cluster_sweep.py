@@ -51,9 +51,7 @@ def survives_kills() -> list[bool]:
         claim("kills", kills, at_least=TRIALS * KILLS),
         claim("tables are identical", same, at_least=1),
         claim("final parameters are identical", networks, at_least=1),
-        claim(
-            "epochs trained twice, to those destroyed", extra, at_most=lost / BATCHES
-        ),
+        claim("epochs trained twice, to those destroyed", extra, at_most=lost / BATCHES),
         claim("the same, to one epoch for each kill", extra, at_most=kills),
     ]
 

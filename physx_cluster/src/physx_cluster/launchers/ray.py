@@ -32,6 +32,9 @@ from physx_cluster.launchers.ray_agent import Agent
 from physx_cluster.launchers.ray_connection import RayConnection
 
 _CALLS = 100_000  # of one agent at a time: two for each client
+# A process of Ray that is told to exit kills its children: clients, whose own children would go on,
+# and the watchdog, which ends all of them.
+_LEAVE_CHILDREN = {"RAY_kill_child_processes_on_worker_exit": "false"}
 _ANSWER_TIME = 1.0  # for an agent that is asked to kill a client
 _LOOK_TIME = 2.0  # for Ray to find nodes
 _PAUSE = 0.25
@@ -42,7 +45,8 @@ class RayLauncher(Launcher):
     """Starts the clients on the nodes of a Ray cluster.
 
     What the clients need is reserved as one placement group. On each node an actor, the agent,
-    starts those that Ray put there as child processes, and follows them. If a node is lost, Ray
+    starts those that Ray put there as child processes, and follows them; on the node of the run
+    the run does that itself. If a node is lost, Ray
     moves its part of the group to another one, where the run starts the clients again
     (`EnvironmentConfig.restarts`); the rows are the same. In an elastic run each client has a group
     of its own, and waits for a place alone.
@@ -210,8 +214,8 @@ class RayHandle(ClientHandle):
             self.finish(-number)
             return
         try:
-            call = self.agent.signal.remote(self.instance_id, int(number))
-            await asyncio.wait_for(_result(call), _ANSWER_TIME)
+            call = _ask(self.agent, "signal", self.instance_id, int(number))
+            await asyncio.wait_for(call, _ANSWER_TIME)
         except (RayError, TimeoutError):
             if number == signal.SIGKILL:
                 self.finish(-number)
@@ -226,10 +230,15 @@ class _Nodes:
 
     def __init__(self, runtime_env: dict[str, Any] | None) -> None:
         self.places: dict[int, tuple[Any, int, Bundle]] = {}
-        options: dict[str, Any] = {"num_cpus": 0, "max_concurrency": _CALLS}
-        options |= {} if runtime_env is None else {"runtime_env": runtime_env}
-        self._actor: Any = ray.remote(**options)(Agent)
+        environment = dict(runtime_env or {})
+        environment["env_vars"] = {**environment.get("env_vars", {}), **_LEAVE_CHILDREN}
+        self._actor: Any = ray.remote(num_cpus=0, max_concurrency=_CALLS, runtime_env=environment)(
+            Agent
+        )
         self._agents: dict[Any, Any] = {}
+        self._here = Agent()  # on this process's node there is no need for another process
+        self._own_node = ray.get_runtime_context().get_node_id()
+        self._is_plain = runtime_env is None
         self._groups: list[Any] = []
         self._tasks: set[Any] = set()
         self._loop = asyncio.new_event_loop()
@@ -273,11 +282,11 @@ class _Nodes:
             while not handle.end.done():
                 key, agent = await self._find_agent(handle)
                 try:
-                    await _result(agent.answer.remote())
+                    await _ask(agent, "answer")
                     if handle.end.done():
                         return
                     handle.agent = agent
-                    await _result(agent.start.remote(number, address, token))
+                    await _ask(agent, "start", number, address, token)
                     break
                 except RayActorError as error:
                     handle.waits_for = f"its node was lost: {_first_line(error)}"
@@ -285,7 +294,7 @@ class _Nodes:
                     self._agents.pop(key, None)
                     await asyncio.sleep(_PAUSE)
             handle.waits_for = f"it runs on {self._describe(number)}"
-            handle.finish(*await _result(handle.agent.follow.remote(number)))
+            handle.finish(*await _ask(handle.agent, "follow", number))
         except RayActorError as error:
             handle.finish(1, f"Ray: {_first_line(error)}")
         except Exception as error:  # of whatever kind, the run must hear of it
@@ -303,6 +312,8 @@ class _Nodes:
             handle.waits_for = f"it waits for {describe(bundle)}, and Ray has {describe(free)} free"
             await asyncio.sleep(_PAUSE)
         handle.waits_for = "it waits for the start of a process of Ray"
+        if node == self._own_node and self._is_plain and not bundle.get("GPU"):
+            return node, self._here
         # Ray gives graphics cards to actors, so there an agent has just one client.
         key = (group.id, index if bundle.get("GPU") else node)
         if key not in self._agents:
@@ -316,8 +327,10 @@ class _Nodes:
         return f"node {placement_group_table(group)['bundles_to_node_id'][index][:8]}"
 
 
-async def _result(call: Any) -> Any:
-    return await call
+async def _ask(agent: Any, method: str, *arguments: Any) -> Any:
+    """Return what a method of an agent returns, which may be one of this process."""
+    call = getattr(agent, method)
+    return await (call(*arguments) if isinstance(agent, Agent) else call.remote(*arguments))
 
 
 def _first_line(error: Exception) -> str:

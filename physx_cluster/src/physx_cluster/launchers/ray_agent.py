@@ -11,9 +11,10 @@ from physx_core.workers import ClientProcess
 
 
 class Agent:
-    """An actor of Ray; its clients are child processes, which end with it, however it ends.
+    """Has clients as child processes, which end with the process of the agent, however it ends.
 
-    All methods are coroutines, so Ray runs any number of their calls at a time, in one thread.
+    It is an actor of Ray, or a plain object. All methods are coroutines, so Ray runs any number of
+    their calls at a time, in one thread.
     """
 
     def __init__(self) -> None:
