@@ -31,6 +31,7 @@ html_title = "physx"
 html_static_path = ["site.css"]
 html_css_files = ["site.css"]
 html_show_sourcelink = False
+html_show_copyright = False
 html_copy_source = False
 
 autodoc_member_order = "bysource"

@@ -150,7 +150,7 @@ def escaped(line: str) -> str:
     """Return a line of a docstring in which (samples, *shape) and np.bool_ mean themselves."""
     if line.startswith(":vartype"):
         return line.replace("_]", r"\_]")
-    return re.sub(r"(?<![*`\w])\*(?=\w)", r"\*", line)
+    return re.sub(r"(?<![*`\w])\*(?=\w)(?![^*]*[\w.]\*(?!\w))", r"\*", line)
 
 
 def undocumented() -> list[str]:

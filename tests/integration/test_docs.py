@@ -24,6 +24,11 @@ def test_the_code_of_a_page_runs(pages, tmp_path):
     run_pages.run(pages, tmp_path)
 
 
+@pytest.mark.parametrize("page", run_pages.LEARN, ids=lambda page: page.stem)
+def test_a_page_to_learn_from_is_short(page):
+    assert sum(len(block.text.splitlines()) for block in run_pages.read(page)) <= 40
+
+
 @pytest.mark.parametrize(
     ("text", "error"),
     [
