@@ -19,6 +19,7 @@ root_doc = "docs/index"
 include_patterns = [
     "docs/**.md",
     "physx_*/README.md",
+    "examples/*/README.md",
     *(f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING", "SECURITY")),
 ]
 exclude_patterns = ["docs/_build", ".venv", "sessions", "tests", "physx_*/src"]
