@@ -1,14 +1,34 @@
 """The same study on Ray and by submitit: the same table."""
 
 import os
+import shutil
 import signal
+import tempfile
 import time
 from pathlib import Path
 
 import pytest
+from one_node_slurm import Slurm
 from sweep_kills import processes, start
 
 pytestmark = pytest.mark.usefixtures("nothing_stays_behind")
+
+
+@pytest.fixture
+def slurm(monkeypatch):
+    """Slurm with this machine as its only node."""
+    folder = Path(tempfile.mkdtemp(prefix="slurm", dir="/tmp"))
+    cluster = Slurm(folder)
+    reason = cluster.start()
+    try:
+        if reason and os.environ.get("CI") != "true":
+            pytest.skip(reason)
+        assert not reason, reason
+        monkeypatch.setenv("SLURM_CONF", cluster.variables["SLURM_CONF"])
+        yield cluster
+    finally:
+        cluster.stop()
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture
@@ -55,7 +75,7 @@ def test_the_table_is_the_same_wherever_trials_run(
         ("ray", {"address": "local", "cpus": 2}, ["Ray refuses the options", "cpus"]),
         ("ray", {"address": "127.0.0.1:9"}, ["Ray does not answer at 127.0.0.1:9"]),
         ("slurm", {"cluster": "local", "tiem": 3}, ["submitit refuses the options", "tiem"]),
-        ("slurm", {"cluster": "slrm"}, ["There is no Slurm here", "slrm"]),
+        ("slurm", {"cluster": "slrm"}, ["run.options.cluster is 'slrm'"]),
     ],
 )
 def test_options_that_an_executor_does_not_know(write, physx, executor, options, texts):
@@ -87,3 +107,39 @@ def test_a_sweep_that_is_asked_to_end_leaves_no_trial_behind(write, training, ex
         time.sleep(0.02)
     if executor == "ray":  # the trial was asked to write a checkpoint
         assert list(Path("studies/there").glob("trial_0001/network/*/checkpoint.toml"))
+
+
+def test_slurm_runs_trials_and_keeps_none_when_the_sweep_is_killed(
+    write, whole, parameters_of, slurm
+):
+    pytest.importorskip("submitit")
+    write(run={"parallel": 2, "executor": "slurm"})
+    sweep = start("sweep.toml", "studies/there")
+    kill_one("studies/there")
+    sweep.kill()
+    sweep.wait()
+    deadline = time.monotonic() + 60
+    while processes("studies/there") or slurm.ask("squeue", "--noheader"):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert start("sweep.toml", "studies/there").wait(200) == 0
+    assert Path("studies/there/trials.csv").read_bytes() == whole
+    assert parameters_of("studies/there") == parameters_of("studies/whole")
+
+
+def test_a_job_that_slurm_cannot_run_ends_the_sweep(write, physx, slurm):
+    pytest.importorskip("submitit")
+    for options, text in (
+        ({"slurm_partition": "none"}, "Slurm refuses the job of a trial"),
+        ({"timeout_min": 600}, "Slurm"),
+    ):
+        write(run={"executor": "slurm", "options": options})
+        assert text in physx("sweep", "sweep.toml", status=1)
+        assert not slurm.ask("squeue", "--noheader")
+
+
+def test_without_slurm_the_sweep_says_so(write, physx):
+    pytest.importorskip("submitit")
+    write(run={"executor": "slurm"})
+    said = physx("sweep", "sweep.toml", status=1, SLURM_CONF="/nowhere/slurm.conf")
+    assert "Slurm does not answer" in said

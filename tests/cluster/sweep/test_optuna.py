@@ -1,6 +1,7 @@
 """Optuna's samplers and pruners, whose choices depend on seed and results alone."""
 
 import csv
+import importlib.util
 import statistics
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from physx_cluster.sweep import Definition, Result, run_study
 from physx_cluster.sweep.optuna import OptunaSearch, Pruning
 from physx_cluster.sweep.parameters import Choices, Range
 from physx_cluster.sweep.plan import Plan
-from physx_core.errors import ConfigError, StudyError
+from physx_core.errors import ConfigError, MissingLibraryError, StudyError
 
 pytest.importorskip("optuna")
 
@@ -34,8 +35,10 @@ def history(search, batches=8, size=3, sign=1):
     return found
 
 
-@pytest.mark.parametrize("name", ["tpe", "random", "qmc", "nsgaii"])
+@pytest.mark.parametrize("name", ["tpe", "random", "qmc", "nsgaii", "cmaes"])
 def test_the_same_questions_get_the_same_answers(name):
+    if name == "cmaes":
+        pytest.importorskip("cmaes")
     first, second = history(search(f"optuna/{name}")), history(search(f"optuna/{name}"))
     assert first == second
     assert len({setting["lr"] for setting in first}) > 20
@@ -159,6 +162,19 @@ def test_trials_that_fall_behind_end_early(write):
     assert int(rows[1]["epochs"]) < 4
     assert study.best().trials[0].number == 3
     assert any("pruned" in line for line in said)
+
+
+def test_a_library_that_a_sampler_lacks_is_named_before_anything_runs(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(MissingLibraryError, match=r'"optuna/cmaes" needs the package "cmaes"'):
+        search("optuna/cmaes")
+
+
+def test_fewer_trials_in_a_batch_than_processes_are_said(write):
+    options = {"sampler": "optuna/tpe", "trials": 2, "batch": 1, "run": {"parallel": 2}}
+    said = []
+    run_study(Definition.read(write(**options)), Path("study"), said.append)
+    assert said[1].startswith("note: no more trials than 1 run at the same time")
 
 
 def test_results_that_were_changed_are_noticed(write):

@@ -6,13 +6,13 @@ import contextlib
 import logging
 import os
 import secrets
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from physx_cluster.launchers.slurm_guard import start_guard
 from physx_cluster.launchers.slurm_queue import (
     FORGOTTEN,
     JobState,
@@ -110,7 +110,7 @@ class SlurmLauncher(Launcher):
         local = LocalQueue(self._folder)
         self._queue = local if controller is None else SlurmQueue(name)
         self._local_jobs = local.jobs
-        self._start_guard("" if controller is None else name)
+        self._guard, self._pipe = start_guard(self._folder, "" if controller is None else name)
         self._executor = self._make_executor(name)
         return None if controller is None else address_towards(controller)
 
@@ -202,15 +202,6 @@ class SlurmLauncher(Launcher):
         descriptor = os.open(self._folder / TOKEN, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
         with os.fdopen(descriptor, "w") as file:
             file.write(token)
-
-    def _start_guard(self, name: str) -> None:
-        reading, self._pipe = os.pipe()
-        module = "physx_cluster.launchers.slurm_guard"
-        words = [sys.executable, "-P", "-m", module, str(reading), str(self._folder), name]
-        try:
-            self._guard = ChildProcess(words, pass_fds=[reading], lives_on=True)
-        finally:
-            os.close(reading)
 
     def _jobs_left(self) -> bool:
         states = [self.state_of(handle.job, 0.0) for handle in self._handles.values()]

@@ -14,9 +14,34 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from physx_core.processes import ChildProcess
 
 _PATIENCE = 20.0  # for jobs to leave the queue
 _PAUSE = 0.1
+
+
+def start_guard(folder: Path, name: str) -> tuple[ChildProcess, int]:
+    """Start a guard.
+
+    Args:
+        folder: Folder of the run.
+        name: Name of its jobs in Slurm's queue; empty: they are processes of this machine.
+
+    Returns:
+        The guard, and the descriptor whose closing has it begin.
+    """
+    from physx_core.processes import ChildProcess
+
+    reading, pipe = os.pipe()
+    module = "physx_cluster.launchers.slurm_guard"
+    words = [sys.executable, "-P", "-m", module, str(reading), str(folder), name]
+    try:
+        return ChildProcess(words, pass_fds=[reading], lives_on=True), pipe
+    finally:
+        os.close(reading)
 
 
 def main(descriptor: int, folder: Path, name: str) -> None:

@@ -122,12 +122,16 @@ class Definition:
     pipelines: Mapping[str, PipelineTable]
 
     @classmethod
-    def read(cls, path: Path, name: str | None = None, **run: Any) -> Definition:
+    def read(
+        cls, path: Path, name: str | None = None, *, builds: bool = True, **run: Any
+    ) -> Definition:
         """Read and check a TOML file.
 
         Args:
             path: The file.
             name: Name of the study; None: that of the file.
+            builds: Whether to build the pipelines with the values of the parameters, and to find
+                their components, which imports the plugins.
             run: Options of the table ``[run]`` that replace those of the file.
 
         Raises:
@@ -154,7 +158,7 @@ class Definition:
         made = cls(
             name or path.stem, {**plain, "run": dict(tables["run"])}, study, options, pipelines
         )
-        for each, pipeline in pipelines.items():
+        for each, pipeline in pipelines.items() if builds else ():
             _check_settings(f"{path}: [pipelines.{each}]", pipeline, study.seeds[0])
         return made
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 import math
 import re
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 PREFIX = "optuna/"
 _UNFIT = ("base", "grid", "bruteforce", "partialfixed", "nop", "patient")
 _NAME = "study"
+_NEEDS = {"optuna/cmaes": "cmaes", "optuna/qmc": "scipy", "optuna/gp": "scipy"}
+"""Libraries that samplers import late, in the middle of a study."""
 
 
 class OptunaSearch:
@@ -63,11 +66,7 @@ class OptunaSearch:
         ranges = {n: _distribution(self._library, p) for n, p in self._parameters.items()}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", self._library.exceptions.ExperimentalWarning)
-            try:
-                self._asked = [self._study.ask(ranges) for _ in range(count)]
-            except ImportError as error:  # of what the sampler needs beside Optuna
-                name = str(error.name or error)
-                raise MissingLibraryError("This sampler", name, "optuna", "physx-cluster") from None
+            self._asked = [self._study.ask(ranges) for _ in range(count)]
         return [
             {name: _value(each, trial.params[name]) for name, each in self._parameters.items()}
             for trial in self._asked
@@ -201,13 +200,13 @@ def _create(module: ModuleType, kind: str, reference: str, kwargs: Mapping[str, 
     unknown = kwargs.keys() - names.keys()
     if unknown:
         raise UnknownOptionError(f'The {kind.lower()} "{reference}"', unknown, names)
+    needed = _NEEDS.get(reference)
+    if needed is not None and importlib.util.find_spec(needed) is None:
+        raise MissingLibraryError(f'"{reference}"', needed, "optuna", "physx-cluster")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that it is experimental
             return make(**kwargs)
-    except ImportError as error:
-        name = str(error.name or error)
-        raise MissingLibraryError(f'"{reference}"', name, "optuna", "physx-cluster") from None
     except (TypeError, ValueError) as error:
         raise ConfigError(
             f'The {kind.lower()} "{reference}" refuses its arguments: {error}'

@@ -33,6 +33,7 @@ class Plan:
 
     Attributes:
         total: Number of trials.
+        together: Largest number of trials in a batch.
     """
 
     def __init__(self, definition: Definition) -> None:
@@ -55,6 +56,7 @@ class Plan:
         waits = study.sampler.startswith(PREFIX) or study.pruner is not None
         self._batch = study.batch if waits else max(self._left.values())
         self.total = sum(self._left.values()) * len(self._seeds)
+        self.together = min(self.total, self._batch * len(self._left) * len(self._seeds))
         self._settings, self._trials = 0, 0
         self._last: list[Trial] = []
 

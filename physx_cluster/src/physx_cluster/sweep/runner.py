@@ -36,6 +36,12 @@ def run_study(definition: Definition, folder: Path, say: Say, start: Start | Non
     with Study.open(folder, definition) as study:
         plan = Plan(definition)
         say(f"study: {folder} ({plan.total} trials, {len(study.results)} of them done)")
+        if plan.together < min(definition.run.parallel, plan.total):
+            say(
+                f"note: no more trials than {plan.together} run at the same time, those of a batch "
+                f"(study.batch = {definition.study.batch}), though run.parallel is "
+                f"{definition.run.parallel}"
+            )
         with _Workers(study, start or _start_executor, say, plan.total) as workers:
             while batch := plan.next_batch():
                 for trial in batch:

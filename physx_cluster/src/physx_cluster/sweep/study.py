@@ -80,7 +80,7 @@ class Study(Closeable):
             raise StudyError(
                 f"There is no study in {folder}, as it has no {STUDY}. Make one: physx sweep FILE"
             )
-        return cls(folder, Definition.read(folder / STUDY, folder.resolve().name))
+        return cls(folder, Definition.read(folder / STUDY, folder.resolve().name, builds=False))
 
     @classmethod
     def open(cls, folder: Path, definition: Definition) -> Self:

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import logging
+import os
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+from physx_cluster.launchers.slurm_guard import start_guard
+from physx_cluster.launchers.slurm_queue import FORGOTTEN, JobState, SlurmQueue, find_controller
 from physx_cluster.sweep.executors.executor import (
     PATIENCE,
     Executor,
@@ -16,35 +23,37 @@ from physx_cluster.sweep.executors.executor import (
     variables_of,
 )
 from physx_cluster.sweep.results import OUTPUT
-from physx_core.errors import ConfigError, MissingLibraryError, StudyError
+from physx_core import files
+from physx_core.errors import ConfigError, MissingLibraryError
 from physx_core.processes import ChildProcess
 
 _FOLDER = "jobs"
-_OWN = ("cluster",)
+_TIMEOUTS = 1_000  # after which submitit starts a job again
+_RARELY = 5.0  # s between two questions to the queue
 
 
 class SlurmExecutor(Executor):
-    """Runs each trial as a job of Slurm, or by another executor of submitit.
+    """Runs each trial as a job of Slurm, or as a process of submitit's local executor.
 
     All nodes need the study's folder and the sweep's working directory under the same path, as a
-    shared disk provides them. A job that is preempted or reaches its time limit is requeued, and
-    continues the trial.
+    shared disk provides them. A job that is preempted or reaches its time limit is queued again,
+    and continues the trial. All jobs end with the sweep, even if that is killed.
     """
 
-    interval = 1.0
+    interval = 0.5
 
     def __init__(self, options: Mapping[str, Any], threads: int) -> None:
         """Find Slurm.
 
         Args:
             options: Parameters of submitit's jobs, for example ``timeout_min`` or
-                ``slurm_partition``, and ``cluster``: "slurm", or "local" for jobs on this machine.
+                ``slurm_partition``, and ``cluster``: "slurm", or "local" for processes of this
+                machine.
             threads: Threads of each trial; also what ``cpus_per_task`` is by default.
 
         Raises:
             MissingLibraryError: If submitit is not installed.
-            StudyError: If there is no Slurm here.
-            ConfigError: If submitit does not know an option.
+            ConfigError: If there is no Slurm here.
         """
         try:
             import submitit
@@ -55,64 +64,119 @@ class SlurmExecutor(Executor):
         self._submitit = submitit
         self._options = {"cpus_per_task": threads, **options}
         self._cluster = self._options.pop("cluster", "slurm")
+        if self._cluster not in ("slurm", "local"):
+            raise ConfigError(
+                f'run.options.cluster is {self._cluster!r}, but must be "slurm" or "local".'
+            )
+        if self._cluster == "slurm":
+            find_controller()
+        logging.getLogger("submitit").setLevel(logging.WARNING)
         self._variables = variables_of(threads)
+        self._queue: SlurmQueue | None = None
+        self._states: dict[str, JobState] = {}
+        self._asked = 0.0
         self._executor: Any = None
+        self._guard: ChildProcess | None = None
+        self._pipe = -1
         self._jobs: list[SlurmJob] = []
 
     def start(self, folder: Path) -> SlurmJob:
         """Submit the job of a trial; see `Executor.start`."""
         if self._executor is None:
-            self._executor = self._make(folder.parent)
-        self._executor.update_parameters(name=folder.name)
+            self._open(folder.parent / _FOLDER)
         run = TrialJob(command_of(folder), self._variables, str(folder / OUTPUT))
-        job = SlurmJob(self._executor.submit(run))
-        self._jobs = [each for each in self._jobs if not each.has_ended()]
+        try:
+            submitted = self._executor.submit(run)
+        except self._submitit.core.utils.FailedJobError as error:
+            reason = " ".join(str(error).split()[-60:])
+            raise ConfigError(f"Slurm refuses the job of a trial: {reason}") from None
+        self._asked = 0.0
+        job = SlurmJob(submitted, self)
+        self._jobs = [each for each in self._jobs if not each.is_over]
         self._jobs.append(job)
         return job
 
+    def state_of(self, job: Any) -> JobState:
+        """Return what the queue says of a job; all are asked for at once, now and then."""
+        if self._queue is None:
+            return JobState("FINISHED" if job.done() else "RUNNING")
+        if time.monotonic() - self._asked > _RARELY:
+            found = self._queue.states()
+            self._asked = time.monotonic()
+            self._states = self._states if found is None else found
+        return self._states.get(job.job_id, FORGOTTEN)
+
+    def cancel(self, job: Any) -> None:
+        """End a job."""
+        if self._queue is None:
+            job.cancel(check=False)
+        else:
+            self._queue.cancel([job])
+
     def close(self) -> None:
-        """Cancel all jobs."""
+        """End all jobs."""
         for job in self._jobs:
             job.close()
+        guard, self._guard = self._guard, None
+        if guard is not None:
+            os.close(self._pipe)  # it does the rest, as it would if this process were killed
+            guard.wait()
 
-    def _make(self, study: Path) -> Any:
+    def _open(self, folder: Path) -> None:
+        """Have the jobs end with this process, and with them those that an earlier one left."""
+        name = f"physx-{hashlib.sha256(str(folder).encode()).hexdigest()[:12]}"
+        if self._cluster == "slurm":
+            self._queue = SlurmQueue(name)
+            left = self._queue.states() or {}
+            self._queue.cancel(SimpleNamespace(job_id=each) for each in left)
+        files.make_folder(folder)
         try:
-            executor = self._submitit.AutoExecutor(study / _FOLDER, cluster=self._cluster)
-        except (RuntimeError, ValueError) as error:
-            raise StudyError(
-                f"There is no Slurm here ({error}): log in to a machine that has sbatch, or choose "
-                'another executor (--executor local). run.options.cluster = "local" has submitit '
-                "run the jobs on this machine."
-            ) from None
-        try:
-            executor.update_parameters(**self._options)
+            self._executor = self._submitit.AutoExecutor(
+                folder, self._cluster, slurm_max_num_timeout=_TIMEOUTS
+            )
+            self._executor.update_parameters(name=name, **self._options)
         except (NameError, TypeError, ValueError, AssertionError) as error:
             raise ConfigError(f"submitit refuses the options of the executor: {error}") from None
-        return executor
+        self._guard, self._pipe = start_guard(folder, name if self._queue is not None else "")
 
 
 class SlurmJob(Job):
-    """The job of a trial."""
+    """The job of a trial.
 
-    def __init__(self, job: Any) -> None:
-        self._job = job
-        self._is_over = False
+    Attributes:
+        is_over: Whether it has been seen to have ended.
+    """
+
+    def __init__(self, job: Any, executor: SlurmExecutor) -> None:
+        self._job, self._executor, self.is_over = job, executor, False
 
     def has_ended(self) -> bool:
-        """Return whether it has ended; Slurm is asked for all jobs at once, now and then."""
-        self._is_over = self._is_over or self._job.done()
-        return self._is_over
+        """Return whether it has ended.
+
+        Raises:
+            ConfigError: If Slurm will never start it.
+        """
+        if not self.is_over:
+            state = self._executor.state_of(self._job)
+            if state.is_hopeless:
+                raise ConfigError(
+                    f"Slurm cannot give job {self._job.job_id} what it asks for ({state.reason}). "
+                    "What jobs ask for are run.options, such as timeout_min, mem_gb and "
+                    'slurm_partition; "sinfo" says what there is.'
+                )
+            self.is_over = state.is_over or self._job.paths.result_pickle.exists()
+        return self.is_over
 
     def describe_end(self) -> str:
         """Return its exit status in words, or what Slurm says."""
         with contextlib.suppress(Exception):  # submitit raises whatever it likes
             return describe_status(self._job.result())
-        return f"ended as job {self._job.job_id} in the state {self._job.state}"
+        return f"ended with its job {self._job.job_id}"
 
     def close(self) -> None:
-        """Cancel it."""
-        if not self.has_ended():
-            self._job.cancel(check=False)
+        """End it."""
+        if not self.is_over:
+            self._executor.cancel(self._job)
 
 
 class TrialJob:
