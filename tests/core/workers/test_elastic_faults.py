@@ -113,14 +113,18 @@ def test_clients_that_cannot_start_end_the_run_at_once(clients, monkeypatch, sai
         assert len(said(how + "It is not started again")) == 1
 
 
-def test_a_slow_client_is_named_once(clients, taking, said, monkeypatch):
+@pytest.mark.parametrize(
+    ("elastic", "name"),
+    [({"min_clients": 4}, rf"client \d on {HOST}"), ({}, r"its client at 127\.0\.0\.1:\d+")],
+)
+def test_a_slow_client_is_named_once(clients, taking, said, monkeypatch, elastic, name):
     monkeypatch.setattr("physx_core.workers.server.pace._HELD", 0.5)
     environment = f"{PROGRAMS / 'elastic_envs.py'}:Slow"
-    with clients(environment, num_clients=4, min_clients=4, run_ahead=4) as source:
+    with clients(environment, num_clients=4, run_ahead=4, **elastic) as source:
         taking(source).take(*[4] * 40)
     (text,) = said("The run waits for instance")
     pattern = (
-        rf"The run waits for instance 3: client \d on {HOST} takes [\d.]+ ms for a row, ([\d.]+) "
+        rf"The run waits for instance 3: {name} takes [\d.]+ ms for a row, ([\d.]+) "
         "times as long as the median of the instances"
     )
     assert float(re.match(pattern, text)[1]) > 2
