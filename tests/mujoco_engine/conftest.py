@@ -4,8 +4,6 @@ import pytest
 
 from physx_core import plugins
 
-mujoco = pytest.importorskip("mujoco")
-
 
 @pytest.fixture
 def backend():

@@ -10,6 +10,8 @@ import pytest
 from physx_core import Box, JointSettings, PhysxError, Robot, World, Wrench
 from physx_core.engines import named_robots, read_robot, rigid_bodies
 
+pytest.importorskip("mujoco")
+
 ROBOTS = sorted(named_robots())
 
 

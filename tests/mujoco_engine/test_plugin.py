@@ -14,6 +14,8 @@ import pytest
 
 from physx_core import Dataset
 
+pytest.importorskip("mujoco")
+
 ROOT = Path(__file__).parents[2]
 ENGINE = ROOT / "examples/mujoco_engine"
 

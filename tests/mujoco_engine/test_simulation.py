@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -31,6 +30,8 @@ from physx_core.errors import (
     UnknownOptionError,
 )
 from physx_core.rotations import to_matrix
+
+mujoco = pytest.importorskip("mujoco")
 
 WEIGHT = 9.81
 JOINTS = ("gantry_x", "gantry_y")
