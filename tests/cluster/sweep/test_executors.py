@@ -40,13 +40,14 @@ def whole(write, training, physx):
     return Path("studies/whole/trials.csv").read_bytes()
 
 
-def kill_one(study, deadline=120):
-    """Kill the process of a trial once it has a checkpoint."""
+def kill_one(study, deadline=120, *, parent=False):
+    """Kill the process of a trial, or the one that started it, once it has a checkpoint."""
     end = time.monotonic() + deadline
     while time.monotonic() < end:
         for name, pid in processes(study).items():
             if list(Path(study, name).glob("network/*/checkpoint.toml")):
-                os.kill(pid, signal.SIGKILL)
+                stat = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+                os.kill(int(stat[1]) if parent else pid, signal.SIGKILL)
                 return
         time.sleep(0.02)
     pytest.fail("no trial has come to a checkpoint")
@@ -123,6 +124,16 @@ def test_slurm_runs_trials_and_keeps_none_when_the_sweep_is_killed(
         assert time.monotonic() < deadline
         time.sleep(0.1)
     assert start("sweep.toml", "studies/there").wait(200) == 0
+    assert Path("studies/there/trials.csv").read_bytes() == whole
+    assert parameters_of("studies/there") == parameters_of("studies/whole")
+
+
+def test_a_worker_that_ray_loses_is_replaced(write, whole, parameters_of):
+    pytest.importorskip("ray")
+    write(run={"executor": "ray", "options": {"address": "local"}})
+    sweep = start("sweep.toml", "studies/there")
+    kill_one("studies/there", parent=True)
+    assert sweep.wait(200) == 0
     assert Path("studies/there/trials.csv").read_bytes() == whole
     assert parameters_of("studies/there") == parameters_of("studies/whole")
 

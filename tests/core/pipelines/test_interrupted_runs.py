@@ -21,6 +21,7 @@ from physx_core import (
     Training,
     checkpoint,
     files,
+    read_scalars,
 )
 from physx_core.cli import main
 from physx_core.errors import ConfigError, DivergedError, EnvironmentFailedError
@@ -89,6 +90,38 @@ def test_a_training_that_is_killed_while_it_removes_a_checkpoint_resumes(monkeyp
     last = [Path(f"sessions/{name}/network/network_12") for name in ("training", "whole")]
     one, two = (np.load(path / "parameters.npz")["weights"] for path in last)
     assert one.tobytes() == two.tobytes()
+
+
+def test_a_checkpoint_after_each_epoch_is_one_to_resume_from():
+    network = NetworkConfig(Linear, optimization=Descending)
+    options = {**OPTIONS, "checkpoint_every": "epoch"}
+    Training(network, DATA, session_name="whole", **options).execute()
+    assert checkpoints("whole") == [f"network_{n}" for n in (1, 2, 3)]
+    assert [progress("whole", n) for n in (1, 2, 3)] == [(1, 4), (2, 4), (3, 0)]
+
+    class Killed(Training):
+        def batch_begin(self):
+            if self.epoch_id == 2 and self.batch_id == 1:
+                raise SystemExit  # without a word, as by a kill
+            super().batch_begin()
+
+        def save_checkpoint(self):
+            return super().save_checkpoint() if self.batch_id != 1 else None
+
+    with pytest.raises(SystemExit):
+        Killed(network, DATA, **options).execute()
+    Training(network, DATA, resume=True, **options).execute()
+    last = [Path(f"sessions/{name}/network") for name in ("training", "whole")]
+    newest = [max(place.glob("network_[0-9]"), key=lambda p: p.name) for place in last]
+    one, two = (np.load(path / "parameters.npz")["weights"] for path in newest)
+    assert one.tobytes() == two.tobytes()
+    assert read_scalars(Path("sessions/training")) == read_scalars(Path("sessions/whole"))
+
+
+def test_checkpoint_every_is_a_number_or_epoch():
+    for wrong in (-1, "batch"):
+        with pytest.raises(ConfigError, match="checkpoint_every"):
+            Training(NETWORK, DATA, **OPTIONS, checkpoint_every=wrong)
 
 
 # SIGTERM ------------------------------------------------------------------------------------------
