@@ -232,15 +232,14 @@ class _Nodes:
         self.places: dict[int, tuple[Any, int, Bundle]] = {}
         environment = dict(runtime_env or {})
         environment["env_vars"] = {**environment.get("env_vars", {}), **_LEAVE_CHILDREN}
-        self._actor: Any = ray.remote(num_cpus=0, max_concurrency=_CALLS, runtime_env=environment)(
-            Agent
-        )
+        options: dict[str, Any] = {"num_cpus": 0, "max_concurrency": _CALLS}
+        options["runtime_env"] = environment
+        self._actor: Any = ray.remote(**options)(Agent)
         self._agents: dict[Any, Any] = {}
         self._here = Agent()  # on this process's node there is no need for another process
         self._own_node = ray.get_runtime_context().get_node_id()
         self._is_plain = runtime_env is None
         self._groups: list[Any] = []
-        self._tasks: set[Any] = set()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._thread.start()
