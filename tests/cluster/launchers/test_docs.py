@@ -25,7 +25,8 @@ def test_three_commands_lead_to_two_nodes(runs):
     expected = runs.rows()
     folder, [port] = tempfile.mkdtemp(prefix="ray", dir="/tmp"), free_ports(1)
     place = f"127.0.0.1:{port}"
-    variables = {**os.environ, "RAY_TMPDIR": folder}
+    own = {"RAY_TMPDIR": folder, "HOME": folder}  # in the user's home Ray may have a token
+    variables = {**os.environ, **own}
 
     def ray(*words):
         program = [sys.executable, "-c", "from ray.scripts.scripts import main; main()"]
@@ -40,7 +41,7 @@ def test_three_commands_lead_to_two_nodes(runs):
         ray(*(word.replace("LAPTOP:6379", place) for word in other), "--num-cpus", "1")
         words = generate[generate.index("--environment.launcher") :]
         launcher = words[: words.index("--environment.num-clients")]
-        assert runs.same(runs.rows(*launcher, RAY_TMPDIR=folder), expected)
+        assert runs.same(runs.rows(*launcher, **own), expected)
         assert len(runs.clients()) == 4
     finally:
         end_processes_with(folder)
