@@ -39,6 +39,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/dataset.py
 	$(BIN)/python benchmarks/crash.py
 	$(BIN)/python benchmarks/checkpoint.py
+	$(BIN)/python benchmarks/cluster_sweep.py
 	$(BIN)/python benchmarks/backends.py
 	$(BIN)/python benchmarks/differentiable.py
 	$(BIN)/python benchmarks/physics.py
