@@ -77,7 +77,8 @@ def given(tmp_path, monkeypatch):
             monkeypatch.syspath_prepend(tmp_path)
             return {"arguments": {"generator": "chance:Chance"}}
         if reference == "external/program":
-            return {"arguments": {"program": heat(tmp_path / "heat")}}
+            words = [heat(tmp_path / "heat"), "4", "20", "10"]
+            return {"arguments": {"program": words, "parameters": {"alpha": 0.1}}}
         return GIVEN.get(reference, GIVEN.get(f"{kind} {reference}", {}))
 
     return find
@@ -92,7 +93,7 @@ def heat(program):
     return str(program)
 
 
-@pytest.mark.parametrize(("kind", "reference"), components())
+@pytest.mark.parametrize(("kind", "reference"), list(components()))
 def test_a_component_keeps_its_contract(kind, reference, given, nothing_stays_behind):
     (report,) = check_plugin(reference, kind=kind, **given(kind, reference))
     counts = report.counts()

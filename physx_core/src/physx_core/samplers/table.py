@@ -57,7 +57,7 @@ class Table(Sampler):
     def ask(self, number: int) -> dict[str, Any]:
         """Return the values of a set."""
         row = number % self.count
-        return {name: column[row] for name, column in self._columns.items()}
+        return {name: column[row].copy() for name, column in self._columns.items()}
 
     def _check(self, row: int) -> None:
         try:

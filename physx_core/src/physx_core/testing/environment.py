@@ -123,6 +123,15 @@ def _instance(
         instance.close()
 
 
+def _refuses(subject: Subject) -> None:
+    refuses_unknown_options(subject, _open)
+
+
+def _open(subject: Subject) -> None:
+    with _instance(subject, 1, 1, Services()):
+        pass
+
+
 def _steps(subject: Subject) -> None:
     with _instance(subject, 1, 1, Services()) as instance:
         promised = {field.name: field for field in instance.fields}
@@ -252,7 +261,7 @@ def _takes_identity(subject: Subject) -> None:
 
 CHECKS: dict[str, Check] = {
     "takes its place among the instances": _takes_identity,
-    "refuses unknown options": refuses_unknown_options,
+    "refuses unknown options": _refuses,
     "gives every field in each step, finite and of its shape and type": _steps,
     "gives the same rows with the same seed": _repeats,
     "gives other rows with another seed": _uses_seed,

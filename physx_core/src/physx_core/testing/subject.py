@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from physx_core.components import Parameter
 from physx_core.config import NetworkConfig, from_plain
-from physx_core.errors import ConfigError, PhysxError, UnknownOptionError
+from physx_core.errors import ConfigError
 from physx_core.fields import Field
 from physx_core.plugins import resolve
 from physx_core.typing import Batch
@@ -66,23 +66,30 @@ Check: TypeAlias = Callable[[Subject], None]
 """Raises if the component does not do what the check's name says."""
 
 
-def refuses_unknown_options(subject: Subject) -> None:
-    """Check that a misspelt option is an error, and not swallowed."""
+def refuses_unknown_options(subject: Subject, use: Check | None = None) -> None:
+    """Check that a misspelt option is an error, and not swallowed.
+
+    Args:
+        subject: The component.
+        use: Creates it and begins to use it, where only that uses its options; None: creates it.
+    """
+    arguments = {**subject.arguments, _UNKNOWN: 1}
     try:
-        made = subject.make(**{_UNKNOWN: 1})
-    except (TypeError, UnknownOptionError, ConfigError):
-        return
-    except PhysxError as error:
-        if _UNKNOWN in str(error):
+        (use or _create)(replace(subject, arguments=arguments))
+    except Exception as error:
+        if isinstance(error, TypeError | ConfigError) or _UNKNOWN in str(error):
             return
         raise
-    close = getattr(made, "close", None)
+    raise AssertionError(
+        "it takes an option that nobody knows, so a user's misspelling would have no effect: name "
+        "the options, and hand **kwargs to super().__init__()"
+    )
+
+
+def _create(subject: Subject) -> None:
+    close = getattr(subject.make(), "close", None)
     if callable(close):
         close()
-    raise AssertionError(
-        "its constructor takes an option that nobody knows, so a user's misspelling would have no "
-        "effect: name the options, and hand **kwargs to super().__init__()"
-    )
 
 
 def expect(condition: Any, message: str) -> None:
