@@ -10,6 +10,8 @@ import json
 import math
 import os
 import shutil
+import subprocess
+import sys
 import tempfile
 import warnings
 from pathlib import Path
@@ -30,6 +32,7 @@ from hypothesis.stateful import (
 from physx_core import Dataset, Field
 from physx_core.dataset.read import reader as reading
 from physx_core.dataset.read.strategies import disk, prefetch, windows
+from physx_core.dataset.repair.report import find_problems
 from physx_core.dataset.store import locks, manifest_file
 from physx_core.dataset.store.partition import commits
 from physx_core.dataset.store.partition import format as partition_format
@@ -470,19 +473,29 @@ def test_the_flat_index_finds_what_the_spans_say():
             assert rows == [wanted[row] for row in range(start, stop)]
 
 
-def test_a_file_has_one_writer_at_a_time(folder, monkeypatch):
+def test_a_stripe_has_one_writer_at_a_time(folder, monkeypatch):
+    """A process that is alive keeps its stripe; at its end the next one gets it at once."""
     monkeypatch.setattr(locks, "_PATIENCE", 0.1)
     with Dataset.create(folder) as dataset:
-        stripes = dataset.stripes("training", 2)
-        stripes.define(FIELDS)
-        stripes.begin()
-        writers = [StripeWriter(folder, FIELDS, stripes.capacity) for _ in range(2)]
-        for writer in writers:
-            writer.add(0, stripes.entries(0)[0])
-        with writers[0], writers[1]:
-            writers[0].append(values([0]), 1)
-            with pytest.raises(DatasetError, match="still written by an earlier client"):
-                writers[1].append(values([0]), 1)
+        dataset.stripes("training", 2)
+        proof = folder / "dataset.clients"
+        holder = (
+            "import sys; from pathlib import Path; from physx_core.dataset.store import locks; "
+            "locks.take_over(Path(sys.argv[1]), 1); print('holds', flush=True); sys.stdin.read()"
+        )
+        process = subprocess.Popen(
+            [sys.executable, "-c", holder, str(proof)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout.readline() == "holds\n"
+        os.close(locks.take_over(proof, 0))
+        with pytest.raises(DatasetError, match="still writes the rows of instance 2"):
+            locks.take_over(proof, 1)
+        process.kill()
+        process.communicate()
+        os.close(locks.take_over(proof, 1))
 
 
 def test_manifests_with_impossible_stripes_are_refused(folder):
@@ -499,12 +512,27 @@ def test_manifests_with_impossible_stripes_are_refused(folder):
     text = path.read_text()
     plain = json.loads(text)
     assert plain["format_version"] == 2
-    for place, stripe in [(0, [1, 3]), (1, [0, 3]), (2, [2, 4]), (0, [3, 3]), (0, [0, 1]), (1, 7)]:
+    wrong = [
+        (2, {"stripe": [2, 4]}, "do not follow"),
+        (1, {"stripe": [0, 3], "first_row": 0}, "do not follow"),
+        (0, {"stripe": [3, 3]}, "place of a stripe"),
+        (0, {"stripe": [0, 1]}, "number of stripes"),
+        (1, {"stripe": 7}, "a stripe cannot be 7"),
+        (2, {"rows": 0}, "do not fit together"),
+        (0, {"rows": 1}, "do not fit together"),
+        (1, {"sealed": False}, "some stripes"),
+    ]
+    for place, changes, problem in wrong:
         changed = json.loads(text)
-        changed["modes"]["training"]["partitions"][place]["stripe"] = stripe
+        changed["modes"]["training"]["partitions"][place] |= changes
         path.write_text(json.dumps(changed))
-        with pytest.raises(DatasetError, match="stripe"):
+        with pytest.raises(DatasetError, match=problem):
             manifest_file.load(folder, edited=True)
+    changed = json.loads(text)
+    changed["modes"]["training"]["partitions"][0]["stripe"] = [1, 3]
+    path.write_text(json.dumps(changed))
+    found = find_problems(folder, manifest_file.load(folder, edited=True))
+    assert all("has another stripe" in problem for problem in found) and len(found) == 3
     path.write_text(text)
     with Dataset.open(folder) as dataset:
         check(dataset, list(range(6)))

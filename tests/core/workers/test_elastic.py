@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physx_core import DataGeneration, Dataset, DatasetConfig, EnvironmentConfig
+from physx_core import Dataset, EnvironmentConfig
 from physx_core.errors import ConfigError, TooFewClientsError
 
 PROGRAMS = Path(__file__).parents[1] / "programs"
@@ -173,10 +173,6 @@ def test_what_cannot_be_combined_is_refused(clients, local):
         clients(min_clients=3, max_clients=2)
     with pytest.raises(ConfigError, match=r"runs in this process.*leave them out"):
         local("Plain", min_clients=1)
-    elastic = EnvironmentConfig("toy/spring", num_clients=2, max_clients=1)
-    stored = DatasetConfig(writers="clients")
-    with pytest.raises(ConfigError, match="an instance may go to another client while the former"):
-        DataGeneration(elastic, stored, batch_nb=1, batch_size=1).execute()
     with pytest.raises(ConfigError, match="max_clients is 0 but must be at least 1"):
         EnvironmentConfig("toy/spring", max_clients=0)
 

@@ -164,12 +164,6 @@ def check_client_writers(config: EnvironmentConfig) -> None:
         raise ConfigError(
             f"{clients}, but redraw needs the rows in the run's process. Use writers='server'."
         )
-    if config.is_elastic:
-        raise ConfigError(
-            f"{clients}, but with min_clients or max_clients an instance may go to another client "
-            "while the former one, which does not answer, still writes. Use writers='server', or "
-            "leave out min_clients and max_clients."
-        )
 
 
 def reject_client_writers(config: DatasetConfig, what: str) -> None:

@@ -72,29 +72,37 @@ def share(directory: Path, descriptor: int) -> None:
         raise _locked(directory, descriptor) from None
 
 
-def take_over(descriptor: int, path: Path) -> None:
-    """Lock a partition file for the process that writes its next rows, until it is closed.
+def take_over(path: Path, place: int) -> int:
+    """Lock one byte of a file for the process that writes a stripe; closing it releases the lock.
 
-    A process whose place it takes may need a moment to end.
+    A process whose place it takes may need a moment to end. As the system releases the lock at its
+    end, nothing is written by both.
+
+    Returns:
+        The descriptor.
 
     Raises:
         DatasetError: If another process keeps it.
     """
+    descriptor = files.open_regular(path, os.O_RDWR)
     until = time.monotonic() + _PATIENCE
-    while True:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if time.monotonic() > until:
-                raise DatasetError(
-                    f"{path} is still written by an earlier client, {_PATIENCE:g} s after another "
-                    "one has taken its place. End it, or wait until it has noticed."
-                ) from None
-            time.sleep(_PAUSE)
-        except OSError:  # a file system without locks
-            return
-        else:
-            return
+    try:
+        while True:
+            try:
+                fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
+            except (BlockingIOError, PermissionError):
+                if time.monotonic() > until:
+                    raise DatasetError(
+                        f"An earlier client still writes the rows of instance {place + 1} to "
+                        f"{path.parent}, {_PATIENCE:g} s after another one has taken its place. "
+                        "End it; its machine may have lost its connection to the run."
+                    ) from None
+                time.sleep(_PAUSE)
+            else:
+                return descriptor
+    except BaseException:
+        files.close(descriptor)
+        raise
 
 
 @contextlib.contextmanager

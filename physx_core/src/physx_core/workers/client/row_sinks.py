@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from physx_core import files
+from physx_core.dataset.store import locks
 from physx_core.dataset.store.manifest import Partition, has_statistics
 from physx_core.dataset.store.partition.format import Stripe
 from physx_core.dataset.write.stripe_writer import StripeWriter
@@ -93,7 +94,7 @@ class StripedRows:
         """
         self._link, self._setup = link, setup
         self._directory = Path(setup["directory"])
-        self._told = 0
+        self._told, self._lock = 0, -1
         self._writer: StripeWriter | None = None
         self.ended = False
 
@@ -101,9 +102,13 @@ class StripedRows:
         """Prove that this is the server's folder, and continue the partitions in it.
 
         Raises:
-            DatasetError: If the folder is not there, or is another one.
+            DatasetError: If the folder is not there, or is another one, or another process
+                writes the same rows.
         """
-        self._prove()
+        path = self._directory / self._setup["file"]
+        self._prove(path)
+        with files.storing(f"The rows of this client in {self._directory}"):
+            self._lock = locks.take_over(path, self._setup["place"])
         self._told = rows
         for number, plain in self._setup["partitions"]:
             self._add(number, plain)
@@ -142,12 +147,16 @@ class StripedRows:
         return frame.kind in (Kind.PARTITION, Kind.SEAL)
 
     def close(self) -> None:
-        """Close the files."""
-        if self._writer is not None:
-            self._writer.close()
+        """Close the files; another client may write the rows from then on."""
+        try:
+            if self._writer is not None:
+                self._writer.close()
+        finally:
+            if self._lock >= 0:
+                files.close(self._lock)
+                self._lock = -1
 
-    def _prove(self) -> None:
-        path = self._directory / self._setup["file"]
+    def _prove(self, path: Path) -> None:
         try:
             proof = files.read_content(path, _LARGEST_PROOF)
         except OSError as error:

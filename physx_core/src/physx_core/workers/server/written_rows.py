@@ -44,6 +44,7 @@ class WrittenRows:
             "host": socket.gethostname(),
             "directory": str(stripes.directory.resolve()),
             "file": PROOF,
+            "place": peer.instance_id - 1,
             "partitions": [(number, self._plain(entry)) for number, entry in known.items()],
         }
 

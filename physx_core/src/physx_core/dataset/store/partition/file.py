@@ -12,7 +12,6 @@ from xxhash import xxh3_64
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
-from physx_core.dataset.store import locks
 from physx_core.dataset.store.partition.commits import COUNT, RECORD, Commit, digest_of, encode
 from physx_core.dataset.store.partition.digesting import LARGE, Digester
 from physx_core.dataset.store.partition.format import Header, Identity, inspect, make_header
@@ -102,7 +101,6 @@ class PartitionFile:
         path = directory / identity.file_name
         descriptor = files.open_regular(path, os.O_RDWR)
         try:
-            locks.take_over(descriptor, path)
             found = inspect(path)
             if found.identity != identity or found.rows < rows:
                 raise DatasetError(f"{path} is not the partition that was to be continued.")
