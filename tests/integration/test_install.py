@@ -116,3 +116,13 @@ def test_remote_works_with_the_core_alone(empty, run, tmp_path):
     python = empty("physx_core", "physx_remote")
     (tmp_path / "program.py").write_text(SERVE)
     assert "1.0 reward" in run("program.py", python=python).stdout
+
+
+def test_the_plugin_of_clusters_works_with_the_core_alone(empty, run):
+    python = empty("physx_core", "physx_cluster")
+    words = ("generate", "toy/spring", *GENERATE.split(), "--environment.launcher")
+    for name, library in (("cluster/ray", "Ray"), ("cluster/slurm", "submitit")):
+        missing = run(*PHYSX, *words, name, python=python, ok=False)
+        assert missing.returncode == 1
+        assert f"needs {library}" in missing.stderr
+        assert "physx_cluster" in missing.stderr and "pip install" in missing.stderr

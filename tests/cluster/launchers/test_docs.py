@@ -15,6 +15,8 @@ from one_node_slurm import free_ports
 
 pytest.importorskip("ray")
 
+pytestmark = pytest.mark.slow
+
 PAGE = Path(__file__).parents[3] / "docs" / "cluster.md"
 
 

@@ -12,6 +12,8 @@ import pytest
 
 pytest.importorskip("ray")
 
+pytestmark = pytest.mark.slow
+
 RAY = ("--environment.launcher", "cluster/ray")
 KWARGS = "--environment.launcher-kwargs"
 
