@@ -19,7 +19,8 @@ HERE = Path(__file__).resolve().parent
 BENCHMARKS = HERE.parent / "benchmarks"
 PAGE, KEPT = HERE / "figures.md", HERE / "figures"
 MARK = "<!-- What follows is written by figures.py. -->"
-OTHERS = {"compare", "jiminy_zoo", "remote_servers"}  # which others start
+# Those that others start:
+OTHERS = {"compare", "jiminy_zoo", "many_clients", "remote_servers", "transport_costs"}
 
 
 def names() -> list[str]:
