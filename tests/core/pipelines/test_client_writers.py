@@ -207,6 +207,29 @@ def test_a_client_that_leaves_an_elastic_run_has_its_instances_continued(
     assert_same(rows(folder), wanted)
 
 
+def test_a_full_disk_keeps_all_rows_before_it(small_disk, nothing_stays_behind):
+    with (
+        pytest.raises(DatasetError, match="the disk is full"),
+        DataGeneration(
+            EnvironmentConfig(f"{PROGRAM}:Large", num_clients=2, seed=3),
+            DatasetConfig(writers="clients", max_file_size=1e-3),
+            batch_nb=1000,
+            batch_size=10,
+            session_dir=str(small_disk),
+            session_name="full",
+            quiet=True,
+        ) as run,
+    ):
+        run.execute()
+    with Dataset.open(small_disk / "full") as dataset:
+        count = dataset.num_samples("training")
+        assert count > 50
+        row = np.arange(count)
+        wanted = row // 2 + (row % 2 + 1) / 10
+        np.testing.assert_array_equal(dataset["training"]["x"][:][:, -1], wanted)
+        assert dataset.verify() == []
+
+
 def test_what_was_written_before_an_error_stays(nothing_stays_behind):
     wanted = rows(generate("server", "server", batches=3, size=60))
     with pytest.raises(NotFiniteError, match='field "x"'):

@@ -53,6 +53,19 @@ class Steps(Environment):
         return self.rng.random() < 0.8
 
 
+class Large(Steps):
+    """Fills a small disk."""
+
+    def init_database(self):
+        self.define_training_fields(Field("x", shape=(5000,)))
+
+    def step(self):
+        self.set_training_data(x=np.full(5000, self.step_index + self.instance_id / 10))
+
+    def check_sample(self):
+        return True
+
+
 class Gaps(Steps):
     """Comes upon NaN."""
 
