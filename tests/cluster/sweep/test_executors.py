@@ -11,7 +11,7 @@ import pytest
 from one_node_slurm import Slurm
 from sweep_kills import processes, start
 
-pytestmark = pytest.mark.usefixtures("nothing_stays_behind")
+pytestmark = [pytest.mark.usefixtures("nothing_stays_behind"), pytest.mark.slow]
 
 
 @pytest.fixture

@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 from sweep_kills import processes, start, sweep_with_kills
 
-from physx_core import read_scalars
+from physx_cluster.sweep import Definition, Study
+from physx_cluster.sweep.plan import Plan
+from physx_core import DataGeneration, EnvironmentConfig, read_scalars
 
-pytestmark = pytest.mark.usefixtures("nothing_stays_behind")
+pytestmark = [pytest.mark.usefixtures("nothing_stays_behind"), pytest.mark.slow]
 EPOCHS, BATCHES = 4, 8
 
 
@@ -90,11 +92,19 @@ def test_data_that_were_cut_short_are_generated_anew(write, slow, physx, paramet
         parameters={"training.network.lr": [0.1]},
     )
     physx("sweep", "sweep.toml", "--study", "studies/whole")
-    # As a kill leaves it: some of the rows, and no word that they are all.
-    physx("sweep", "sweep.toml", "--study", "studies/killed")
-    folder = Path("studies/killed/trial_0001")
-    for name in ("result.toml", "generated"):
-        (folder / name).unlink()
+    definition = Definition.read(Path("sweep.toml"))
+    with Study.open(Path("studies/killed"), definition) as study:
+        for trial in Plan(definition).next_batch():
+            study.prepare(trial)
+    DataGeneration(  # what a process leaves that is killed after two of five batches
+        EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=0),
+        session_dir="studies/killed",
+        session_name="trial_0001",
+        new_session=False,
+        batch_nb=2,
+        batch_size=20,
+        quiet=True,
+    ).execute()
     physx("sweep", "sweep.toml", "--study", "studies/killed")
     check(parameters_of)
 
