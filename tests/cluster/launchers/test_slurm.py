@@ -13,10 +13,10 @@ from one_node_slurm import wait_for
 
 pytest.importorskip("submitit")
 
-pytestmark = pytest.mark.slow
-
 from physx_cluster import SlurmLauncher
 from physx_core.errors import ConfigError
+
+pytestmark = pytest.mark.slow
 
 TOKEN = "a token that nobody sees"
 
