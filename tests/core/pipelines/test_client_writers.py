@@ -343,6 +343,28 @@ def test_a_client_that_sees_another_folder_is_refused(content, error, text, noth
     assert not Path("sessions/clients").exists()
 
 
+@pytest.mark.parametrize(
+    ("message", "text"),
+    [
+        ({"kind": "WRITTEN", "number": 10**6}, "rows that nobody asked for"),
+        ({"kind": "WRITTEN", "number": 0}, "rows that nobody asked for"),
+        ({"kind": "ROWS", "number": 1}, "sent ROWS, which a client may not send"),
+        ({"kind": "FOLDER", "number": 0}, "it is not the same folder"),
+        ({"kind": "SEALED", "number": 0, "value": {"rows": 1}}, "impossible numbers"),
+        ({"kind": "SEALED", "number": 0, "value": {"checksums": 3}}, "impossible numbers"),
+        ({"kind": "SEALED", "number": 99, "value": "x"}, "impossible numbers"),
+        ({"kind": "SEALED", "number": 0, "value": "plausible"}, "did not seal its partition 0"),
+        ({"kind": "SEALED", "number": 99, "value": "plausible"}, "did not seal its partition 99"),
+    ],
+)
+def test_a_client_that_breaks_a_rule_is_cut_off(message, text, nothing_stays_behind):
+    with pytest.raises(ClientError, match=text):
+        generate("clients", environment=f"{PROGRAM}:Rogue", batches=20, env_kwargs=message)
+    if Path("sessions/clients").exists():  # it is removed if no row was complete by then
+        with Dataset.open("sessions/clients") as dataset:
+            assert dataset.verify() == []
+
+
 def test_nobody_else_changes_the_rows_meanwhile(nothing_stays_behind):
     class Meddling(DataGeneration):
         def batch_end(self):

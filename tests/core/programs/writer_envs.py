@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
 import time
 from pathlib import Path
@@ -21,6 +22,8 @@ from physx_core import (
     Field,
     Parameter,
 )
+from physx_core.net import Kind, pack
+from physx_core.net.values import encode
 from physx_core.workers.launchers import SubprocessLauncher
 
 
@@ -64,6 +67,41 @@ class Large(Steps):
 
     def check_sample(self):
         return True
+
+
+class Rogue(Steps):
+    """Sends a message of its own, which a client would not send."""
+
+    def __init__(self, *, kind: str, number: int, value=None, **kwargs):
+        super().__init__(**kwargs)
+        if value == "plausible":
+            names = ("mean", "std", "minimum", "maximum")
+            value = {
+                "rows": 3,
+                "checksums": dict.fromkeys(("x", "n", "f", "env_id", "episode", "step"), 0),
+                "statistics": {
+                    name: {"count": 3, **{each: np.zeros(shape) for each in names}}
+                    for name, shape in (("x", 30), ("f", ()))
+                },
+            }
+        self.message = pack(Kind[kind], encode(value), number)
+
+    def step(self):
+        super().step()
+        if self.instance_id == 2 and self.step_index == 5:
+            connection().sendall(self.message)
+
+
+def connection():
+    """The client's connection to its server, found among the open files of the process."""
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            found = socket.socket(fileno=os.dup(int(entry.name)))
+            found.getpeername()
+        except OSError:
+            continue
+        return found
+    raise LookupError("no connection")
 
 
 class Gaps(Steps):
