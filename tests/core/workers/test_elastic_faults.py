@@ -10,6 +10,7 @@ import os
 import re
 import signal
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -162,6 +163,28 @@ def wait_for(said, pattern):
     deadline = time.monotonic() + 60
     while not said(pattern) and time.monotonic() < deadline:
         time.sleep(0.05)
+
+
+@pytest.mark.parametrize("launcher", ["physx/subprocess", "physx/manual"])
+def test_nothing_is_left_of_a_run_that_is_killed(join, port, launcher):
+    """What the environments started is gone, too, as `nothing_stays_behind` checks."""
+    options = {"num-clients": 3, "max-clients": 2, "port": port, "launcher": launcher}
+    words = [word for name, value in options.items() for word in (f"--environment.{name}", value)]
+    words += ["--environment.env-kwargs", "fault=fail", "place=never", "pace=0.01"]
+    command = [sys.executable, "-m", "physx_core", "generate", WANDERER, *map(str, words)]
+    run = subprocess.Popen([*command, "--batch-nb", "100000", "--batch-size", "3"])
+    by_hand = join() if launcher == "physx/manual" else None
+    try:
+        deadline = time.monotonic() + 60
+        while len(list(Path().glob("started-*"))) < 3 and time.monotonic() < deadline:
+            time.sleep(0.05)
+    finally:
+        run.kill()
+        run.wait()
+    assert len(list(Path().glob("started-*"))) >= 3
+    if by_hand is not None:
+        assert by_hand.wait(60) == 1
+        assert "the server is gone" in by_hand.stdout.read()
 
 
 # Workers ----------------------------------------------------------------------------------------
