@@ -47,7 +47,7 @@ class Chance:
         self.random = np.random.default_rng(abs(hash(sum(one["loss"] for one in results))))
 """
 ELSEWHERE = {"cluster/ray", "cluster/slurm"}
-"""Components that need more than this machine has: tests/cluster checks them."""
+"""Launchers that need a cluster."""
 
 
 def components():

@@ -151,6 +151,16 @@ def _launched(
         launcher.close()
 
 
+def _refuses(subject: Subject) -> None:
+    refuses_unknown_options(subject, _start)
+
+
+def _start(subject: Subject) -> None:
+    if not subject.make().by_hand:
+        with _launched(subject, (1,)):
+            pass
+
+
 def _starts(subject: Subject) -> None:
     with _launched(subject, (1, 2, 4)) as run:
         numbers = [handle.instance_id for handle in run.handles]
@@ -325,7 +335,7 @@ def _quiet(subject: Subject) -> None:
 
 
 CHECKS: dict[str, Check] = {
-    "refuses unknown options": refuses_unknown_options,
+    "refuses unknown options": _refuses,
     "starts a client for each instance": _starts,
     "keeps the token off command lines": _hides_token,
     "terminates clients": _terminates,
