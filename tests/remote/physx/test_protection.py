@@ -152,6 +152,7 @@ def test_the_end_of_a_service_is_told_and_that_of_a_connection_is_no_answer(serv
     env = connect(text(service), token=TOKEN)
     env.reset()
     service.close()
+    service.thread.join(PATIENCE)
     with pytest.raises(RemoteClosedError):
         env.step(np.zeros(2))
     env.close()
