@@ -128,6 +128,25 @@ def test_slurm_runs_trials_and_keeps_none_when_the_sweep_is_killed(
     assert parameters_of("studies/there") == parameters_of("studies/whole")
 
 
+def test_a_job_that_slurm_preempts_continues_its_trial(
+    write, training, whole, parameters_of, slurm
+):
+    pytest.importorskip("submitit")
+    training["network"]["optimization_kwargs"] = {"pause": 0.15}
+    write(run={"parallel": 1, "executor": "slurm", "options": {"slurm_partition": "low"}})
+    sweep = start("sweep.toml", "studies/there")
+    deadline = time.monotonic() + 60
+    while not list(Path("studies").glob("there/trial_0001/network/*/checkpoint.toml")):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    slurm.ask("sbatch", "-phigh", "-n4", "--output=/dev/null", "--wrap=sleep 1")
+    assert sweep.wait(200) == 0
+    assert Path("studies/there/trials.csv").read_bytes() == whole
+    assert parameters_of("studies/there") == parameters_of("studies/whole")
+    output = Path("studies/there/trial_0001/output.txt").read_text()
+    assert output.count("session: ") == 2  # the same trial began twice
+
+
 def test_a_worker_that_ray_loses_is_replaced(write, whole, parameters_of):
     pytest.importorskip("ray")
     write(run={"executor": "ray", "options": {"address": "local"}})
