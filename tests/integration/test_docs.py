@@ -144,6 +144,5 @@ def test_the_gallery_shows_every_example(root):
         path.name for path in (root / "examples").iterdir() if not path.name.startswith(("_", "."))
     }
     assert {name for name in there if f"examples/{name}" not in text} == set()
-    assert {name for name in re.findall(r"examples/(\w+)", text)} <= {
-        name.removesuffix(".py") for name in there
-    }
+    named = set(re.findall(r"examples/(\w+)", text))
+    assert named <= {name.removesuffix(".py") for name in there}
