@@ -4,6 +4,7 @@ import contextlib
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -13,6 +14,7 @@ import physx_gym  # noqa: F401 - registers the environments
 
 pytest.importorskip("ray")
 COUNT = 5
+ROOT = Path(__file__).parents[3]
 
 
 @contextlib.contextmanager
@@ -60,9 +62,9 @@ def test_a_killed_node_is_replaced_and_the_episodes_go_on(ray_cluster):
 
 
 @pytest.mark.faults
-def test_a_policy_learns_on_two_nodes(root):
+def test_a_policy_learns_on_two_nodes():
     """The example starts its own cluster."""
     variables = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
-    command = [sys.executable, root / "examples/cluster_ppo.py", "--steps", "8000"]
+    command = [sys.executable, ROOT / "examples/cluster_ppo.py", "--steps", "8000"]
     ended = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
     assert not ended.returncode, ended.stdout + ended.stderr

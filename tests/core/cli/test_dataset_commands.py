@@ -152,7 +152,7 @@ def test_minari_by_commands(session, run, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["info"], "DIR"),
+        (["info", "nowhere"], "nowhere"),
         (["verify", "nowhere"], "nowhere"),
         (["export", "run", "out", "--to", "npy"], "npy"),
         (["export", "run", "out"], "--to"),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
+import sysconfig
 from pathlib import Path
 
 from physx_core import Dataset
@@ -15,8 +17,13 @@ ALONE = """physx generate toy/spring --environment.num-clients 4 --environment.s
 
 def test_the_commands_of_the_page_make_the_rows_of_a_run_alone(port, nothing_stays_behind):
     commands = re.search(r"```sh\n(.*?)```", PAGE.read_text(), re.S)[1].replace("5000", str(port))
+    path = f"{sysconfig.get_path('scripts')}:{os.environ['PATH']}"
     done = subprocess.run(
-        ["bash", "-euc", f"{commands}\n{ALONE}"], capture_output=True, text=True, timeout=120
+        ["bash", "-euc", f"{commands}\n{ALONE}"],
+        env=os.environ | {"PATH": path},
+        capture_output=True,
+        text=True,
+        timeout=120,
     )
     assert done.returncode == 0, done.stderr
     assert "runs instance 4, and 3 others" in done.stdout

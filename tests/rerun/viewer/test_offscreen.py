@@ -69,11 +69,13 @@ def is_orange(picture):
 
 @pytest.mark.usefixtures("vulkan")
 def test_a_viewer_that_is_gone(offscreen):
+    before = psutil.Process().children()
     visualizer, factory = offscreen(), Factory()
     factory.add_points("points", np.zeros((1, 3)))
     visualizer.events(1, 0, factory.take_events())
     visualizer.capture()
-    (viewer,) = (p for p in psutil.Process().children() if "--headless" in p.cmdline())
+    begun = [each for each in psutil.Process().children() if each not in before]
+    (viewer,) = (each for each in begun if "--headless" in each.cmdline())
     viewer.kill()
     with pytest.raises(VisualizerError, match="The Rerun viewer ended with status -9"):
         visualizer.capture()

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
+import random
+import signal
 import socket
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +104,13 @@ def _probe(address: str) -> None:
 
 def _init(address: str) -> None:
     options: dict[str, Any] = {} if address != "local" else {"include_dashboard": False}
-    ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **options)
+    handler, numbers = signal.getsignal(signal.SIGTERM), random.getstate()
+    try:
+        ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **options)
+    finally:  # Ray has installed a handler of its own, and drawn random numbers
+        random.setstate(numbers)
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, handler)
 
 
 def _silence() -> None:

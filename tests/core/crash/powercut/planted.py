@@ -164,7 +164,7 @@ BUGS = (
     Bug("there is only one mark", _instead(PartitionFile, "mark", _mark_one_place), first=36),
     Bug(
         "rows that follow lost ones are given out",
-        _instead(recovery, "_discard_behind_lost_rows", lambda mode: None),
+        _instead(recovery, "_discard_behind_gaps", lambda mode: None),
     ),
     Bug("a sealed copy replaces its original unsynced", _skip("sync", "copy")),
     Bug("a full partition is sealed unsynced", _skip("sync_file", "seal")),
