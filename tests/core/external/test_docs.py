@@ -47,21 +47,21 @@ def rows_of(session, mode="training"):
 def test_the_program_in_c(compiler):
     compiler("cc")
     Path("spring.c").write_text(block("c", "int main"))
-    assert "training loss" in run(block("", "cc -O2"))
+    assert "training loss" in run(block("sh", "cc -O2"))
     rows = rows_of("data_generation")
     assert len(rows["state"]) == 1000
     goes_on = (rows["env_id"] == 1) & (rows["step"] % 100 > 0)
     before = (rows["env_id"] == 1) & (rows["step"] % 100 < 99)
     np.testing.assert_array_equal(rows["state"][goes_on], rows["next_state"][before])
     assert set(rows["episode"]) == set(range(5))
-    run(block("", "physx/sobol"))
+    run(block("sh", "physx/sobol"))
     assert len({*rows_of("data_generation_1", "parameters")["stiffness"]}) == 10
 
 
 def test_the_program_in_fortran(compiler):
     compiler("gfortran")
     Path("bar.f90").write_text(block("fortran", "program bar"))
-    run(block("", "gfortran -O2"))
+    run(block("sh", "gfortran -O2"))
     rows = rows_of("data_generation")
     np.testing.assert_array_equal(rows["u"][1:100], rows["next_u"][:99])
     assert rows["u"].shape == (200, 20) and (rows["u"][0] != rows["u"][100]).any()

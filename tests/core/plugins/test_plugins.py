@@ -242,7 +242,8 @@ def test_commands_of_other_packages(tmp_path):
     overview = physx(tmp_path, "--help").stdout
     lines = {line.split()[0]: line for line in overview.splitlines() if line.startswith("  ")}
     core = ["generate", "train", "predict", "replay", "info", "stats", "verify"]
-    core += ["export", "import", "export-network", "client", "include", "plugins", "completion"]
+    core += ["export", "import", "export-network", "client", "include", "plugins", "new"]
+    core += ["check", "completion"]
     assert list(lines)[: len(core)] == core
     others = list(lines)[len(core) :]
     assert others == sorted(others) and {"broken", "twice", "wave", "wrong"} <= {*others}

@@ -3,6 +3,7 @@
 import json
 import struct
 import sys
+import time
 
 import numpy as np
 import psutil
@@ -24,11 +25,19 @@ def folder(tmp_path, monkeypatch):
 
 
 def read(session):
-    """Return the history of the only run: a dictionary for each call of ``log``."""
+    """Return the history of the only run: a dictionary for each call of ``log``.
+
+    W&B's service writes the end of a file after the run has finished.
+    """
     (path,) = session.glob("stats/wandb/offline-run-*/run-*.wandb")
+    until, found = time.monotonic() + 20, []
+    while not any(record.HasField("exit") for record in found):
+        assert time.monotonic() < until, f"the run has no end after {len(found)} records"
+        time.sleep(0.01)
+        found = list(parse(path.read_bytes()))
     return [
         {item.key or ".".join(item.nested_key): json.loads(item.value_json) for item in one}
-        for one in (record.history.item for record in parse(path.read_bytes()))
+        for one in (record.history.item for record in found)
         if one
     ]
 
@@ -36,11 +45,13 @@ def read(session):
 def parse(content):
     """Yield the records of a log in the format of LevelDB, in blocks of 32 KiB."""
     place, parts = MAGIC, []
-    while place + HEADER <= len(content):
+    while place + HEADER <= len(content):  # the last record may be incomplete
         if BLOCK - place % BLOCK < HEADER:
             place += BLOCK - place % BLOCK
             continue
         _, length, kind = struct.unpack_from("<IHB", content, place)
+        if place + HEADER + length > len(content):
+            return
         parts.append(content[place + HEADER : place + HEADER + length])
         place += HEADER + length
         if kind in (FULL, LAST):
