@@ -89,7 +89,17 @@ class Rogue(Steps):
     def step(self):
         super().step()
         if self.instance_id == 2 and self.step_index == 5:
+            wait_for_partitions()
             connection().sendall(self.message)
+
+
+def wait_for_partitions():
+    """Wait until the server has begun partitions: a client may be some steps ahead of that."""
+    until = time.monotonic() + 30
+    while not list(Path("sessions").glob("*/dataset/*_training_*.h5")):
+        if time.monotonic() > until:
+            raise TimeoutError("the server has begun no partition")
+        time.sleep(0.01)
 
 
 def connection():
