@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import random
@@ -9,6 +10,7 @@ import signal
 import socket
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +61,8 @@ class RayConnection:
     def close(self) -> None:
         """Disconnect, and end the cluster if it was started here."""
         if self._is_own and ray.is_initialized():
-            ray.shutdown()
+            with _unchanged():
+                ray.shutdown()
 
     def _connect(self, address: str | None) -> None:
         self._is_local = address == "local"
@@ -104,10 +107,17 @@ def _probe(address: str) -> None:
 
 def _init(address: str) -> None:
     options: dict[str, Any] = {} if address != "local" else {"include_dashboard": False}
+    with _unchanged():
+        ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **options)
+
+
+@contextlib.contextmanager
+def _unchanged() -> Iterator[None]:
+    """Undo what Ray does to this process: it handles SIGTERM, and draws random numbers."""
     handler, numbers = signal.getsignal(signal.SIGTERM), random.getstate()
     try:
-        ray.init(address, log_to_driver=False, logging_level=logging.ERROR, **options)
-    finally:  # Ray has installed a handler of its own, and drawn random numbers
+        yield
+    finally:
         random.setstate(numbers)
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, handler)
