@@ -94,7 +94,7 @@ class Rogue(Steps):
 
 
 def wait_for_partitions():
-    """Wait until the server has begun partitions: a client may be some steps ahead of that."""
+    """Wait until the server has begun partitions: it needs a row of instance 1 for that."""
     until = time.monotonic() + 30
     while not list(Path("sessions").glob("*/dataset/*_training_*.h5")):
         if time.monotonic() > until:
