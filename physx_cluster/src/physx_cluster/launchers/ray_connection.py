@@ -124,7 +124,12 @@ def _unchanged() -> Iterator[None]:
 
 
 def _silence() -> None:
-    """Keep Ray from printing what its daemons log, which it has no option for."""
+    """Keep Ray from printing what its daemons log, which it has no option for.
+
+    And from being told of errors that end this process.
+    """
     worker: Any = sys.modules["ray._private.worker"]
+    if sys.excepthook is getattr(worker, "custom_excepthook", None):
+        sys.excepthook = worker.normal_excepthook
     if hasattr(worker, "print_to_stdstream"):
         worker.print_to_stdstream = lambda *arguments, **options: None
