@@ -243,3 +243,9 @@ def test_the_queue_is_asked_for_all_jobs_at_once_and_rarely(runs, slurm, tmp_pat
 def test_options_are_checked_before_anything_is_started():
     with pytest.raises(ConfigError, match="cluster is 'slrum'"):
         SlurmLauncher(cluster="slrum")
+
+
+def test_clients_of_an_elastic_run_are_jobs_too(runs, eventually):
+    expected = runs.rows(clients=4)
+    assert runs.same(runs.rows(*LOCAL, "--environment.max-clients", "2", clients=4), expected)
+    eventually(runs.nothing_is_left)
