@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import logging
+import os
 import shutil
 import tempfile
 import time
@@ -41,8 +42,8 @@ _NAMES = itertools.count()
 @contextlib.contextmanager
 def two_nodes() -> Iterator[None]:
     """Run Ray with two nodes, to which this process is connected."""
-    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")
-    options: dict[str, Any] = {"num_cpus": 1, "include_dashboard": False, "temp_dir": folder}
+    folder = os.environ["RAY_TMPDIR"] = tempfile.mkdtemp(prefix="ray", dir="/tmp")
+    options: dict[str, Any] = {"num_cpus": 1, "include_dashboard": False}
     cluster = Cluster(initialize_head=True, head_node_args=options)
     try:
         cluster.add_node(num_cpus=1)

@@ -112,7 +112,7 @@ def runs(tmp_path):
 
 
 class RayCluster:
-    """Ray with two nodes on this machine, in a folder of its own.
+    """Ray with two nodes on this machine.
 
     Attributes:
         variables: The environment variables by which a run finds it.
@@ -121,7 +121,6 @@ class RayCluster:
     def __init__(self):
         from ray.cluster_utils import Cluster
 
-        self.folder = Path(tempfile.mkdtemp(prefix="ray", dir="/tmp"))
         soon = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500}
         settings = {**soon, "health_check_failure_threshold": 4}
         self._cluster = Cluster(
@@ -129,7 +128,6 @@ class RayCluster:
             head_node_args={
                 "num_cpus": 1,
                 "include_dashboard": False,
-                "temp_dir": str(self.folder),
                 "_system_config": settings,
             },
         )
@@ -154,7 +152,6 @@ class RayCluster:
 
         ray.shutdown()
         self._cluster.shutdown()
-        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def descendants(pid):
@@ -173,9 +170,13 @@ def descendants(pid):
 def ray_cluster():
     """Ray with two nodes of one processor each."""
     pytest.importorskip("ray")
-    cluster = RayCluster()
-    yield cluster
-    cluster.close()
+    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # the names of sockets must be short
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_TMPDIR", folder)
+        cluster = RayCluster()
+        yield cluster
+        cluster.close()
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="session")
