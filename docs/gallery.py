@@ -1,0 +1,111 @@
+"""Runs examples in full, keeps their output and pictures, and shows them in docs/gallery.md.
+
+python docs/gallery.py NAME ...    # runs examples/NAME, such as 02_train: minutes
+python docs/gallery.py             # writes the page from what is kept in docs/examples/
+
+A page's section is made of the beginning of the example: the docstring of a script, the comment of
+a TOML file, the README of a folder as far as its first table. A script draws the picture
+(``--picture``), a film if its docstring says ``--picture NAME.webp``; other examples leave it where
+their commands are run.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import shutil
+import sys
+import tempfile
+import textwrap
+from pathlib import Path
+
+import kept
+
+HERE = Path(__file__).resolve().parent
+EXAMPLES = HERE.parent / "examples"
+TEST = "<!-- tested by tests/examples/test_all.py -->"
+
+
+def path_of(name: str) -> Path:
+    """Return the file or folder of an example."""
+    [found] = [path for path in EXAMPLES.iterdir() if name in (path.name, path.stem)]
+    return found
+
+
+def names() -> list[str]:
+    """Return the names of all examples: the numbered ones in their order, then the others."""
+    numbered = {path.stem for path in EXAMPLES.glob("[0-9][0-9]_*")}
+    others = {path.parent.name for path in EXAMPLES.glob("*/README.md")}
+    return sorted(numbered) + sorted(others - numbered)
+
+
+def beginning(name: str) -> str:
+    """Return what an example says of itself: its title, text and commands, as in a docstring."""
+    path = path_of(name)
+    if path.is_dir():
+        told = (path / "README.md").read_text(encoding="utf-8").partition("\n|")[0]
+        return told.removeprefix("# ").strip()
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        return ast.get_docstring(ast.parse(text)) or ""
+    lines = text.partition("\n\n")[0].splitlines()
+    return "\n".join(line.removeprefix("#").removeprefix(" ") for line in lines)
+
+
+def commands(name: str) -> str:
+    """Return the commands that an example says of itself, for a shell."""
+    told = beginning(name)
+    fenced = re.findall(r"^```sh\n(.*?)^```", told, re.MULTILINE | re.DOTALL)
+    return "\n".join([*fenced, *(line.strip() for line in told.splitlines() if line[:4] == "    ")])
+
+
+def picture(name: str) -> Path:
+    """Return the path of an example's picture, or of its film."""
+    film = re.search(r"--picture \S+\.webp", beginning(name))
+    return HERE / "examples" / f"{name}{'.webp' if film else '.png'}"
+
+
+def run(name: str) -> int:
+    """Run an example in full in an empty folder, keep its picture, and return its exit status."""
+    path, drawn = path_of(name), picture(name)
+    drawn.parent.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        if path.suffix == ".py":
+            words = [sys.executable, str(path), "--picture", str(drawn)]
+            return PAGE.keep(name, words, Path(folder))
+        Path(folder, "examples").symlink_to(EXAMPLES)
+        status = PAGE.keep(name, ["/bin/sh", "-e", "-c", commands(name)], Path(folder))
+        found = [each for each in Path(folder).rglob(f"*{drawn.suffix}") if each.is_file()]
+        if found:
+            shutil.copyfile(max(found, key=lambda each: each.stat().st_mtime), drawn)
+    return status
+
+
+def markdown(told: str) -> str:
+    """Return a docstring as Markdown, its indented parts as commands."""
+    parts = []
+    for part in told.split("\n\n"):
+        if part.startswith("    "):
+            parts.append(f"{TEST}\n```sh\n{textwrap.dedent(part)}\n```")
+        else:
+            parts.append(part)
+    return "\n\n".join(parts)
+
+
+def section(name: str) -> str:
+    """Return what the page says of an example."""
+    title, _, told = beginning(name).partition("\n")
+    path, drawn = path_of(name), picture(name)
+    place = f"../examples/{path.name}" + ("/README.md" if path.is_dir() else "")
+    parts = [f"## {title.rstrip('.')}", f"[examples/{path.name}]({place})", markdown(told.strip())]
+    if drawn.is_file():
+        parts.append(f"![{title.rstrip('.')}](examples/{drawn.name})")
+    if (PAGE.kept / f"{name}.txt").is_file():
+        parts.append(PAGE.printed(name).rstrip("\n"))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+PAGE = kept.Page(HERE / "gallery.md", HERE / "examples", names, run, section)
+
+if __name__ == "__main__":
+    sys.exit(PAGE.main(__doc__ or ""))

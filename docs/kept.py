@@ -1,0 +1,73 @@
+"""What the pages of figures and examples share: runs whose output is kept, and shown on a page."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page whose end shows programs, and what each printed when it was last run.
+
+    Attributes:
+        path: The page. What stands before its mark is written by hand.
+        kept: Folder of the output, one text file for each program.
+        names: Returns the names of all programs.
+        run: Runs a program and returns its exit status; what it prints goes through `keep`.
+        section: Returns what the page says of a program.
+    """
+
+    path: Path
+    kept: Path
+    names: Callable[[], list[str]]
+    run: Callable[[str], int]
+    section: Callable[[str], str]
+
+    @property
+    def mark(self) -> str:
+        """The line before what is not written by hand."""
+        return f"<!-- What follows is written by {self.path.stem}.py. -->"
+
+    def text(self) -> str:
+        """Return what the page has to be, its written part as it is."""
+        written = self.path.read_text(encoding="utf-8").partition(self.mark)[0]
+        return "\n".join([f"{written}{self.mark}\n", *map(self.section, self.names())])
+
+    def keep(self, name: str, words: Sequence[str], folder: Path | None = None) -> int:
+        """Run a command in a folder, keep what it prints, and return its exit status."""
+        done = subprocess.run(words, cwd=folder, stdout=subprocess.PIPE, text=True, check=False)
+        head = (
+            f"{datetime.now(UTC):%Y-%m-%d}, {platform.system()} {platform.machine()}, "
+            f"{os.cpu_count()} cores, Python {platform.python_version()}, "
+            f"exit status {done.returncode}"
+        )
+        self.kept.mkdir(exist_ok=True)
+        (self.kept / f"{name}.txt").write_text(f"{head}\n\n{done.stdout}", encoding="utf-8")
+        return done.returncode
+
+    def printed(self, name: str) -> str:
+        """Return a block of what is kept of a program."""
+        kept = self.kept / f"{name}.txt"
+        told = kept.read_text(encoding="utf-8") if kept.is_file() else "No run is kept.\n"
+        return f"```text\n{told}```\n"
+
+    def main(self, doc: str) -> int:
+        """Run the programs that the command line names, write the page, return the exit status."""
+        parser = argparse.ArgumentParser(description=doc.partition("\n")[0])
+        parser.add_argument("names", nargs="*", metavar="NAME")
+        asked = parser.parse_args().names
+        if unknown := set(asked) - set(self.names()):
+            parser.error(f"no {', '.join(unknown)}; there are {', '.join(self.names())}")
+        failed = [name for name in asked if self.run(name)]
+        self.path.write_text(self.text(), encoding="utf-8")
+        for name in failed:
+            print(f"{name} misses a target", file=sys.stderr)
+        return len(failed) > 0

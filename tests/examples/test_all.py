@@ -1,0 +1,115 @@
+"""Every example runs at a small size, is short, draws its picture, and is in the gallery."""
+
+import ast
+import importlib.util
+import os
+import re
+
+import gallery
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+pytestmark = pytest.mark.slow
+
+EXAMPLES = gallery.EXAMPLES
+SCRIPTS = sorted(EXAMPLES.glob("[0-9][0-9]_*.py"))
+SHARED = {path.stem for path in EXAMPLES.rglob("*.py")}
+
+
+def skip_without_libraries(path):
+    """Skip the test if an example imports what is not installed; `make test` installs it all."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module.partition(".")[0])
+            shared = EXAMPLES / f"{node.module.replace('.', '/')}.py"
+            if shared.is_file() and shared != path:
+                skip_without_libraries(shared)
+    for name in sorted(names - SHARED - {"environments"}):
+        if importlib.util.find_spec(name) is None:
+            assert not os.environ.get("CI"), f"{name} is missing: make test installs it"
+            pytest.skip(f"the example needs {name}")
+
+
+def assert_not_blank(path):
+    """Assert that a picture, or each of a film's, shows something; and that a film moves."""
+    with Image.open(path) as image:
+        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)]
+    for frame in frames:
+        colors, counts = np.unique(frame.reshape(-1, 3), axis=0, return_counts=True)
+        assert len(colors) > 16 and counts.max() < 0.98 * counts.sum()
+    if path.suffix == ".webp":
+        assert len(frames) > 1 and np.any(frames[0] != frames[-1])
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_an_example_runs_and_draws_its_picture(path, run, tmp_path):
+    skip_without_libraries(path)
+    picture = tmp_path / gallery.picture(path.stem).name
+    done = run(path, "--small", "--picture", picture)
+    if done.returncode and "Vulkan" in done.stderr and os.environ.get("CI") != "true":
+        pytest.skip(done.stderr.splitlines()[-1])
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.strip()
+    assert_not_blank(picture)
+
+
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+def test_an_example_is_short_and_tells_what_it_is(path):
+    lines = path.read_text().splitlines()
+    assert len(lines) < 80
+    title, _, told = gallery.beginning(path.stem).partition("\n\n")
+    assert "\n" not in title and f"python examples/{path.name}" in told
+
+
+def test_the_gallery_is_what_the_examples_say():
+    assert gallery.PAGE.path.read_text() == gallery.PAGE.text(), "python docs/gallery.py writes it"
+
+
+def test_the_gallery_has_everything_there_is():
+    there = {path.stem for path in EXAMPLES.iterdir() if not path.name.startswith((".", "_"))}
+    shared = {"common", "rivals", "environments", "requirements"}
+    assert there - shared == set(gallery.names())
+
+
+def test_each_picture_and_each_run_that_is_kept_belongs_to_an_example():
+    kept = {path for path in gallery.PAGE.kept.iterdir() if path.suffix != ".txt"}
+    assert kept <= {gallery.picture(name) for name in gallery.names()}
+    assert {path.stem for path in gallery.PAGE.kept.glob("*.txt")} <= set(gallery.names())
+    for path in kept:
+        assert path.stat().st_size < (600_000 if path.suffix == ".webp" else 150_000)
+        assert_not_blank(path)
+    for path in gallery.PAGE.kept.glob("*.txt"):
+        assert "exit status 0" in path.read_text().partition("\n")[0]
+
+
+def test_what_examples_import_is_in_their_requirements():
+    text = (EXAMPLES / "requirements.txt").read_text().lower()
+    wanted = {"felupe", "scipy", "neuralop", "torch_geometric", "stable_baselines3", "onnxruntime"}
+    distributions = {"neuralop": "neuraloperator"}
+    for path in EXAMPLES.rglob("*.py"):
+        for name in wanted & set(re.findall(r"(?:import|from) (\w+)", path.read_text())):
+            assert distributions.get(name, name).replace("_", "-") in text, (path, name)
+
+
+def test_a_shared_module_is_found_by_clients(run, tmp_path):
+    """The folder of a script is where clients look for its modules, too."""
+    (tmp_path / "environments").mkdir()
+    (tmp_path / "environments/own.py").write_text(
+        "import physx_core.toy\n\nclass Own(physx_core.toy.Spring):\n    pass\n"
+    )
+    (tmp_path / "script.py").write_text(
+        "from environments.own import Own\n"
+        "from physx_core import DataGeneration, EnvironmentConfig\n"
+        'if __name__ == "__main__":\n'
+        "    config = EnvironmentConfig(Own, num_clients=2)\n"
+        "    DataGeneration(config, batch_nb=1, batch_size=4).execute()\n"
+    )
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    done = run(tmp_path / "script.py", cwd=elsewhere)
+    assert done.returncode == 0, done.stderr
+    assert list(elsewhere.glob("sessions/*/dataset"))
