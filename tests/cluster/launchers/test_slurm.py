@@ -47,8 +47,12 @@ def jobs_of(folder):
 
 
 def test_local_jobs_make_the_rows_of_a_local_run(runs, eventually):
+    """The name of their folder is not taken for one of their processes."""
     expected = runs.rows()
-    assert runs.same(runs.rows(*LOCAL), expected)
+    (runs.folder / "submitit").mkdir()
+    words = slurm_words("cluster='local'", "folder='submitit'")
+    assert runs.same(runs.rows(*words), expected)
+    assert not list((runs.folder / "submitit").iterdir())
     assert "submitit" not in runs.log.read_text()
     eventually(runs.nothing_is_left)
 
@@ -240,9 +244,14 @@ def test_the_queue_is_asked_for_all_jobs_at_once_and_rarely(runs, slurm, tmp_pat
     assert after - before <= 2
 
 
-def test_options_are_checked_before_anything_is_started():
+def test_options_are_checked_before_anything_is_started(tmp_path, children):
     with pytest.raises(ConfigError, match="cluster is 'slrum'"):
         SlurmLauncher(cluster="slrum")
+    before, launcher = children(), SlurmLauncher(cluster="local", folder=str(tmp_path), tiem=3)
+    with pytest.raises(ConfigError, match="tiem"):
+        launcher.open()
+    assert children() <= before
+    assert not list(tmp_path.iterdir())
 
 
 def test_clients_of_an_elastic_run_are_jobs_too(runs, eventually):

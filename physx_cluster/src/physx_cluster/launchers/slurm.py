@@ -110,8 +110,12 @@ class SlurmLauncher(Launcher):
         local = LocalQueue(self._folder)
         self._queue = local if controller is None else SlurmQueue(name)
         self._local_jobs = local.jobs
+        try:
+            self._executor = self._make_executor(name)
+        except Exception:
+            self._folder.rmdir()
+            raise
         self._guard, self._pipe = start_guard(self._folder, "" if controller is None else name)
-        self._executor = self._make_executor(name)
         return None if controller is None else address_towards(controller)
 
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 _PATIENCE = 20.0  # for jobs to leave the queue
 _PAUSE = 0.1
+# What the processes of submitit's local executor run; the folder's path may hold any word.
+_MODULES = {b"submitit.local._local", b"submitit.core._submit"}
 
 
 def start_guard(folder: Path, name: str) -> tuple[ChildProcess, int]:
@@ -89,11 +91,11 @@ def _end_processes(folder: Path, until: float) -> None:
 
 
 def _processes_of(folder: Path) -> list[int]:
-    mark, found = f"\0{folder}\0".encode(), []
+    mark, found = os.fsencode(folder), []
     for entry in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
-            command = entry.read_bytes()
-            if mark in command and b"submitit" in command:
+            words = entry.read_bytes().split(b"\0")
+            if mark in words and _MODULES.intersection(words):
                 found.append(int(entry.parent.name))
     return found
 
