@@ -49,6 +49,21 @@ def samples(session: Path, mode: str, *fields: str) -> list[np.ndarray]:
         return [dataset[mode][field][:] for field in fields]
 
 
+def config(
+    network: str | type, given: str, wanted: str, epochs: int, lr: float, **arguments: Any
+) -> NetworkConfig:
+    """Return what trains a network by Adam, its learning rate falling to 0 in so many epochs."""
+    return NetworkConfig(
+        network,
+        network_kwargs={**arguments, "net_fields": given, "opt_fields": wanted},
+        loss="MSELoss",
+        optimizer="Adam",
+        lr=lr,
+        scheduler="CosineAnnealingLR",
+        scheduler_kwargs={"T_max": epochs},
+    )
+
+
 def learned(
     session: Path, network: NetworkConfig, given: str, epochs: int, seed: int, **options: Any
 ) -> np.ndarray:
