@@ -20,7 +20,7 @@ ACTION = [2.0, 3.0]
 
 
 def build(frame_steps: int) -> Simulation:
-    """Return the robot of examples/apple_seeker on the ground, on DART.
+    """Return the robot of examples/13_remote_world.py on the ground, on DART.
 
     Args:
         frame_steps: How many physics steps a frame of 1/60 s has.
