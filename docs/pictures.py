@@ -132,7 +132,7 @@ def show_environments(folder: Path, *visualizers: Visualizer) -> None:
     scenes = (
         play(load("arm_dynamics/run.py").ComparedArm, 1, 100),
         play(load("beam/beam.py").Beam, 2, 10),
-        play(load("features/cloud.py").Cloud, 3, 4),
+        play(load("environments/cloud.py").Cloud, 3, 4),
     )
     for visualizer in visualizers:
         visualizer.open("examples", folder, len(scenes))

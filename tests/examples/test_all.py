@@ -15,6 +15,16 @@ pytestmark = pytest.mark.slow
 EXAMPLES = gallery.EXAMPLES
 SCRIPTS = sorted(EXAMPLES.glob("[0-9][0-9]_*.py"))
 SHARED = {path.stem for path in EXAMPLES.rglob("*.py")}
+PRINTED = {  # what an example has to print, as patterns
+    "01_generate": (
+        r"input +200 x \(10, 3\) m",
+        r"1 client : .*samples/s\n4 clients: .*samples/s",
+        r"first rows: \[1 2 3 4 1 2 3 4\]",
+    ),
+    "02_train": ("one go: True", r"linear map +\d", r"network +\d"),
+    "03_predict": (r"after   0 .* [01]\.[1-9]\d* m", r"after 200 .* 0\.00\d+ m", "30 new clouds"),
+    "04_own_network": (r"linear map +\d", r"FC, \d+ parameters +\d", r"deep set, 12867 parameters"),
+}
 
 
 def skip_without_libraries(path):
@@ -28,7 +38,7 @@ def skip_without_libraries(path):
             shared = EXAMPLES / f"{node.module.replace('.', '/')}.py"
             if shared.is_file() and shared != path:
                 skip_without_libraries(shared)
-    for name in sorted(names - SHARED - {"environments"}):
+    for name in sorted(names - SHARED - {"environments", "networks"}):
         if importlib.util.find_spec(name) is None:
             assert not os.environ.get("CI"), f"{name} is missing: make test installs it"
             pytest.skip(f"the example needs {name}")
@@ -53,7 +63,8 @@ def test_an_example_runs_and_draws_its_picture(path, run, tmp_path):
     if done.returncode and "Vulkan" in done.stderr and os.environ.get("CI") != "true":
         pytest.skip(done.stderr.splitlines()[-1])
     assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.strip()
+    for pattern in PRINTED.get(path.stem, (".",)):
+        assert re.search(pattern, done.stdout), (pattern, done.stdout)
     assert_not_blank(picture)
 
 
@@ -71,7 +82,7 @@ def test_the_gallery_is_what_the_examples_say():
 
 def test_the_gallery_has_everything_there_is():
     there = {path.stem for path in EXAMPLES.iterdir() if not path.name.startswith((".", "_"))}
-    shared = {"common", "rivals", "environments", "requirements"}
+    shared = {"common", "rivals", "environments", "networks", "requirements"}
     assert there - shared == set(gallery.names())
 
 

@@ -18,12 +18,6 @@ pytestmark = pytest.mark.slow
 pytest.importorskip("torch")
 
 
-@pytest.fixture
-def feature(root, run):
-    """Run a script of examples/features and return what it printed."""
-    return lambda name, *words: run(root / f"examples/features/{name}.py", *words).stdout
-
-
 def load(path):
     """Return a script as a module."""
     spec = importlib.util.spec_from_file_location(f"examples_{path.stem}", path)
@@ -34,42 +28,6 @@ def load(path):
 
 def number(text, pattern):
     return float(re.search(pattern, text)[1])
-
-
-def test_one_environment_fills_a_dataset(feature):
-    text = feature("single_environment")
-    assert "input         5000 x (10, 3) m" in text
-    mean, truth = (line.partition("[")[2] for line in text.splitlines()[-2:])
-    assert mean == truth != ""
-
-
-def test_several_clients_take_turns(feature):
-    text = feature("several_clients")
-    assert "1 client(s):" in text and "4 client(s):" in text
-    assert "[1 2 3 4 1 2 3 4]" in text
-
-
-def test_offline_training_reads_stored_samples(feature):
-    assert number(feature("offline_training"), r"([\d.]+) with those held back") < 0.005
-
-
-def test_online_training_stores_what_clients_make(feature):
-    text = feature("online_training")
-    assert "stored: 640 samples" in text and "stored: 4480 samples" in text
-    losses = [float(loss) for loss in re.findall(r"loss ([\d.]+)", text)]
-    assert losses[3] < losses[0] / 10 and losses[7] < losses[4] / 10
-
-
-def test_an_environment_watches_gradient_descent(feature):
-    distances = re.findall(r"is ([\d.]+) m off", feature("gradient_descent"))
-    assert len(distances) == 7 and float(distances[0]) > 0.1 > 1e-2 > float(distances[-1])
-
-
-def test_prediction_takes_part_and_is_recorded(feature, tmp_path):
-    pytest.importorskip("rerun", reason="needs physx-rerun for the recording")
-    text = feature("prediction", "--rerun")
-    assert number(text, r"guesses are ([\d.]+) m") < number(text, r"would be ([\d.]+) m") / 10
-    assert list(tmp_path.glob("sessions/prediction/*.rrd"))
 
 
 # The beam -------------------------------------------------------------------------------------

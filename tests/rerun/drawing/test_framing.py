@@ -133,7 +133,7 @@ def test_every_robot_environment_is_in_its_picture(name):
 
 
 @pytest.mark.parametrize(
-    ("file", "cls"), [("features/cloud.py", "Cloud"), ("beam/beam.py", "Beam")]
+    ("file", "cls"), [("environments/cloud.py", "Cloud"), ("beam/beam.py", "Beam")]
 )
 def test_every_example_is_in_its_picture(file, cls, tmp_path):
     spec = importlib.util.spec_from_file_location("example", EXAMPLES / file)

@@ -1,0 +1,79 @@
+"""A network learns from stored samples, is interrupted, and goes on.
+
+Fully connected layers learn the spread of a cloud from the coordinates of its points. The training
+ends after a third of its epochs, as after Ctrl-C, and is resumed: the network is the same, bit for
+bit, as one trained in one go. Then networks of three seeds stand against what is cheaper: the mean
+of all samples, a linear map, and a linear map of all products of two coordinates.
+
+    python examples/02_train.py
+    physx stats sessions/train
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+from common import SEEDS, generate, learned, options, samples
+from environments.cloud import Cloud, network
+from matplotlib.figure import Figure
+from rivals import linear_map, relative_error, verdict
+
+from physx_core import DatasetConfig, Training, read_scalars
+
+
+def products(clouds: np.ndarray) -> np.ndarray:
+    """Return all coordinates and all products of two of them, shape (rows, features)."""
+    flat = clouds.reshape(len(clouds), -1)
+    first, second = np.triu_indices(flat.shape[1])
+    return np.hstack([flat, flat[:, first] * flat[:, second]])
+
+
+def draw(path, session, right, guess) -> None:
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    losses, compared = figure.subplots(1, 2)
+    for name in ("loss/training", "loss/validation"):
+        curve = read_scalars(session)["epoch", name]
+        losses.semilogy(list(curve), list(curve.values()), label=name)
+    losses.set(xlabel="epoch", ylabel="mean squared error (normalized)")
+    losses.legend()
+    compared.plot(right, guess, ".", [0, 1.8], [0, 1.8], "k", ms=2, lw=0.8)
+    compared.set(xlabel="spread in m, along the three axes", ylabel="what the network says")
+    figure.savefig(path)
+
+
+def main() -> int:
+    asked = options(__doc__).parse_args()
+    rows, epochs = (300, 3) if asked.small else (20_000, 12)
+    stored = generate(Cloud, rows, asked.session_dir, as_tcp_ip_client=False)
+    inputs, outputs = samples(stored, "training", "input", "ground_truth")
+    clouds, right = samples(stored, "validation", "input", "ground_truth")
+
+    data, name = DatasetConfig(existing_dir=str(stored), normalize=True), "train"
+    for until in (epochs // 3, epochs):
+        training = Training(
+            network(), data, epoch_nb=until, batch_size=64, seed=0,
+            session_name=name, session_dir=str(asked.session_dir), resume=until == epochs,
+        )  # fmt: skip
+        with training:
+            training.execute()
+            resumed = training.learner.predict_in_training({"input": clouds})["prediction"]
+        name = training.session.name
+        print(f"after {until:2} epochs: loss {training.validation_loss:.4f}, held-back samples")
+    guesses = [learned(stored, network(), "input", epochs, seed, batch_size=64) for seed in SEEDS]
+    print(f"the same as a training in one go: {np.array_equal(resumed, guesses[0])}")
+
+    cheap = {
+        "mean of all samples": 0 * right + outputs.mean(axis=0),
+        "linear map": linear_map(inputs, outputs)(clouds),
+        "map of products": linear_map(products(inputs), outputs)(products(clouds)),
+    }
+    errors = {name: [relative_error(guess, right)] for name, guess in cheap.items()}
+    errors["network"] = [relative_error(guess, right) for guess in guesses]
+    if asked.picture:
+        draw(asked.picture, training.session.path, right, guesses[0])
+    return verdict(errors, "network") and not asked.small
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,78 @@
+"""A network takes part in the running environment: while it learns, and when it has.
+
+First an environment looks on while the network learns: it asks for a prediction in its own step,
+as often as it likes. Then a network that has learned from stored samples guesses the spread of
+clouds that it has never seen. The environment draws its guess over the truth, the viewer records
+the scene, and the dataset what was predicted.
+
+    python examples/03_predict.py
+    physx view sessions/predict
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from common import generate, options
+from environments.cloud import Cloud, network
+from rivals import relative_error
+
+from physx_core import (
+    Dataset,
+    DatasetConfig,
+    EnvironmentConfig,
+    NetworkConfig,
+    Prediction,
+    Training,
+)
+from physx_rerun import render_picture
+
+
+class Watched(Cloud):
+    """A cloud that stays the same, and asks the network, as it is now, for its spread."""
+
+    def step(self) -> None:
+        super().step()
+        guess = self.get_prediction(input=self.points)["prediction"]
+        if self.step_index % 50 == 0:
+            distance = np.linalg.norm(guess - self.spread)
+            print(f"  after {self.step_index:3} steps the guess is {distance:.4f} m off")
+
+
+def main() -> None:
+    asked = options(__doc__).parse_args()
+    rows, epochs, steps = (500, 4, 10) if asked.small else (20_000, 12, 100)
+    place = {"session_dir": str(asked.session_dir)}
+
+    print("One cloud, again and again:")
+    watched = EnvironmentConfig(Watched, {"constant": True}, as_tcp_ip_client=False, seed=0)
+    once = {"epoch_nb": 1, "batch_nb": 201, "batch_size": 1, "seed": 0}
+    Training(network(), None, watched, session_name="watch", **once, **place).execute()
+
+    stored = DatasetConfig(
+        existing_dir=str(generate(Cloud, rows, asked.session_dir, num_clients=2))
+    )
+    training = Training(
+        network(), stored, session_name="predict", epoch_nb=epochs, batch_size=64, seed=0, **place
+    )
+    training.execute()
+    session = training.session
+
+    config = EnvironmentConfig(
+        Cloud, num_clients=3, as_tcp_ip_client=False, visualizer="rerun", seed=1
+    )
+    taking_part = Prediction(
+        NetworkConfig(), config, session_name=session.name, step_nb=steps, record=True, **place
+    )
+    taking_part.execute()
+    with Dataset.open(session.path) as dataset:
+        recorded = dataset["prediction"]
+        right, guesses = recorded["ground_truth"][:], recorded["prediction"][:]
+    print(f"{len(right)} new clouds:\n  the network is {relative_error(guesses, right):.1%} off,")
+    print(f"  always the same spread {relative_error(0 * right + right.mean(axis=0), right):.1%}")
+    if asked.picture:
+        [recording] = session.path.glob("*.rrd")
+        render_picture(recording, asked.picture, (900, 360))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""A network of your own, which knows what the problem is like.
+
+The spread of a cloud depends neither on the order of its points nor on where it is. A deep set, a
+plain PyTorch class named by its module, cannot but respect that. Beside it stand fully connected
+layers of three widths, which have to learn it: one with as many parameters, one with more. All
+learn from the same samples.
+
+    python examples/04_own_network.py
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+from common import SEEDS, generate, learned, options, samples
+from environments.cloud import POINTS, Cloud, network
+from matplotlib.figure import Figure
+from networks.deep_set import DeepSet
+from rivals import linear_map, relative_error, verdict
+
+from physx_core import NetworkConfig
+
+WIDTH = 64
+OWN = NetworkConfig(
+    "networks.deep_set:DeepSet",
+    network_kwargs={"width": WIDTH, "outputs": 3},
+    loss="MSELoss",
+    optimizer="Adam",
+    lr=2e-3,
+)
+
+
+def draw(path, right, guesses) -> None:
+    """Draw guesses over what is right, a diagram for each network."""
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    for axes, (name, guess) in zip(figure.subplots(1, 3), guesses.items(), strict=True):
+        axes.plot(right, guess, ".", ms=2)
+        axes.plot([0, right.max()], [0, right.max()], "k", lw=0.8)
+        axes.set(title=name, xlabel="spread in m", xlim=(0, 1.8), ylim=(0, 1.8))
+    figure.savefig(path)
+
+
+def main() -> int:
+    asked = options(__doc__).parse_args()
+    rows, epochs = (300, 3) if asked.small else (20_000, 12)
+    stored = generate(Cloud, rows, asked.session_dir, num_clients=2)
+    inputs, outputs = samples(stored, "training", "input", "ground_truth")
+    clouds, right = samples(stored, "validation", "input", "ground_truth")
+
+    def trained(config: NetworkConfig) -> list[np.ndarray]:
+        return [learned(stored, config, "input", epochs, seed, batch_size=64) for seed in SEEDS]
+
+    guesses = {"linear map": [linear_map(inputs, outputs)(clouds)]}
+    for width in (32, 97, 256):
+        count = width**2 + (3 * POINTS + 5) * width + 3
+        guesses[f"FC, {count} parameters"] = trained(network(width))
+    count = sum(each.numel() for each in DeepSet(WIDTH, 3).parameters())
+    guesses[own := f"deep set, {count} parameters"] = trained(OWN)
+    errors = {
+        name: [relative_error(guess, right) for guess in found] for name, found in guesses.items()
+    }
+    if asked.picture:
+        names = ["linear map", list(guesses)[2], own]
+        draw(asked.picture, right, {name: guesses[name][0] for name in names})
+    return verdict(errors, own) and not asked.small
+
+
+if __name__ == "__main__":
+    sys.exit(main())
