@@ -38,7 +38,7 @@ class Serve:
     environment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENVIRONMENT")]
     """"physx/Cartpole-v0", "gym/CartPole-v1", "dart/arm", "script.py:Class" ..."""
     protocol: str = "physx"
-    """godot-gym, godot-rl, physx, or "package.module:Class"."""
+    """"physx", "godot-gym", "godot-rl", or "package.module:Class"."""
     address: str = "127.0.0.1"
     """Address to listen at; for godot-rl that of the trainer."""
     port: int | None = None

@@ -2,60 +2,150 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import io
+import os
+import re
+from collections.abc import Iterator, Sequence
 
-from physx_core.errors import UsageError
+from physx_core import plugins
+from physx_core.cli.command import main
+from physx_core.errors import PhysxError, UsageError
+from physx_core.plugins import KINDS
 
 _HELP = """usage: physx completion {bash,zsh}
 
-Prints a script that completes commands, options, and files:
+Prints a script that completes commands, options, their values, names of components, and files:
   bash: physx completion bash > ~/.local/share/bash-completion/completions/physx
   zsh:  physx completion zsh > ~/.physx-completion; echo 'source ~/.physx-completion' >> ~/.zshrc
-It asks `physx --help` for what there is, so it knows the commands of all installed plugins."""
+It asks  physx completion after WORD ...  for what may follow, so it knows all installed plugins."""
 
-_KNOWN = r"""# Completes the command physx.
+_ASK = r"""# Completes the command physx.
 typeset -gA _physx_known
-_physx_ask() {  # what may follow "physx", or a command of it
-    [ -n "${_physx_known[-$1]}" ] && return
-    if [ -z "$1" ]; then
-        _physx_known[-]=$(physx --help 2>/dev/null | sed -n 's/^  \([a-z][a-z-]*\)  .*/\1/p')
-    else
-        _physx_known[-$1]=$(physx "$1" --help 2>/dev/null | grep -oE -- '--[a-z][a-z0-9._-]*' |
-            sort -u)
-    fi
+_physx_ask() {  # what may follow "physx" and some words
+    [ -n "${_physx_known[-$*]+known}" ] ||
+        _physx_known[-$*]=$(physx completion after "$@" 2>/dev/null)
 }
 """
 
 _SCRIPTS = {
-    "bash": _KNOWN
+    "bash": _ASK
     + r"""_physx() {
-    local command=""
-    [ "$COMP_CWORD" -gt 1 ] && command=${COMP_WORDS[1]}
-    _physx_ask "$command"
-    COMPREPLY=($(compgen -W "${_physx_known[-$command]}" -- "${COMP_WORDS[COMP_CWORD]}"))
+    local word=${COMP_WORDS[COMP_CWORD]}
+    local -a before=("${COMP_WORDS[@]:1:COMP_CWORD-1}") hidden=(-X '-*')
+    [ "$word" = "=" ] && word=""
+    [[ $word == -* ]] && hidden=()
+    _physx_ask "${before[@]}"
+    COMPREPLY=($(compgen -W "${_physx_known[-${before[*]}]}" "${hidden[@]}" -- "$word"))
 }
 complete -o default -F _physx physx
 """,
-    "zsh": _KNOWN
+    "zsh": _ASK
     + r"""_physx() {
-    local command=""
-    (( CURRENT > 2 )) && command=$words[2]
-    _physx_ask "$command"
-    local -a known=(${(f)_physx_known[-$command]})
-    compadd -a known
-    (( CURRENT == 2 )) || [[ $words[CURRENT] == -* ]] || _files
+    local -a before=(${words[2,CURRENT-1]})
+    _physx_ask $before
+    local -a known=(${(f)_physx_known[-$before]})
+    [[ $words[CURRENT] == -* ]] || known=(${known:#-*})
+    compadd -a known || (( CURRENT == 2 )) || _files
 }
 (( $+functions[compdef] )) || { autoload -Uz compinit && compinit }
 compdef _physx physx
 """,
 }
 
+_KIND_OF = {kind: kind for kind in KINDS} | {"online": "buffer", "statistics": "visualizer"}
+"""The kind of component that an option or argument of a name takes."""
+_WORD = re.compile(r"[\w.][\w./@+-]*|--[\w.-]+")
+"""What a shell takes for a word as it is: names in metadata come from strangers."""
+_OPTION = re.compile(
+    r"^[│ ]*(?:-\w, )?(--[a-z][\w.-]*)(?:, (--[a-z][\w.-]*))?(?: (\S.*?))?(?:  |│|$)"
+)
+_GROUP = re.compile(r"\[-[^][]*(?:\[[^][]*(?:\[[^][]*\])?\])?[^][]*\]|\[OPTIONS\]")
+
 
 def run(words: Sequence[str]) -> None:
-    """Print the script for a shell."""
+    """Print the script for a shell, or what may follow some words."""
     if words and words[0] in ("-h", "--help"):
         print(_HELP)
-        return
-    if len(words) != 1 or words[0] not in _SCRIPTS:
+    elif words and words[0] == "after":
+        found = dict.fromkeys(_after(words[1:]))
+        print("\n".join(word for word in found if _WORD.fullmatch(word)))
+    elif len(words) == 1 and words[0] in _SCRIPTS:
+        print(_SCRIPTS[words[0]], end="")
+    else:
         raise UsageError(f"physx completion takes bash or zsh, not {' '.join(words) or 'nothing'}.")
-    print(_SCRIPTS[words[0]], end="")
+
+
+def _after(words: Sequence[str]) -> Iterator[str]:
+    """Yield what may follow the command ``physx`` and some words: values, and options."""
+    if not words:
+        yield from re.findall(r"^  ([a-z][a-z-]*)  ", _help(), re.MULTILINE)
+        return
+    text = _help(words[0])
+    options = dict(_options(text))
+    option, place = "", 0
+    for word in words[1:]:
+        if word.startswith("-"):
+            option = word if options.get(word, ("", ""))[0] else ""
+        elif option and word != "=":
+            option = option if "..." in options[option][0] else ""
+        else:
+            place += word != "="
+    if option:
+        yield from _values(option, *options[option])
+        return
+    usage = _GROUP.sub("", text.partition("\n\n")[0]).split()[3:]
+    for name in usage[place : place + 1]:
+        yield from _values(name.strip("[]").lower(), name, "")
+    yield from options
+
+
+def _help(*command: str) -> str:
+    """Return what ``--help`` prints."""
+    os.environ["COLUMNS"] = "80"  # each option on a line of its own
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        main([*command, "--help"])
+    return printed.getvalue()
+
+
+def _options(text: str) -> Iterator[tuple[str, tuple[str, str]]]:
+    """Yield the options of a help text, each with its metavariable and its description."""
+    names: tuple[str, ...] = ()
+    metavar = description = ""
+    for line in [*text.splitlines(), "╰"]:
+        match = _OPTION.match(line)
+        if match or line.startswith("╰"):
+            for name in names:
+                yield name, (metavar, description)
+            names, description = (), ""
+        if match:
+            names = tuple(name for name in match.groups()[:2] if name)
+            metavar, description = match[3] or "", line[match.end() :]
+        else:
+            description += line
+
+
+def _values(name: str, metavar: str, description: str) -> Iterator[str]:
+    """Yield what an argument takes: choices, names of components, words that its help quotes."""
+    choices = {each for group in re.findall(r"\{(.*?)\}", metavar) for each in group.split(",")}
+    yield from sorted(choices - {"None"})
+    name = name.lstrip("-").rpartition(".")[2]
+    if name == "kind":
+        yield from sorted(KINDS)
+    elif name in _KIND_OF:
+        yield from _components(_KIND_OF[name])
+    elif "reference" in name:
+        yield from plugins.available()
+        for kind in KINDS:
+            yield from _components(kind)
+    if "STR" in metavar:
+        yield from re.findall(r'"([a-z][\w-]*)"', description)
+
+
+def _components(kind: str) -> Iterator[str]:
+    """Yield the references of the components of a kind."""
+    for name in plugins.available():
+        with contextlib.suppress(PhysxError):  # a broken plugin breaks only itself
+            for component in plugins.load(name).components.get(kind, ()):
+                yield name if component == name else f"{name}/{component}"

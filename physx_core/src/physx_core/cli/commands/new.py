@@ -82,11 +82,8 @@ class New:
     A `plugin` holds an environment and a network that learns from it; any may hold more.
     """
 
-    kind: Annotated[
-        tyro.conf.Positional[Literal["environment", "network", "visualizer", "backend", "plugin"]],
-        tyro.conf.arg(metavar="KIND"),
-    ]
-    """What the plugin brings: environment, network, visualizer, backend, or plugin."""
+    kind: tyro.conf.Positional[Literal["environment", "network", "visualizer", "backend", "plugin"]]
+    """What the plugin brings."""
     name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")]
     """Name of the plugin, by which users select it, as in wave-tank."""
     folder: Path = Path()
