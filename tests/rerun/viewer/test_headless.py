@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import psutil
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from physx_core.components import Factory
-from physx_core.errors import VisualizerError
+from physx_core.errors import ConfigError, VisualizerError
 from physx_rerun.viewer import viewer
-from physx_rerun.viewer.headless import render_picture
+from physx_rerun.viewer.headless import render_film, render_picture
 
 
 @pytest.fixture
@@ -48,6 +48,30 @@ def test_picture_of_two_times(recording, tmp_path):
     assert first.shape == (360, 640, 3)
     assert len(np.unique(first.reshape(-1, 3), axis=0)) > 200
     assert (first != last).any(axis=2).mean() > 0.005
+
+
+@pytest.mark.usefixtures("vulkan")
+def test_a_film_goes_from_the_beginning_to_the_end(recording, tmp_path):
+    before, size = children(), (320, 200)
+    path = render_film(recording, tmp_path / "new" / "a.webp", size, frames=3, frame_rate=10)
+    assert children() == before
+    with Image.open(path) as film:
+        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
+        assert film.info["duration"] == 100
+    assert len(frames) == 3
+    for frame, at in ((frames[0], 0), (frames[2], 19)):
+        still = pixels(render_picture(recording, tmp_path / "still.png", size, at=at))
+        assert np.abs(still.astype(int) - frame).mean() < 4  # what compression changes
+    assert (frames[0] != frames[1]).any() and (frames[1] != frames[2]).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "reason"),
+    [("a.gif", 3, r"must be a \.webp file, not a\.gif"), ("a.webp", 1, "at least 2 frames, not 1")],
+)
+def test_a_film_that_cannot_be_made(name, frames, reason, tmp_path):
+    with pytest.raises(ConfigError, match=reason):
+        render_film(tmp_path / "none.rrd", tmp_path / name, frames=frames)
 
 
 @pytest.mark.usefixtures("vulkan")
@@ -90,6 +114,8 @@ def test_a_title_that_the_viewers_font_cannot_show_is_named(title, glyph, opened
 def test_no_recording(tmp_path):
     with pytest.raises(VisualizerError, match=r"no recording .*none\.rrd"):
         render_picture(tmp_path / "none.rrd", tmp_path / "a.png")
+    with pytest.raises(VisualizerError, match=r"no recording .*none\.rrd"):
+        render_film(tmp_path / "none.rrd", tmp_path / "a.webp")
 
 
 def test_the_viewer_is_only_reachable_from_this_machine(receiver):

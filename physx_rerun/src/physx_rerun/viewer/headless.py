@@ -1,17 +1,17 @@
-"""Renders pictures of a recording with a viewer without window."""
+"""Renders pictures and films of a recording with a viewer without window."""
 
 from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from PIL import Image
 from rerun.experimental import ViewerClient
 
-from physx_core.errors import VisualizerError
+from physx_core.errors import ConfigError, VisualizerError
 from physx_core.processes import TemporaryFolder
 from physx_rerun.viewer.viewer import Viewer
 
@@ -20,6 +20,7 @@ _TOP_BAR = 36  # height of the viewer's own menu bar in pixels, cut off
 _QUIET_SECONDS = 0.4  # without a change of state, after which everything is loaded
 _TIMELINES = ("step", "row", "epoch", "batch")  # in order of preference
 _NOTES = 30  # frames after which the viewer's notifications at its start are gone
+_QUALITY = 60  # of a film's pictures, from 0 to 100
 _PATIENCE = 5  # equal pictures in a row, after which missing assets are given up
 
 
@@ -48,25 +49,82 @@ def render_picture(
         VisualizerError: If the recording is missing or has no such time, there is no graphics
             driver, or the viewer fails or takes too long.
     """
-    rrd_path, png_path = Path(rrd_path), Path(png_path)
-    if not rrd_path.is_file():
-        raise VisualizerError(f"There is no recording {rrd_path}.")
+    [picture] = _pictures(Path(rrd_path), size, [at], timeline, timeout)
+    png_path = Path(png_path)
+    png_path.parent.mkdir(parents=True, exist_ok=True)
+    picture.save(png_path)
+    return png_path
+
+
+def render_film(
+    rrd_path: str | Path,
+    film_path: str | Path,
+    size: tuple[int, int] = (800, 480),
+    frames: int = 50,
+    frame_rate: float = 12.5,
+    timeline: str | None = None,
+    timeout: float = 600.0,
+) -> Path:
+    """Render a recording as a film: a looping animation that browsers show.
+
+    Args:
+        rrd_path: The recording, a ``.rrd`` file.
+        film_path: Film to write, a ``.webp`` file.
+        size: Width and height in pixels.
+        frames: Number of pictures, at equal distances from the beginning of the timeline to its
+            end, both included.
+        frame_rate: Pictures per second.
+        timeline: Name of the timeline; None: ``step`` where there is one.
+        timeout: Longest time to take, in s.
+
+    Returns:
+        The film's path.
+
+    Raises:
+        ConfigError: If the film is no ``.webp`` file, or of fewer than two pictures.
+        VisualizerError: As in `render_picture`.
+    """
+    film_path = Path(film_path)
+    if film_path.suffix.lower() != ".webp":
+        raise ConfigError(f"A film must be a .webp file, not {film_path.name}.")
+    if frames < 2:
+        raise ConfigError(f"A film needs at least 2 frames, not {frames}.")
+    shares = [frame / (frames - 1) for frame in range(frames)]
+    first, *others = _pictures(Path(rrd_path), size, shares, timeline, timeout, by_share=True)
+    film_path.parent.mkdir(parents=True, exist_ok=True)
+    look: dict[str, Any] = {"quality": _QUALITY, "method": 6, "loop": 0}
+    duration = round(1000 / frame_rate)
+    first.save(film_path, save_all=True, append_images=others, duration=duration, **look)
+    return film_path
+
+
+def _pictures(
+    recording: Path,
+    size: tuple[int, int],
+    times: Sequence[float | None],
+    timeline: str | None,
+    timeout: float,
+    *,
+    by_share: bool = False,
+) -> Iterator[Image.Image]:
+    """Yield pictures of a recording at some times: see `Camera.find`."""
+    if not recording.is_file():
+        raise VisualizerError(f"There is no recording {recording}.")
     with TemporaryFolder("rerun-") as folder:
-        viewer = start_viewer(size, folder.path, str(rrd_path))
+        viewer = start_viewer(size, folder.path, str(recording))
         try:
             viewer.wait_until_ready(timeout)
             camera = Camera(viewer, time.monotonic() + timeout)
             camera.wait_for_recording()
-            camera.go_to(*camera.find(timeline, at))
-            picture = Image.open(io.BytesIO(camera.wait_for_picture()))
+            for at in times:
+                camera.go_to(*camera.find(timeline, at, by_share=by_share))
+                picture = Image.open(io.BytesIO(camera.wait_for_picture())).convert("RGB")
+                yield picture.crop((0, _TOP_BAR, size[0], size[1] + _TOP_BAR))
         except OSError as error:
             viewer.check(wait=2.0)
             raise VisualizerError(f"The Rerun viewer rendered no picture: {error}.") from error
         finally:
             viewer.end()
-    png_path.parent.mkdir(parents=True, exist_ok=True)
-    picture.crop((0, _TOP_BAR, size[0], size[1] + _TOP_BAR)).save(png_path)
-    return png_path
 
 
 def start_viewer(size: tuple[int, int], folder: Path, *options: str) -> Viewer:
@@ -112,8 +170,13 @@ class Camera:
         for _ in range(_NOTES):  # a request lets a frame pass, without drawing it
             self._request(self._client.get_state)
 
-    def find(self, timeline: str | None, at: float | None) -> tuple[str, int]:
-        """Return a timeline and the viewer's number for a time on it, as in `render_picture`."""
+    def find(
+        self, timeline: str | None, at: float | None, *, by_share: bool = False
+    ) -> tuple[str, int]:
+        """Return a timeline and the viewer's number for a time on it, as in `render_picture`.
+
+        With `by_share`, `at` is a share of the timeline, from 0 to 1.
+        """
         state = self._request(self._client.get_state)
         known = {line.name: line for line in state.recordings[0].timelines}
         if timeline is None:
@@ -125,6 +188,8 @@ class Camera:
         line = known[timeline]
         unit = 1 if line.time_type == "sequence" else 1_000_000_000  # the viewer counts ns
         start, end = line.start or 0, line.end or 0
+        if by_share and at is not None:
+            return timeline, round(start + at * (end - start))
         position = end if at is None else round(at * unit)
         if not start <= position <= end:
             raise VisualizerError(
