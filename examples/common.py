@@ -64,10 +64,10 @@ def config(
     )
 
 
-def learned(
-    session: Path, network: NetworkConfig, given: str, epochs: int, seed: int, **options: Any
-) -> np.ndarray:
-    """Train a network with a session's samples; return its predictions for those of validation."""
+def trained(
+    session: Path, network: NetworkConfig, epochs: int, seed: int, **options: Any
+) -> Training:
+    """Train a network with a session's samples; return what trained it, its `learner` ready."""
     training = Training(
         network,
         DatasetConfig(existing_dir=str(session), normalize=True),
@@ -80,6 +80,14 @@ def learned(
     )
     with training:
         training.execute()
-        (tested,) = samples(session, "validation", given)
-        (guess,) = training.learner.predict_in_training({given: tested}).values()
+    return training
+
+
+def learned(
+    session: Path, network: NetworkConfig, given: str, epochs: int, seed: int, **options: Any
+) -> np.ndarray:
+    """Train a network with a session's samples; return its predictions for those of validation."""
+    learner = trained(session, network, epochs, seed, **options).learner
+    (tested,) = samples(session, "validation", given)
+    (guess,) = learner.predict_in_training({given: tested}).values()
     return guess

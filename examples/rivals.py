@@ -36,12 +36,23 @@ def relative_error(guess: np.ndarray, exact: np.ndarray) -> float:
     return float(np.mean(norms[0] / norms[1]))
 
 
-def verdict(errors: Mapping[str, Sequence[float]], network: str) -> int:
-    """Print mean and worst of all errors; return 0 if the network's worst beats the best rival."""
-    print(f"\n{'relative error':28}{'mean':>10}{'worst':>10}")
+def verdict(
+    errors: Mapping[str, Sequence[float]],
+    network: str,
+    *,
+    what: str = "relative error",
+    form: str = ".2%",
+    references: Sequence[str] = (),
+) -> int:
+    """Print mean and worst of all errors; return 0 if the network's worst beats the best rival.
+
+    References are printed, but are no rivals.
+    """
+    print(f"\n{what:28}{'mean':>10}{'worst':>10}")
     for name, found in errors.items():
-        print(f"{name:28}{np.mean(found):>10.2%}{max(found):>10.2%}")
-    means = {name: np.mean(found) for name, found in errors.items() if name != network}
+        print(f"{name:28}{np.mean(found):>10{form}}{max(found):>10{form}}")
+    others = errors.keys() - {network, *references}
+    means = {name: np.mean(errors[name]) for name in errors if name in others}
     rival = min(means, key=means.get)
     print(f"\n{network} by the best rival, {rival}: {np.mean(errors[network]) / means[rival]:.2f}")
     return int(max(errors[network]) >= means[rival])
