@@ -55,8 +55,9 @@ def beginning(name: str) -> str:
 def commands(name: str) -> str:
     """Return the commands that an example says of itself, for a shell."""
     told = beginning(name)
-    fenced = re.findall(r"^```sh\n(.*?)^```", told, re.MULTILINE | re.DOTALL)
-    return "\n".join([*fenced, *(line.strip() for line in told.splitlines() if line[:4] == "    ")])
+    if path_of(name).is_dir():
+        return "\n".join(re.findall(r"^```sh\n(.*?)^```", told, re.MULTILINE | re.DOTALL))
+    return "\n".join(line.strip() for line in told.splitlines() if line.startswith("    "))
 
 
 def picture(name: str) -> Path:
@@ -74,7 +75,8 @@ def run(name: str) -> int:
             words = [sys.executable, str(path), "--picture", str(drawn)]
             return PAGE.keep(name, words, Path(folder))
         Path(folder, "examples").symlink_to(EXAMPLES)
-        status = PAGE.keep(name, ["/bin/sh", "-e", "-c", commands(name)], Path(folder))
+        script = f'PATH="{Path(sys.executable).parent}:$PATH"\nexec 2>&1\n{commands(name)}'
+        status = PAGE.keep(name, ["/bin/sh", "-e", "-c", script], Path(folder))
         found = [each for each in Path(folder).rglob(f"*{drawn.suffix}") if each.is_file()]
         if found:
             shutil.copyfile(max(found, key=lambda each: each.stat().st_mtime), drawn)

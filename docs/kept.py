@@ -50,7 +50,9 @@ class Page:
             f"exit status {done.returncode}"
         )
         self.kept.mkdir(exist_ok=True)
-        (self.kept / f"{name}.txt").write_text(f"{head}\n\n{done.stdout}", encoding="utf-8")
+        (self.kept / f"{name}.txt").write_text(
+            f"{head}\n\n{done.stdout.lstrip()}", encoding="utf-8"
+        )
         return done.returncode
 
     def printed(self, name: str) -> str:

@@ -166,12 +166,12 @@ def examples() -> dict[str, np.ndarray]:
 
     Returns:
         Pictures of the width 1000: the scenes of the environments and those of the robots in
-        Rerun's viewer, and the former in that of ``examples/matplotlib_viewer``.
+        Rerun's viewer, and the former in that of ``examples/05_own_plugin``.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         rerun = RerunVisualizer(path=folder / "environments.rrd")
-        plain = load("matplotlib_viewer/src/physx_matplotlib.py").MatplotlibVisualizer((1000, 340))
+        plain = load("05_own_plugin/src/physx_matplotlib.py").MatplotlibVisualizer((1000, 340))
         show_environments(folder, rerun, plain)
         drawn = {"matplotlib": plain.capture()}
         rerun.close()

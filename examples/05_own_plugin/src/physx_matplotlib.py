@@ -31,14 +31,18 @@ class MatplotlibVisualizer(Visualizer):
                 scene[event.name][1].update(event.values)
 
     def figure(self):
-        figure = Figure(figsize=[length / 100 for length in self.size], dpi=100)
+        figure = Figure([length / 100 for length in self.size], dpi=100, layout="constrained")
         for number, (instance, scene) in enumerate(sorted(self.scenes.items()), 1):
             axes = figure.add_subplot(1, len(self.scenes), number, projection="3d")
             axes.set_title(f"instance {instance}")
             for kind, values in scene.values():
-                if points := self.points(kind, values):
-                    color = values.get("color")
-                    axes.scatter(*np.concatenate(points).T, s=4, color=color)
+                color = values.get("color")
+                if kind == "lines":
+                    for line in values["positions"]:
+                        axes.plot(*np.transpose(line), color=color, lw=2)
+                elif points := self.points(kind, values):
+                    axes.scatter(*np.concatenate(points).T, s=9, color=color)
+            axes.set_aspect("equal")
         return figure
 
     def points(self, kind, values):
@@ -49,8 +53,7 @@ class MatplotlibVisualizer(Visualizer):
             return [position + values["half_sizes"] * CORNERS]
         if kind == "robot":
             return [values["poses"][:, :3]] if "poses" in values else []
-        positions = values.get("positions", ())  # of lines several arrays, of others one
-        return positions if isinstance(positions, (list, tuple)) else [positions]
+        return [values["positions"]] if "positions" in values else []
 
     def capture(self):
         if not self.scenes:
