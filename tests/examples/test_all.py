@@ -6,7 +6,6 @@ import os
 import re
 
 import gallery
-import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
@@ -47,12 +46,12 @@ def skip_without_libraries(path):
 def assert_not_blank(path):
     """Assert that a picture, or each of a film's, shows something; and that a film moves."""
     with Image.open(path) as image:
-        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)]
-    for frame in frames:
-        colors, counts = np.unique(frame.reshape(-1, 3), axis=0, return_counts=True)
-        assert len(colors) > 16 and counts.max() < 0.98 * counts.sum()
+        frames = [frame.convert("RGB") for frame in ImageSequence.Iterator(image)]
+    for frame in frames[:: len(frames) // 4 + 1]:
+        counts = [count for count, _ in frame.getcolors(frame.width * frame.height)]
+        assert len(counts) > 16 and max(counts) < 0.98 * sum(counts)
     if path.suffix == ".webp":
-        assert len(frames) > 1 and np.any(frames[0] != frames[-1])
+        assert len(frames) > 1 and frames[0].tobytes() != frames[-1].tobytes()
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
