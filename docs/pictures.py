@@ -27,7 +27,8 @@ from physx_rerun import RerunVisualizer, render_picture
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parent / "examples"
-GUESSES = {"ground_truth": "prediction", "displacement": "displacement"}
+sys.path.insert(0, str(EXAMPLES))  # their modules import each other
+GUESSES = {"ground_truth": "prediction", "correction": "correction"}
 NAMES = ("Cartpole", "Acrobot", "Ant", "Quadruped", "ArmReach", "PushBox")
 COLUMNS = 3
 FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
@@ -131,7 +132,7 @@ def show_environments(folder: Path, *visualizers: Visualizer) -> None:
     """Show the arm, the beam and the cloud of the examples, side by side."""
     scenes = (
         play(load("arm_dynamics/run.py").ComparedArm, 1, 100),
-        play(load("beam/beam.py").Beam, 2, 10),
+        play(load("environments/beam.py").Beam, 2, 10),
         play(load("environments/cloud.py").Cloud, 3, 4),
     )
     for visualizer in visualizers:

@@ -2,14 +2,11 @@
 
 import importlib.util
 import re
-import sys
 
 import gymnasium
 import numpy as np
 import pytest
 
-from physx_core import DataGeneration, EnvironmentConfig
-from physx_core.errors import WrongSamplesError
 from physx_gym import Policy
 from physx_gym.cli import evaluate
 
@@ -28,82 +25,6 @@ def load(path):
 
 def number(text, pattern):
     return float(re.search(pattern, text)[1])
-
-
-# The beam -------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def beam(root):
-    """The module of the beam."""
-    pytest.importorskip("felupe", reason="needs felupe, which solves the beam")
-    module = load(root / "examples/beam/beam.py")
-    sys.modules[module.__name__] = module
-    yield module
-    del sys.modules[module.__name__]
-
-
-def tip_load(beam, force):
-    forces = np.zeros((*beam.NODES, 3))
-    forces[-1, :, :, 2] = force / 16
-    return forces
-
-
-def test_the_beam_bends_as_beam_theory_says_under_small_loads(beam):
-    solver = beam.ElasticBeam()
-    assert np.allclose(solver.rest[3, 1, 2], [3 / 15, 0.25 / 3, 0.5 / 3])
-    solver.solve(tip_load(beam, 0.1))
-    length, _, height = beam.SIZE
-    area, inertia = height**2, height**4 / 12
-    shear = beam.YOUNG / (2 * (1 + beam.POISSON)) * area * 5 / 6
-    theory = 0.1 * (length**3 / (3 * beam.YOUNG * inertia) + length / shear)  # Timoshenko
-    assert solver.displacement[-1, :, :, 2].mean() == pytest.approx(theory, rel=0.15)
-    assert np.all(solver.displacement[0] == 0)
-
-
-def test_large_loads_bend_it_less_than_in_proportion(beam):
-    solver = beam.ElasticBeam()
-    deflections = []
-    for force in (1, 40):
-        solver.solve(tip_load(beam, force))
-        deflections.append(solver.displacement[-1, :, :, 2].mean())
-    assert 0.3 < deflections[1] < 0.9 * 40 * deflections[0]
-    solver.solve(0 * tip_load(beam, 0))  # elastic: it comes back
-    assert np.abs(solver.displacement).max() < 1e-6
-
-
-def test_loads_that_newton_cannot_reach_at_once_are_reached_in_steps(beam):
-    whole, parts = beam.ElasticBeam(), beam.ElasticBeam()
-    far = tip_load(beam, -300)
-    whole.solve(far)
-    for part in np.linspace(0.1, 1, 10):
-        parts.solve(part * far)
-    assert np.allclose(whole.displacement, parts.displacement, atol=1e-6)
-
-
-def test_the_skin_is_closed_and_faces_outwards(beam):
-    corners = beam.ElasticBeam().rest.reshape(-1, 3)[beam.skin()]
-    volumes = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
-    assert volumes.sum() == pytest.approx(np.prod(beam.SIZE))
-
-
-def test_a_step_that_diverges_is_refused(beam, tmp_path, monkeypatch):
-    def fail(solver, forces):
-        raise beam.NoEquilibriumError
-
-    monkeypatch.setattr(beam.ElasticBeam, "solve", fail)
-    config = EnvironmentConfig(beam.Beam, as_tcp_ip_client=False, max_wrong_samples_per_step=3)
-    with pytest.raises(WrongSamplesError, match="rejected 4 samples"):
-        DataGeneration(config, session_dir=str(tmp_path), batch_nb=1, batch_size=1).execute()
-
-
-def test_the_beam_is_learned_and_compared(root, run, tmp_path):
-    pytest.importorskip("felupe", reason="needs felupe, which solves the beam")
-    pytest.importorskip("rerun", reason="needs physx-rerun for the recording")
-    text = run(root / "examples/beam/run.py", "--small").stdout
-    assert re.search(r"FC +[\d.]+% +[\d.]+%", text) and re.search(r"UNet +[\d.]+%", text)
-    assert (tmp_path / "sessions/beam/fc.rrd").stat().st_size > 10_000
-    assert (tmp_path / "sessions/beam/unet.rrd").stat().st_size > 10_000
 
 
 # Operators ------------------------------------------------------------------------------------

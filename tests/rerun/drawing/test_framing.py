@@ -133,9 +133,10 @@ def test_every_robot_environment_is_in_its_picture(name):
 
 
 @pytest.mark.parametrize(
-    ("file", "cls"), [("environments/cloud.py", "Cloud"), ("beam/beam.py", "Beam")]
+    ("file", "cls"), [("environments/cloud.py", "Cloud"), ("environments/beam.py", "Beam")]
 )
-def test_every_example_is_in_its_picture(file, cls, tmp_path):
+def test_every_example_is_in_its_picture(file, cls, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
     spec = importlib.util.spec_from_file_location("example", EXAMPLES / file)
     module = importlib.util.module_from_spec(spec)
     try:
