@@ -60,7 +60,7 @@ def test_a_replay_with_contacts_plots_and_a_ghost_is_as_documented(tmp_path):
 
 SCENES = {  # rows and columns in the sheet, and the least shares of the colors of its objects
     "arm": ((30, 290), (0, 330), {"light": 0.01, "green": 0.005}),
-    "beam": ((30, 290), (335, 665), {"orange": 0.02, "blue": 0.02}),
+    "beam": ((30, 290), (335, 665), {"orange": 0.01, "blue": 0.01, "light": 0.01}),
     "cloud": ((30, 290), (668, 1000), {"light": 0.0005, "green": 0.0001, "orange": 0.0001}),
     "push_box": ((550, 830), (0, 499), {"orange": 0.01, "light": 0.01, "red": 0.0002}),
     "quadruped": ((550, 830), (502, 1000), {"light": 0.005, "red": 0.0002}),
