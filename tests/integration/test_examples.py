@@ -27,23 +27,6 @@ def number(text, pattern):
     return float(re.search(pattern, text)[1])
 
 
-# Operators ------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("problem", "library", "network"),
-    [
-        ("ring", "neuralop", "Fourier neural operator"),
-        ("plate", "torch_geometric", "graph network"),
-        ("picture", "torch", "UNet"),
-    ],
-)
-def test_operators_are_learned_by_networks_of_other_libraries(problem, library, network, root, run):
-    if importlib.util.find_spec(library) is None:
-        pytest.skip(f"needs {library}, where the {network} comes from")
-    text = run(root / "examples/operators/run.py", "--small", problem).stdout
-    sizes = [int(size) for size in re.findall(rf"^(?:{network}|FC) +(\d+)", text, re.M)]
-    assert len(sizes) == 2 and sizes[1] == pytest.approx(sizes[0], rel=0.02)
 
 
 def test_equations_of_motion_help_a_network(root, run):

@@ -1,0 +1,67 @@
+"""Heat in a mesh of triangles, learned by a graph network of torch-geometric.
+
+A plate with a hole conducts heat well in some places and badly in others; how warm is each node a
+while later? A graph network knows which nodes are neighbors, and has to learn only what happens
+along an edge. A linear map and fully connected networks learn each node by itself, and do worse.
+
+The network is a plain PyTorch class and knows nothing of physx: networks/heat.py.
+
+    python examples/08_mesh_with_a_graph_network.py
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import rivals
+from common import SEEDS, config, generate, learned, options, samples
+from environments.plate import Plate, mesh
+from matplotlib.figure import Figure
+
+
+def draw(picture: Path, fields: dict[str, np.ndarray]) -> None:
+    """Draw fields of the same samples beside each other, one sample in a row."""
+    nodes, triangles = mesh()
+    rows = len(fields["exact"])
+    figure = Figure(figsize=(12, 2 * rows + 0.25), layout="constrained")
+    places = figure.subplots(rows, len(fields))
+    for row, line in enumerate(places):
+        for place, (name, field) in zip(line, fields.items(), strict=True):
+            colors = {} if "m²/s" in name else {"cmap": "coolwarm", "vmin": -2, "vmax": 2}
+            place.tripcolor(*nodes.T, triangles, field[row], shading="gouraud", **colors)
+            place.triplot(*nodes.T, triangles, color="black", linewidth=0.2)
+            place.set(title=name if row == 0 else "", aspect="equal")
+            place.axis("off")
+    figure.savefig(picture, dpi=80)
+
+
+def main() -> int:
+    """Compare the networks; the exit status says whether the graph network beats all others."""
+    asked = options(__doc__).parse_args()
+    count, epochs = (100, 2) if asked.small else (1000, 20)
+    session = generate(Plate, count, asked.session_dir, as_tcp_ip_client=False)
+    before, after = samples(session, "validation", "before", "after")
+    linear = rivals.linear_map(*samples(session, "training", "before", "after"))(before)
+    guesses = {"nothing changes": [before[..., :1]], "linear map": [linear]}
+    networks = {"graph network": ("networks.heat:HeatNetwork", {"channels": 32, "steps": 8}, 1e-2)}
+    for width in (128, 512):
+        layers = [before[0].size, width, width, after[0].size]
+        networks[f"FC {width}"] = "torch/fc", {"layers": layers, "activation": "SiLU"}, 2e-3
+    for name, (kind, arguments, lr) in networks.items():
+        made = config(kind, "before", "after", epochs, lr=lr, **arguments)
+        guesses[name] = [learned(session, made, "before", epochs, seed) for seed in SEEDS]
+    if asked.picture:
+        guess = guesses["graph network"][0]
+        shown = {"temperature, K": before[..., 0], "conductivity, m²/s": before[..., 1]}
+        shown |= {"exact": after[..., 0], "graph network": guess[..., 0]}
+        shown |= {"linear map": linear[..., 0], "error of the network": (guess - after)[..., 0]}
+        draw(asked.picture, {name: field[:2] for name, field in shown.items()})
+    errors = {
+        name: [rivals.relative_error(each, after) for each in found]
+        for name, found in guesses.items()
+    }
+    return rivals.verdict(errors, "graph network") and not asked.small
+
+
+if __name__ == "__main__":
+    sys.exit(main())
