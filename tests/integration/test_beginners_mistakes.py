@@ -150,17 +150,17 @@ def leaves_a_field_out_later():
     with_data(lambda data, step: data if step < 5 else {"state": data["state"]})
 
 
-@mistake(e.UnknownFieldError, "step() did not set any data: call set_training_data()")
+@mistake(e.MissingFieldError, "step() did not set any data: call set_training_data()")
 def never_sets_data():
     with_data(lambda data, step: None)
 
 
-@mistake(e.UnknownFieldError, "Instance 1, step 5", "call set_training_data() in every step")
+@mistake(e.MissingFieldError, "Instance 1, step 5", "call set_training_data() in every step")
 def forgets_the_data_of_a_later_step():
     with_data(lambda data, step: data if step < 5 else None)
 
 
-@mistake(e.UnknownFieldError, "call set_training_data()")
+@mistake(e.MissingFieldError, "call set_training_data()")
 def writes_a_generator_in_place_of_a_step():
     def step(self):
         self.set_training_data(state=0, next_state=0)
@@ -419,6 +419,26 @@ def misspells_a_plugin():
     generate("toi/spring")
 
 
+@mistake(e.PluginNotFoundError, '"spring"', 'Did you mean "toy/spring"')
+def leaves_out_the_plugin():
+    generate("spring")
+
+
+@mistake(e.PluginNotFoundError, '"vedo"', "of the kind visualizer: ", "rerun")
+def wants_a_viewer_that_nobody_has():
+    generate(visualizer="vedo")
+
+
+@mistake(e.ReferenceFormError, "mistaken_envs.py:Good", "names a script")
+def names_a_script_without_a_class():
+    generate(str(PROGRAM))
+
+
+@mistake(e.ReferenceFormError, '"none.py:Class"')
+def names_a_script_that_is_not_there_without_a_class():
+    generate("none.py")
+
+
 @mistake(e.ComponentNotFoundError, '"Sprng"', 'Did you mean "spring"')
 def misspells_a_component():
     generate("toy/Sprng")
@@ -632,7 +652,7 @@ def gives_a_network_an_unknown_option():
     train(of(OwnNetwork, network_kwargs={"size": 2}, optimization=OwnOptimization))
 
 
-@mistake(e.ConfigError, "The transformation Needy rejects its arguments", "mean")
+@mistake(e.ConfigError, "The transformation Needy needs mean: give it in transformation_kwargs")
 def gives_a_transformation_too_few_arguments():
     class Needy(Transformation):
         def __init__(self, mean):
@@ -761,6 +781,11 @@ def predict(environment=Good, network=None, data=None, **options):
     ).execute()
 
 
+@mistake(e.CheckpointError, "There is no network in ", "physx train")
+def predicts_with_a_session_that_trained_nothing():
+    Prediction(NetworkConfig(), EnvironmentConfig(Good), session_name="kept").execute()
+
+
 @mistake(e.CheckpointError, '"network_7"', "There are: network_0")
 def wants_a_checkpoint_that_does_not_exist():
     predict(network=NetworkConfig(which_network=7))
@@ -846,9 +871,24 @@ def gives_the_layers_by_their_former_name():
     train(of("torch/fc", network_kwargs={"dim_layers": [2, 8, 2]}, **ADAM))
 
 
-@mistake(e.ConfigError, "A training needs a loss")
+@mistake(e.ConfigError, "The network 'torch/fc' needs layers", "network_kwargs", "layers=...")
+def gives_a_network_no_layers():
+    train(of("torch/fc", **ADAM))
+
+
+@mistake(e.FieldsMismatchError, "input: missing", "network_kwargs, net_fields and opt_fields")
+def names_no_fields():
+    train(of("torch/fc", network_kwargs={"layers": [2, 8, 2]}, **ADAM))
+
+
+@mistake(e.ConfigError, "A training needs a loss", "--network.loss MSELoss")
 def chooses_no_loss():
     train(fc(loss=None))
+
+
+@mistake(e.ConfigError, "A training needs an optimizer", "--network.optimizer Adam")
+def chooses_no_optimizer():
+    train(fc(optimizer=None))
 
 
 @mistake(e.ConfigError, "MSEloss", "MSELoss")

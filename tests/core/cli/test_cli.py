@@ -1,6 +1,8 @@
+import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -9,6 +11,22 @@ from physx_core.cli import main
 GENERATE = ["generate", "toy/spring", "--batch-nb", "2", "--batch-size", "10"]
 TRAIN = ["train", "nowhere", "--network.network", "toy/linear"]
 LOCAL = ["--environment.no-as-tcp-ip-client"]
+KEEPS = """
+import json
+from pathlib import Path
+from physx_core import Environment
+
+class Keeps(Environment):
+    def __init__(self, *, given, **kwargs):
+        super().__init__(**kwargs)
+        Path("given.json").write_text(json.dumps(given))
+    def create(self):
+        pass
+    def init_database(self):
+        self.define_training_fields([("x", float)])
+    def step(self):
+        self.set_training_data(x=1.0)
+"""
 
 
 def test_the_main_job_by_commands(capsys):
@@ -58,6 +76,7 @@ def test_a_file_gives_options_and_words_replace_them(capsys, tmp_path):
         (["info", "--verify"], "needs a folder"),
         (["predict", "sessions/none", "toy/spring"], "no session"),
         ([*TRAIN, "--epoch-nb", "1", "--batch-size", "1"], "nowhere"),
+        ([*GENERATE, "--environment.env-kwargs", "mass=[1,", "2]"], "quote one"),
     ],
 )  # fmt: skip
 def test_mistakes_end_with_one_clear_error(words, message, capsys):
@@ -79,6 +98,27 @@ def test_misspelt_keys_in_a_file_are_named(table, environment, name, capsys, tmp
     )
     assert main(["generate", "--config", "job.toml"]) == 1
     assert f'no option "{name}"' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ('["state","force"]', ["state", "force"]),
+        ("[state,force]", ["state", "force"]),  # what a shell leaves of it
+        ("[state, 2, true]", ["state", 2, True]),
+        ("[state]", ["state"]),
+        ("[3,32,2]", [3, 32, 2]),
+        ("state", "state"),
+        ("[]", []),
+        ("[a,[b]]", "[a,[b]]"),
+        ("[a", "[a"),
+    ],
+)
+def test_values_on_the_command_line(text, value):
+    Path("kept.py").write_text(KEEPS)
+    words = ["generate", "kept.py:Keeps", *LOCAL, "--batch-nb", "1", "--batch-size", "1"]
+    assert main([*words, "--environment.env-kwargs", f"given={text}"]) == 0
+    assert json.loads(Path("given.json").read_text()) == value
 
 
 def test_debug_shows_the_traceback(capsys):

@@ -123,6 +123,93 @@ def test_a_prediction_and_a_replay_say_what_they_left(said):
     assert said() == ["session: sessions/replay", "20 steps of toy/spring"]
 
 
+UNUSED = (
+    "nothing used the predictions: the environment does not define apply_prediction, and record "
+    "(--record) is off"
+)
+
+
+class Deaf(Environment):
+    """Does nothing with predictions, unless it asks for them."""
+
+    def __init__(self, *, asks=False, **kwargs):
+        super().__init__(**kwargs)
+        self.asks = asks
+
+    def create(self):
+        pass
+
+    def init_database(self):
+        self.define_training_fields([("state", np.ndarray), ("force", np.ndarray)])
+
+    def step(self):
+        inputs = {"state": np.ones(2), "force": np.ones(1)}
+        if self.asks:
+            self.get_prediction(**inputs)
+        self.set_training_data(**inputs)
+
+
+class Hears(Deaf):
+    def apply_prediction(self, prediction):
+        self.prediction = prediction
+
+
+class Prints(Prediction):
+    """Does something with predictions itself."""
+
+    def sample_end(self):
+        super().sample_end()
+        assert self.prediction
+
+
+def test_a_prediction_that_nothing_uses_says_so(said):
+    train(generate().session.path)
+    said()
+
+    def lines(environment, make=Prediction, record=False, **options):
+        config = EnvironmentConfig(environment, as_tcp_ip_client=False, env_kwargs=options)
+        make(NetworkConfig(), config, step_nb=2, record=record).execute()
+        return said()
+
+    assert lines(Deaf)[1:] == ["2 steps with toy/linear", UNUSED]
+    for used in (lines(Hears), lines(Deaf, asks=True), lines(Deaf, Prints)):
+        assert used[1:] == ["2 steps with toy/linear"]
+    assert UNUSED not in lines(Deaf, record=True)
+
+
+def test_a_prediction_without_an_end_says_how_it_ends(said):
+    train(generate().session.path)
+    said()
+
+    class Interrupted(Prediction):
+        def sample_end(self):
+            super().sample_end()
+            signal.raise_signal(signal.SIGINT)
+
+    Interrupted(NetworkConfig(), SPRING).execute()
+    assert said()[1] == "steps until Ctrl-C; step_nb (--step-nb) is their number"
+
+
+def test_a_batch_that_is_larger_than_the_dataset_is_announced(said):
+    made = generate().session.path
+    said()
+    data = DatasetConfig(existing_dir=made)
+    Training(LINEAR, data, epoch_nb=1, batch_size=21).execute()
+    assert said()[2] == "batches of 20 samples, as there are no more than these"
+    Training(LINEAR, data, epoch_nb=1, batch_size=20).execute()
+    assert not any("no more" in line for line in said())
+
+
+def test_what_is_known_only_in_a_run_says_so_before():
+    pipeline = DataGeneration(SPRING, session_name="spring", batch_nb=1, batch_size=1)
+    with pytest.raises(AttributeError, match="'session' yet: .* call execute"):
+        _ = pipeline.session
+    with pytest.raises(AttributeError, match="no attribute 'sesion'$"):
+        _ = pipeline.sesion
+    pipeline.execute()
+    assert pipeline.session.path.is_dir()
+
+
 class Filming(Visualizer):
     """Has a screen, leaves a film, and fails afterwards if asked."""
 
@@ -449,7 +536,7 @@ ONE = ["--batch-nb", "1", "--batch-size", "1", "--environment.no-as-tcp-ip-clien
         (["stats", "sessions/none"], "There is no sessions/none/stats/scalars.csv"),
         (["verify", "flat.toml"], "It is a file"),
         (["info", "flat.toml"], "It is a file"),
-        (["predict", "sessions/spring", "toy/spring"], 'no checkpoint "network_<number>"'),
+        (["predict", "sessions/spring", "toy/spring"], "There is no network in sessions/spring"),
         (["predict", "flat.toml", "toy/spring"], 'no session "flat.toml"'),
         (["generate", "toy/sprint", *ONE], 'mean "spring"'),
         (["generate", "flat.py:Nothing", *ONE], "has: Mine."),

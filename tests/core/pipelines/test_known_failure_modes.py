@@ -107,7 +107,7 @@ def generate(fault, at, **options):
 @pytest.mark.parametrize(
     ("fault", "error", "named"),
     [
-        ("nothing", UnknownFieldError, "did not set any data: call set_training_data"),
+        ("nothing", MissingFieldError, "did not set any data: call set_training_data"),
         ("no field", MissingFieldError, '"label"'),
         ("no additional data", MissingFieldError, '"note"'),
         ("unknown field", UnknownFieldError, '"speed"'),

@@ -338,9 +338,10 @@ def test_the_command_takes_the_only_visualizer_plugin(installed, monkeypatch, ca
         return plugins.Plugin(plugins.PluginInfo(name, (), ""), kinds)
 
     DataGeneration(environment(), session_name="few", batch_nb=1, batch_size=2).execute()
-    monkeypatch.setattr(plugins, "available", lambda: dict.fromkeys([*installed, "more", "broken"]))
-    monkeypatch.setattr(plugins, "load", load)
-    monkeypatch.setattr("physx_core.plugins.references.load", load)
+    found = dict.fromkeys([*installed, "more", "broken"])
+    for module in ("physx_core.plugins", "physx_core.plugins.references"):
+        monkeypatch.setattr(f"{module}.available", lambda: found)
+        monkeypatch.setattr(f"{module}.load", load)
     words = ["replay", "sessions/few", "--environment.no-as-tcp-ip-client", "--trust"]
     assert main(words) == (len(installed) != 1)
     if len(installed) == 1:

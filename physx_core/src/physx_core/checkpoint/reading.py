@@ -113,6 +113,10 @@ def find(place: Path, name: str | None, which: int | str) -> Checkpoint:
         except CheckpointError as error:
             raise CheckpointError(f"{error} Other checkpoints: {others}.") from error
     wanted = f"{name}_<number>" if which == -1 else path.name
+    if not list_all(folder):
+        raise CheckpointError(
+            f"There is no network in {folder}: name the session of a training (physx train)."
+        )
     raise CheckpointError(f'There is no checkpoint "{wanted}" in {folder}. There are: {others}.')
 
 

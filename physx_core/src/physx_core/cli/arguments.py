@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import tomllib
 from typing import Any
 
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+_WORDS = re.compile(r"\[[^][{},\s\"'=]+(\s*,\s*[^][{},\s\"'=]+)*\]")
+"""A list of words without brackets, spaces or quotes."""
 
 
 def argument_registry() -> ConstructorRegistry:
@@ -42,12 +46,23 @@ def argument_registry() -> ConstructorRegistry:
 
 
 def _argument(word: str) -> tuple[str, Any]:
-    """Return name and value of ``NAME=VALUE``; the value is TOML, or JSON, or else a string."""
+    """Return name and value of ``NAME=VALUE``."""
     name, equals, text = word.partition("=")
     if not equals:
-        raise ValueError(f"{word!r} is not NAME=VALUE")
+        example = "'layers=[3, 32, 2]'"
+        raise ValueError(f"{word!r} is not NAME=VALUE; quote one that has spaces: {example}")
+    return name, _value(text)
+
+
+def _value(text: str) -> Any:
+    """Return a value that is TOML, or JSON, or a list of bare words, or else a string.
+
+    Shells take quotes away: what is typed as ``["a","b"]`` arrives as ``[a,b]``.
+    """
     with contextlib.suppress(ValueError, RecursionError):  # a TOMLDecodeError is a ValueError
-        return name, tomllib.loads(f"value = {text}")["value"]
+        return tomllib.loads(f"value = {text}")["value"]
     with contextlib.suppress(ValueError, RecursionError):
-        return name, json.loads(text)
-    return name, text
+        return json.loads(text)
+    if _WORDS.fullmatch(text):
+        return [_value(item.strip()) for item in text[1:-1].split(",")]
+    return text

@@ -17,7 +17,6 @@ from physx_core.errors import (
     MissingFieldError,
     NotFiniteError,
     SampleError,
-    UnknownFieldError,
     UnknownOptionError,
     UsageError,
     listed,
@@ -399,11 +398,11 @@ class Environment:
         """Return and clear this step's data by field name.
 
         Raises:
-            UnknownFieldError: If the step did not set any training data.
+            MissingFieldError: If the step did not set any training data.
         """
         sample, additional = self._training, self._additional
         if sample is None:
-            raise UnknownFieldError(
+            raise MissingFieldError(
                 "step() did not set any data: call set_training_data() in every step.",
                 instance_id=self.instance_id,
                 step=self.step_index,

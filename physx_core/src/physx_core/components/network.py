@@ -118,7 +118,11 @@ class Network(ABC):
             if name not in fields
         }
         if missing:
-            raise FieldsMismatchError(f"{type(self).__name__} needs other fields", missing)
+            raise FieldsMismatchError(
+                f"{type(self).__name__} needs other fields. Those that it reads and is compared "
+                "with are named in network_kwargs, net_fields and opt_fields",
+                missing,
+            )
 
     @abstractmethod
     def predict(self, data: Tensors) -> Tensors:

@@ -8,10 +8,10 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import TracebackType
-from typing import ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
@@ -63,6 +63,15 @@ class Pipeline(ABC):
     _resources: contextlib.ExitStack | None = field(init=False, repr=False, default=None)
     _leads = True  # whether this process writes the session; others only help with the training
     _began = 0.0
+
+    if not TYPE_CHECKING:  # or every misspelt attribute would be one
+
+        def __getattr__(self, name: str) -> object:
+            """Explain why an attribute of a running pipeline is not there yet."""
+            what = f"{type(self).__name__!r} object has no attribute {name!r}"
+            if name in {each.name for each in fields(self) if not each.init}:
+                what += " yet: it is known once the pipeline runs; call execute() before"
+            raise AttributeError(what, name=name, obj=self)
 
     @abstractmethod
     def execute(self) -> None:

@@ -87,6 +87,7 @@ class Prediction(Pipeline):
     prediction: Batch = field(init=False, repr=False)
     step_id: int = field(init=False, repr=False, default=0)
     _stored: StoredRows | None = field(init=False, repr=False, default=None)
+    _is_asked: bool = field(init=False, repr=False, default=False)
 
     def execute(self) -> None:
         """Run all steps. Ctrl-C and SIGTERM end the run in an orderly way after the current step.
@@ -189,16 +190,29 @@ class Prediction(Pipeline):
             resources,
             environment,
             derive_seed(seed, "prediction", 0),
-            predict=self.learner.answer,
+            predict=self._answer,
             run_ahead=0,
             in_process=environment.num_clients == 1,
             replayed=replayed,
         )
 
+    def _answer(self, request: Batch) -> Batch:
+        self._is_asked = True
+        return self.learner.answer(request)
+
+    def _plan(self) -> Iterable[str]:
+        if self.step_nb < 0:
+            yield "steps until Ctrl-C; step_nb (--step-nb) is their number"
+
     def _results(self) -> Iterable[str]:
         yield f"{self.step_id} steps with {self.learner.config.network}"
         if self.dataset is not None:
             yield describe_samples(self.dataset.directory)
+        elif type(self) is Prediction and not self._is_asked and self.source.ignores_predictions:
+            yield (
+                "nothing used the predictions: the environment does not define apply_prediction, "
+                "and record (--record) is off"
+            )
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         if self.dataset is not None:

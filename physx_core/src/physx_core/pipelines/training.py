@@ -561,6 +561,9 @@ class Training(NewSessionPipeline):
             yield describe_samples(self.data.dataset.directory)
         if self.data.online is not None:
             yield from self.data.online.announce()
+        size = self.batch_size * self.group.size
+        if not self.data.produces and size > self.data.num_samples:
+            yield f"batches of {self.data.num_samples:,} samples, as there are no more than these"
         if self.group.size > 1:
             total, each, count = self.batch_size * self.group.size, self.batch_size, self.group.size
             yield f"batches of {total} samples, {each} in each of {count} processes"

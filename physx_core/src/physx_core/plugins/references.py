@@ -6,6 +6,8 @@ What the user names may be any code. What a file names may only be components of
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import functools
 import hashlib
 import importlib
@@ -21,12 +23,15 @@ from physx_core.config import reference_of as reference_of
 from physx_core.errors import (
     ComponentNotFoundError,
     PhysxError,
+    PluginError,
+    PluginNotFoundError,
     ReferenceFormError,
     UntrustedReferenceError,
+    listed,
 )
 from physx_core.plugins.hookspecs import KINDS
 from physx_core.plugins.loading import loading
-from physx_core.plugins.registry import available, load
+from physx_core.plugins.registry import available, load, plugin_hint
 
 if TYPE_CHECKING:
     from physx_core.components import (
@@ -278,14 +283,24 @@ def find(kind: str, reference: Any) -> Any:
         raise ReferenceFormError(f"{reference!r} is neither a class nor a reference to one.")
     if ":" in reference:
         return import_component(kind, reference)
+    if reference.endswith(".py"):
+        raise ReferenceFormError(
+            f'"{reference}" names a script, but not the {kind} in it: '
+            f"give {_listed_classes(reference)}."
+        )
+    return _component_of_plugin(kind, reference)
+
+
+def _component_of_plugin(kind: str, reference: str) -> Any:
     plugin_name, _, name = reference.partition("/")
     if not plugin_name:
         raise ReferenceFormError(
-            f'"{reference}" does not name a {kind}: give "plugin/name", "package.module:Class" '
+            f'"{reference}" names no {kind}: give "plugin/name", "package.module:Class" '
             'or "script.py:Class".'
         )
-    plugin = load(plugin_name)
-    components = plugin.components.get(kind, {})
+    if plugin_name not in available():
+        raise _no_plugin(kind, plugin_name)
+    components = load(plugin_name).components.get(kind, {})
     if not name and len(components) == 1:
         name = next(iter(components))
     if name not in components:
@@ -296,6 +311,32 @@ def find(kind: str, reference: Any) -> Any:
     with loading(plugin_name, f'Plugin "{plugin_name}"', f'fails to import its {kind} "{name}"'):
         place, _, attribute = component.rpartition(":")
         return getattr(importlib.import_module(place), attribute)
+
+
+def _listed_classes(script: str) -> str:
+    """Return references to a script's classes that derive from others; it is not run."""
+    names = ["Class"]
+    with contextlib.suppress(OSError, SyntaxError, ValueError):
+        tree = ast.parse(Path(script).read_bytes())
+        classes = (node for node in tree.body if isinstance(node, ast.ClassDef))
+        names = [node.name for node in classes if node.bases] or names
+    return " or ".join(f'"{script}:{name}"' for name in names)
+
+
+def _no_plugin(kind: str, plugin_name: str) -> PluginNotFoundError:
+    """Return the error for a plugin that is not installed, with what may have been meant."""
+    having, meant = [], []
+    for name in sorted(available()):
+        with contextlib.suppress(PluginError):  # `physx plugins` shows it
+            components = load(name).components.get(kind, {})
+            having += [name] if components else []
+            meant += [f'"{name}/{plugin_name}"'] if plugin_name in components else []
+    hint = (
+        f"Did you mean {' or '.join(meant)}?"
+        if meant
+        else f"With components of the kind {kind}: {listed(having)}. {plugin_hint(plugin_name)}"
+    )
+    return PluginNotFoundError(plugin_name, list(available()), hint)
 
 
 def _module(kind: str, place: str) -> ModuleType:

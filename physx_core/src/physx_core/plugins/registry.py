@@ -76,7 +76,7 @@ def load(name: str) -> Plugin:
     """
     found = find_entries(PLUGINS)
     if name not in found:
-        raise PluginNotFoundError(name, list(found), _hint(name))
+        raise PluginNotFoundError(name, list(found), plugin_hint(name))
     if len(found[name]) > 1:
         raise PluginError(name, describe_conflict("plugin", found[name]))
     return _load(found[name][0])
@@ -116,8 +116,11 @@ def _call(manager: pluggy.PluginManager, hook: str) -> Components:
     return merged
 
 
-def _hint(name: str) -> str:
+def plugin_hint(name: str) -> str:
     """Return what to do about a plugin that is not installed."""
     if (PLUGINS, name) in OFFICIAL:
         return install_hint(OFFICIAL[PLUGINS, name])
-    return unreadable_hint() or "It is none of physx's own: install the package that contains it."
+    return unreadable_hint() or (
+        "It is none of physx's own: install the package that contains it. A class without a plugin "
+        'is named "package.module:Class" or "script.py:Class".'
+    )

@@ -75,6 +75,7 @@ class LocalSource(Source):
         """Create the instances' environments: see `Source.open`."""
         for instance in self._instances:
             self._open(instance)
+        self.ignores_predictions = all(instance.ignores_predictions for instance in self._instances)
         self.sets.begin([instance.parameters for instance in self._instances])
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:

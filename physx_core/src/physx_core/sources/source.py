@@ -28,10 +28,13 @@ class Source(ABC):
         instance_nb: Number of instances.
         sets: The sets of parameters that the instances are given; those whose first rows are in the
             last batch can be taken from it.
+        ignores_predictions: Whether `apply` is known to have no effect; what clients do with
+            predictions is not known.
     """
 
     instance_nb: int
     sets: ParameterSets
+    ignores_predictions = False
     _is_canceled = False
 
     @property

@@ -161,6 +161,11 @@ class Instance:
         return self.environment.fields if self.environment is not None else []
 
     @property
+    def ignores_predictions(self) -> bool:
+        """Whether the environment does not define `Environment.apply_prediction`."""
+        return type(self._alive()).apply_prediction is Environment.apply_prediction
+
+    @property
     def parameters(self) -> list[Parameter]:
         """The parameters that the environment defines. Empty if it is closed."""
         environment = self.environment

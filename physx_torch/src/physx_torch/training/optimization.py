@@ -132,7 +132,9 @@ class TorchOptimization(Optimization):
         """
         known = find_classes(torch.nn.modules.loss, torch.nn.Module)
         if loss is None:
-            raise ConfigError('A training needs a loss, for example loss="MSELoss".')
+            raise ConfigError(
+                'A training needs a loss, for example loss="MSELoss" (--network.loss MSELoss).'
+            )
         chosen = choose("loss", loss, known)
         if isinstance(chosen, type):
             chosen = make("loss", object, chosen, **self._loss_kwargs)
@@ -164,7 +166,10 @@ class TorchOptimization(Optimization):
                 parameters, or it does not support the options.
         """
         if optimizer is None:
-            raise ConfigError('A training needs an optimizer, for example optimizer="Adam".')
+            raise ConfigError(
+                'A training needs an optimizer, for example optimizer="Adam" '
+                "(--network.optimizer Adam)."
+            )
         if not isinstance(network, TorchNetwork):
             raise ConfigError(f"{type(network).__name__} is not a TorchNetwork.")
         chosen = choose("optimizer", optimizer, find_classes(torch.optim, torch.optim.Optimizer))

@@ -59,6 +59,12 @@ def _make(
         unknown = arguments.keys() - set(options_of(make)) if isinstance(make, type) else set()
         if isinstance(error, TypeError) and unknown:
             raise UnknownOptionError(name, unknown, options_of(make)) from error
+        if isinstance(error, TypeError) and (missing := _missing(make, arguments)):
+            option = f"{kind}_kwargs"
+            raise ConfigError(
+                f"{name} needs {listed(missing)}: give it in {option} "
+                f"(--network.{option.replace('_', '-')} {missing[0]}=...)."
+            ) from error
         text = f"rejects its arguments: {error}"
         if not isinstance(error, TypeError):
             text = f"raised in __init__(): {type(error).__name__}: {error}"
@@ -70,6 +76,20 @@ def _make(
             'example network="torch/module", network_kwargs={"module": "package.module:function"}.'
         )
     return component
+
+
+def _missing(make: Any, arguments: Mapping[str, Any]) -> list[str]:
+    """Return the arguments that a component needs and is not given."""
+    try:
+        parameters = inspect.signature(make).parameters.values()
+    except (TypeError, ValueError):  # not known, for example of a class in C
+        return []
+    named = (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return [
+        each.name
+        for each in parameters
+        if each.kind in named and each.default is each.empty and each.name not in arguments
+    ]
 
 
 def _check_fields(network: Network) -> None:

@@ -99,6 +99,11 @@ class TrainingData:
         return self._stored.dataset
 
     @property
+    def num_samples(self) -> int:
+        """Number of stored samples to train on."""
+        return self._stored.num_samples
+
+    @property
     def source(self) -> Source | None:
         """The environments; None if only the dataset is read."""
         return None if self._made is None else self._made.source

@@ -43,7 +43,8 @@ def exit_error(
     how = "closed the connection" if status is None else describe_exit(status)
     return ClientError(
         number,
-        f"{how} {when}. To see what it does, run with as_tcp_ip_client=False.",
+        f"{how} {when}. To see what it does, run it in this process: as_tcp_ip_client=False "
+        "(--environment.no-as-tcp-ip-client).",
         exit_status=status,
         stderr=handle.stderr(),
         client=place,
