@@ -222,7 +222,7 @@ def network(output: str, *layers: int) -> NetworkConfig:
     )
 
 
-HEAT = f"{Path(__file__).parents[1] / 'examples' / 'online' / 'heat.py'}:Heat"
+HEAT = f"{Path(__file__).parents[1] / 'examples' / 'environments' / 'heat.py'}:Heat"
 PROBLEMS = {
     "Lorenz": Problem("online_problems:Lorenz", network("output", 6, 64, 64, 3), 128, 50),
     "heat": Problem(HEAT, network("temperature", 5, 128, 128, 128, 576), 192, 10),

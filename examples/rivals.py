@@ -36,6 +36,15 @@ def relative_error(guess: np.ndarray, exact: np.ndarray) -> float:
     return float(np.mean(norms[0] / norms[1]))
 
 
+def table(
+    errors: Mapping[str, Sequence[float]], what: str = "relative error", form: str = ".2%"
+) -> None:
+    """Print mean and worst of all errors."""
+    print(f"\n{what:28}{'mean':>10}{'worst':>10}")
+    for name, found in errors.items():
+        print(f"{name:28}{np.mean(found):>10{form}}{max(found):>10{form}}")
+
+
 def verdict(
     errors: Mapping[str, Sequence[float]],
     network: str,
@@ -48,9 +57,7 @@ def verdict(
 
     References are printed, but are no rivals.
     """
-    print(f"\n{what:28}{'mean':>10}{'worst':>10}")
-    for name, found in errors.items():
-        print(f"{name:28}{np.mean(found):>10{form}}{max(found):>10{form}}")
+    table(errors, what, form)
     others = errors.keys() - {network, *references}
     means = {name: np.mean(errors[name]) for name in errors if name in others}
     rival = min(means, key=means.get)

@@ -27,6 +27,8 @@ def number(text, pattern):
     return float(re.search(pattern, text)[1])
 
 
+
+
 def test_equations_of_motion_help_a_network(root, run):
     text = run(root / "examples/physics_informed/run.py", "--small").stdout
     assert number(text, r"make the error ([\d.]+) times smaller") > 5
@@ -63,12 +65,3 @@ def test_normalization_is_part_of_a_saved_policy(root, tmp_path):
         seen = env.observation_space.sample()
         wanted, _ = model.predict(many.normalize_obs(seen), deterministic=True)
         np.testing.assert_allclose(policy(seen), wanted, atol=1e-5)
-
-
-def test_heat_is_learned_while_it_is_simulated(root, run, tmp_path):
-    pytest.importorskip("matplotlib")
-    picture = tmp_path / "online.png"
-    words = "--small", "--sessions", str(tmp_path / "sessions"), "--picture", str(picture)
-    text = run(root / "examples/online/run.py", *words).stdout
-    assert "physx/uniform: 32 simulations" in text and "physx/active: 32 simulations" in text
-    assert picture.stat().st_size > 10_000

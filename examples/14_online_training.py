@@ -1,0 +1,78 @@
+"""Learning the heat equation while two clients simulate it, where the network is still wrong.
+
+Heat spreads from a spot; narrow spots that stay sharp are few, and the hard part. A reservoir mixes
+the samples of many simulations, and the network learns from each while the next are made;
+`physx/active` simulates more where the loss is high. Compared are the largest errors on unseen
+simulations: with parameters drawn at random, after simulations that were all stored first, and of
+other widths, each with as many simulations and batches.
+
+    python examples/14_online_training.py --picture online.png
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+from common import SEEDS, generate, learned, options, samples
+from environments.heat import CELLS, FRAMES, Heat
+from environments.heat_picture import draw
+from rivals import linear_map, table, verdict
+
+from physx_core import EnvironmentConfig, NetworkConfig, Training
+
+BATCH, VIEWS, WIDTH = 32, 8, 128
+
+
+def network(width: int) -> NetworkConfig:
+    kwargs = {"layers": [5, *[width] * 3, CELLS**2], "activation": "SiLU"}
+    kwargs["opt_fields"] = "temperature"
+    return NetworkConfig("torch/fc", kwargs, loss="MSELoss", optimizer="Adam", lr=1e-3)
+
+
+def online(sampler, rows, seed, folder, given):
+    """Learn while simulating; return the session's parameters, and predictions."""
+    environment = EnvironmentConfig(Heat, num_clients=2, seed=seed, sampler=sampler)
+    buffer = {"capacity": rows // 2, "watermark": rows // 10, "views": VIEWS}
+    how = {"online": "physx/reservoir", "online_kwargs": buffer, "quiet": True}
+    training = Training(
+        network(WIDTH), None, environment, epoch_nb=1, batch_nb=VIEWS * rows // BATCH,
+        batch_size=BATCH, seed=seed, session_dir=str(folder), session_name="online", **how,
+    )  # fmt: skip
+    with training:
+        training.execute()
+        (guess,) = training.learner.predict_in_training({"input": given}).values()
+    return samples(training.session.path, "parameters", "width", "diffusivity"), guess
+
+
+def main() -> int:
+    """Learn in all ways; return whether choosing the simulations was no better."""
+    chosen = options(__doc__).parse_args()
+    simulations, seeds = (32, SEEDS[:1]) if chosen.small else (1024, SEEDS)
+    rows, folder, errors, found = simulations * FRAMES, chosen.session_dir, {}, []
+    session = generate(Heat, rows, folder, num_clients=2)
+    given, exact = samples(session, "validation", "input", "temperature")
+
+    def note(name, guess):
+        error = np.sqrt(((guess - exact) ** 2).mean((1, 2)) / (exact**2).mean())
+        errors.setdefault(name, []).append((error.mean(), np.quantile(error, 0.99)))
+        return error
+
+    note("a linear map", linear_map(*samples(session, "training", "input", "temperature"))(given))
+    for seed in seeds:
+        for width in (WIDTH, 4 * WIDTH):
+            guess = learned(session, network(width), "input", VIEWS, seed, batch_size=BATCH)
+            note(f"stored first, {width} wide", guess)
+        for sampler in ("physx/uniform", "physx/active"):
+            sets, guess = online(sampler, rows, seed, folder, given)
+            found.append((sampler, sets, note(sampler, guess)))
+    table({name: [mean for mean, _ in each] for name, each in errors.items()}, "mean error")
+    tails = {name: [tail for _, tail in each] for name, each in errors.items()}
+    lost = verdict(tails, "physx/active", what="99 % of errors are below")
+    if chosen.picture:
+        draw(chosen.picture, found[-2:], given)
+    return lost and not chosen.small
+
+
+if __name__ == "__main__":
+    sys.exit(main())
