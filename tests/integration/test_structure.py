@@ -1,9 +1,11 @@
-"""No module of a package imports in a circle, not even for type checkers or within functions."""
+"""No module imports in a circle, not even for type checkers; what closes is a context manager."""
 
 import ast
 import graphlib
+import inspect
 from pathlib import Path
 
+import public_names
 import pytest
 
 ROOT = Path(__file__).parents[2]
@@ -39,3 +41,14 @@ def test_modules_do_not_import_in_circles(package):
         graphlib.TopologicalSorter(graph).prepare()
     except graphlib.CycleError as error:
         pytest.fail(" imports ".join(reversed(error.args[1])))
+
+
+def test_what_can_be_closed_is_a_context_manager():
+    pytest.importorskip("torch")
+    found = {
+        f"{each.module}.{each.name}": hasattr(each.value, "__enter__")
+        for each in public_names.described()
+        if inspect.isclass(each.value) and hasattr(each.value, "close")
+    }
+    assert {"physx_gym.ParallelVectorEnv", "physx_remote.PhysxVectorEnv"} <= found.keys()
+    assert [name for name, can_enter in found.items() if not can_enter] == []

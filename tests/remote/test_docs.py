@@ -84,6 +84,7 @@ def test_several_worlds(tmp_path, monkeypatch, worlds_in_thread):
     service = worlds_in_thread("gym/CartPole-v1", num_worlds=16, token_file="token")
     names = run(block("worlds.reset", service.address))
     assert names["observations"].shape == (16, 4)
+    assert names["worlds"].closed
 
 
 @pytest.fixture

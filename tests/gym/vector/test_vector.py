@@ -152,7 +152,7 @@ def test_it_returns_what_gymnasium_returns(mode, launch, nothing_stays_behind):
     assert ours.action_space == theirs.action_space
     assert ours.metadata["autoreset_mode"] is mode
     theirs.action_space.seed(1)
-    with contextlib.closing(ours):
+    with ours:
         same(ours.reset(seed=[4, 5, 6]), theirs.reset(seed=[4, 5, 6]))
         for _ in range(20):
             actions = theirs.action_space.sample()
@@ -167,7 +167,7 @@ def test_infos_whose_layout_changes(count, launch, nothing_stays_behind):
         SyncVectorEnv([Talker] * count),
     )
     actions = {"kind": np.zeros(count, int), "size": np.zeros((count, 1), np.float32)}
-    with contextlib.closing(ours):
+    with ours:
         same(ours.reset(seed=8), theirs.reset(seed=8))
         for _ in range(2 * len(Talker.TALK)):
             same(ours.step(actions)[4], theirs.step(actions)[4])
@@ -179,7 +179,7 @@ def test_nan_and_infinity_are_passed_through(launch, nothing_stays_behind):
         SyncVectorEnv([Broken] * 2),
     )
     actions = {"kind": np.zeros(2, int), "size": np.zeros((2, 1), np.float32)}
-    with contextlib.closing(ours):
+    with ours:
         same(ours.reset(seed=8), theirs.reset(seed=8))
         for _ in range(3):
             same(ours.step(actions), theirs.step(actions))
@@ -187,7 +187,7 @@ def test_nan_and_infinity_are_passed_through(launch, nothing_stays_behind):
 
 def test_nested_spaces_infos_calls_and_attributes(caplog, launch, nothing_stays_behind):
     env = launch(HERE + "Counter", 3, env_kwargs={"render_mode": "rgb_array"}, num_processes=3)
-    with contextlib.closing(env):
+    with env:
         observation, infos = env.reset(seed=1, options={"start": 1})
         assert observation["count"].tolist() == [[1.0, 1.0]] * 3
         assert observation["parts"][0].tolist() == [1, 1, 1]

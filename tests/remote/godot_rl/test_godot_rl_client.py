@@ -177,16 +177,16 @@ def application(port, *answers):
 
 def test_an_application_of_an_older_version(port, beside):
     beside(application, port, INFO, {"type": "reset", "obs": [{"obs": [0]}] * 2}, STEP)
-    vector = connect_vector(f"127.0.0.1:{port}", "godot-rl")
-    assert vector.single_action_space == spaces.Dict({"move": spaces.Discrete(3)})
-    assert vector.reset()[0].tolist() == [[0], [0]]
-    seen, rewards, terminated, truncated, _ = vector.step({"move": np.array([2, 0])})
-    assert seen.tolist() == [[1], [1]]
-    assert rewards.tolist() == [1, 2]
-    assert (terminated.tolist(), truncated.tolist()) == ([True, False], [False, False])
-    with pytest.raises(RemoteClosedError):
-        vector.reset()
-    vector.close()
+    with connect_vector(f"127.0.0.1:{port}", "godot-rl") as vector:
+        assert vector.single_action_space == spaces.Dict({"move": spaces.Discrete(3)})
+        assert vector.reset()[0].tolist() == [[0], [0]]
+        seen, rewards, terminated, truncated, _ = vector.step({"move": np.array([2, 0])})
+        assert seen.tolist() == [[1], [1]]
+        assert rewards.tolist() == [1, 2]
+        assert (terminated.tolist(), truncated.tolist()) == ([True, False], [False, False])
+        with pytest.raises(RemoteClosedError):
+            vector.reset()
+    assert vector.closed
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Protocol, TypeAlias
 
 import numpy as np
 
+from physx_core.closeable import Closeable
 from physx_core.components.parameter import Parameter, as_parameters, draw, random_of
 from physx_core.components.sampler import checked
 from physx_core.components.scene.event import Event
@@ -88,7 +89,7 @@ Choose: TypeAlias = Callable[[int], Mapping[str, Any]]
 """Returns the values of the parameters for an episode, by name."""
 
 
-class Environment:
+class Environment(Closeable):
     """A simulation that generates one sample in each step.
 
     Subclasses implement `create`, `init_database` and `step`. The methods are called in this

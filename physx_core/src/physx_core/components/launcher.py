@@ -6,6 +6,8 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
+from physx_core.closeable import Closeable
+
 _POLL_SECONDS = 0.005
 
 
@@ -51,7 +53,7 @@ class ClientHandle(ABC):
         return True
 
 
-class Launcher(ABC):
+class Launcher(Closeable):
     """Starts clients; a plugin offers its own with the hook ``physx_launchers``.
 
     The constructor takes the entries of `EnvironmentConfig.launcher_kwargs`. The started processes
@@ -85,7 +87,7 @@ class Launcher(ABC):
         """
         return None
 
-    def close(self) -> None:  # noqa: B027 - most have nothing to end
+    def close(self) -> None:
         """End everything that the launcher started; called after the clients have ended."""
 
     @abstractmethod

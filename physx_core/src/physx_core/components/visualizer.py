@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from physx_core.closeable import Closeable
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -13,7 +15,7 @@ if TYPE_CHECKING:
     from physx_core.typing import Array
 
 
-class Observer:
+class Observer(Closeable):
     """Receives the events of a running pipeline. All methods do nothing unless overridden.
 
     An observer that raises is reported once and then left out; the run continues.

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from physx_core.closeable import Closeable
 from physx_core.typing import Vector
 
 
-class Algorithms(ABC):
+class Algorithms(Closeable):
     """Kinematics and dynamics of the robots and objects of a world.
 
     States follow the convention of `physx_core.simulation.layout`; `RobotSimulation` has validated
@@ -116,5 +117,5 @@ class Algorithms(ABC):
                 out[place] = weight @ matrix
         return found
 
-    def close(self) -> None:  # noqa: B027 (most engines hold nothing)
+    def close(self) -> None:
         """Free what the algorithms hold, such as processes."""

@@ -9,6 +9,7 @@ import time
 from abc import ABC, abstractmethod
 from typing import Any
 
+from physx_core.closeable import Closeable
 from physx_core.net.liveness import prepare_connection
 
 _MOST_AT_ONCE = 1 << 20
@@ -46,7 +47,7 @@ class Reader(ABC):
         """Whether more may be received before a message is taken."""
 
 
-class Connection:
+class Connection(Closeable):
     """One non-blocking socket of a server.
 
     Attributes:

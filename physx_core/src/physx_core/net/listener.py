@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 from weakref import WeakSet
 
+from physx_core.closeable import Closeable
 from physx_core.net.addresses import is_loopback
 from physx_core.net.connection import Connection
 from physx_core.net.liveness import LOOK_EVERY, has_vanished
@@ -25,7 +26,7 @@ _LOG = logging.getLogger("physx")
 AnyConnection = TypeVar("AnyConnection", bound=Connection)
 
 
-class Listener(Generic[AnyConnection]):
+class Listener(Closeable, Generic[AnyConnection]):
     """The sockets of one server: one that listens, and any number that are connected.
 
     Attributes:

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from physx_core.closeable import Closeable
 from physx_core.components.environment import (
     Choose,
     Environment,
@@ -96,7 +97,7 @@ def instance_arguments(
     }
 
 
-class Instance:
+class Instance(Closeable):
     """Calls an environment's methods in order, and names the instance in every error.
 
     Attributes:

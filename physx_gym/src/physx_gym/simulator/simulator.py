@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from physx_core import checks, plugins
+from physx_core import Closeable, checks, plugins
 from physx_core.errors import (
     ComponentNotFoundError,
     ConfigError,
@@ -60,7 +60,7 @@ class Engine:
     first: State
 
 
-class Simulator(SharedArrays):
+class Simulator(SharedArrays, Closeable):
     """A world ready to run, whose engine is built when it is first needed.
 
     It can be pickled and copied, even while it runs: the copy builds an engine of its own and

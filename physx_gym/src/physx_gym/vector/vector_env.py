@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from physx_core import Closeable
 from physx_core.config import reference_of
 from physx_core.errors import ActionError, ConfigError, UnknownOptionError, UsageError
 from physx_core.net import Frame, Kind, count_cores, decode
@@ -33,7 +34,7 @@ FORBIDDEN = ("reset", "step", "close")
 _LOG = logging.getLogger("physx")
 
 
-class ParallelVectorEnv(VectorEnv[Any, Any, Any]):
+class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
     """A vector environment whose environments are stepped in processes of their own.
 
     ``gymnasium.make_vec("physx/Ant-v0", num_envs=8, num_processes=2)`` creates one. `step` does

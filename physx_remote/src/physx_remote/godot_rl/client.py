@@ -14,6 +14,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
+from physx_core import Closeable
 from physx_core.errors import RemoteError, RemoteProtocolError, RemoteTimeoutError, UsageError
 from physx_core.typing import Array
 from physx_remote.godot_rl.json_spaces import (
@@ -53,7 +54,7 @@ class _Incoming(RequestLink):
                 ) from error
 
 
-class GodotRLVectorEnv(VectorEnv[Any, Any, Any]):
+class GodotRLVectorEnv(VectorEnv[Any, Any, Any], Closeable):
     """The agents of an application that connects to an address: the trainer's side of godot-rl.
 
     Observations and actions are dictionaries by the application's keys; a single key ``obs`` or

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from physx_core import Closeable
 from physx_core.errors import ActionError, ConfigError, EpisodeError, RemoteProtocolError
 from physx_core.typing import Array
 from physx_remote.physx.client import PhysxClient
@@ -16,7 +17,7 @@ from physx_remote.physx.wire import REWARD, TERMINATED, TRUNCATED
 from physx_remote.serving.spaces import NONSENSE
 
 
-class PhysxVectorEnv(VectorEnv[Any, Any, Any]):
+class PhysxVectorEnv(VectorEnv[Any, Any, Any], Closeable):
     """All worlds of a service, stepped with one request. Closing it ends the connection.
 
     Attributes:
