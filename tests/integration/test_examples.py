@@ -27,8 +27,6 @@ def number(text, pattern):
     return float(re.search(pattern, text)[1])
 
 
-
-
 def test_equations_of_motion_help_a_network(root, run):
     text = run(root / "examples/physics_informed/run.py", "--small").stdout
     assert number(text, r"make the error ([\d.]+) times smaller") > 5
