@@ -19,6 +19,8 @@ PACKAGES = (
 )
 PHYSX = ("-m", "physx_core")
 GENERATE = "--batch-nb 2 --batch-size 10"
+CONSTRAINTS = Path(__file__).parents[2] / "constraints.txt"
+OPTIONS = ("--quiet", "--no-compile", "-c", CONSTRAINTS)
 SERVE = """
 import threading
 from physx_remote import connect, serve
@@ -50,55 +52,81 @@ def build_wheels(root, folder):
     return folder
 
 
+@pytest.fixture(scope="module")
+def python(tmp_path_factory, wheels):
+    """The interpreter of an environment that holds the core alone."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, with_pip=False)
+    pip(folder / "bin/python", "install", *OPTIONS, next(wheels.glob("physx_core-*.whl")))
+    return folder / "bin/python"
+
+
 @pytest.fixture
-def empty(tmp_path, run, wheels, root):
-    venv.create(tmp_path / "venv", with_pip=True)
-    python = tmp_path / "venv/bin/python"
-
-    def install(*names):
-        files = [next(wheels.glob(f"{name}-*.whl")) for name in names]
-        constraints = ("-c", root / "constraints.txt")
-        quiet = ("--quiet", "--disable-pip-version-check", "--no-compile")
-        run("-m", "pip", "install", *quiet, *constraints, *files, python=python)
-        return python
-
-    return install
+def add(python, wheels):
+    """Install a package beside the core; it goes after the test, with all that came with it."""
+    before = installed(python)
+    yield lambda name: pip(python, "install", *OPTIONS, next(wheels.glob(f"{name}-*.whl")))
+    pip(python, "uninstall", "--quiet", "--yes", *sorted(installed(python) - before))
 
 
-def test_the_core_alone_generates_and_trains_and_torch_adds_its_network(empty, run, wheels):
-    python = empty("physx_core")
-    listed = json.loads(run("-m", "pip", "list", "--format", "json", python=python).stdout)
+def pip(python, command, *words):
+    """Have the pip of this environment work on another one, which then needs none."""
+    line = [sys.executable, "-m", "pip", "--python", python, "--disable-pip-version-check"]
+    done = subprocess.run(
+        list(map(str, [*line, command, *words])), capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def installed(python):
+    """Return the names of all packages of an environment."""
+    return {package["name"] for package in json.loads(pip(python, "list", "--format", "json"))}
+
+
+FC = (
+    "torch/fc", "--network.network-kwargs",
+    "layers=[2,4,2]", "net_fields='state'", "opt_fields='next_state'",
+    "--network.loss", "MSELoss", "--network.optimizer", "Adam",
+)  # fmt: skip
+
+
+def generate(run, python):
+    return run(*PHYSX, "generate", "toy/spring", *GENERATE.split(), python=python).stderr
+
+
+def train(run, python, network, *options, ok=True):
+    words = (*PHYSX, "train", "sessions/data_generation", "--epoch-nb", 1, "--batch-size", 5)
+    return run(*words, "--network.network", network, *options, python=python, ok=ok).stderr
+
+
+def test_the_core_alone_generates_and_trains(python, run, wheels):
     folder = run(*PHYSX, "include", python=python).stdout.strip()
     assert {"physx.h", "physx.f90"} < {path.name for path in Path(folder).iterdir()}
     foreign = {"gymnasium", "torch", "dartpy", "pin", "rerun-sdk"}
-    assert not foreign & {package["name"] for package in listed}
-    generate = (*PHYSX, "generate", "toy/spring", "--batch-nb", 2, "--batch-size", 10)
-    assert "20 training" in run(*generate, python=python).stderr
+    assert not foreign & installed(python)
+    assert "20 training" in generate(run, python)
 
-    def pip(name):
+    def hint(name):
         return f"pip install {next(wheels.glob(f'{name}-*.whl'))}"
 
-    def train(network, *options, ok=True):
-        words = (*PHYSX, "train", "sessions/data_generation", "--epoch-nb", 1, "--batch-size", 5)
-        return run(*words, "--network.network", network, *options, python=python, ok=ok)
-
     arguments = ("--network.network-kwargs", "net_fields=['state','force']")
-    assert "training loss" in train("toy/linear", *arguments).stderr
-    fc = (
-        "torch/fc", "--network.network-kwargs",
-        "layers=[2,4,2]", "net_fields='state'", "opt_fields='next_state'",
-        "--network.loss", "MSELoss", "--network.optimizer", "Adam",
-    )  # fmt: skip
-    missing = train(*fc, ok=False)
-    assert missing.returncode == 1 and pip("physx_torch") in missing.stderr
-    missing = run(*PHYSX, "generate", "dart/arm", *generate[4:], python=python, ok=False)
-    assert missing.returncode == 1 and pip("physx_dart") in missing.stderr
+    assert "training loss" in train(run, python, "toy/linear", *arguments)
+    assert hint("physx_torch") in train(run, python, *FC, ok=False)
+    missing = run(*PHYSX, "generate", "dart/arm", *GENERATE.split(), python=python, ok=False)
+    assert missing.returncode == 1 and hint("physx_dart") in missing.stderr
     missing = run(*PHYSX, "serve", python=python, ok=False)
-    assert missing.returncode == 1 and pip("physx_remote") in missing.stderr
-    empty("physx_torch")
-    assert "training loss" in train(*fc).stderr
+    assert missing.returncode == 1 and hint("physx_remote") in missing.stderr
 
 
+@pytest.mark.faults
+def test_torch_adds_its_network(python, add, run):
+    generate(run, python)
+    add("physx_torch")
+    assert "training loss" in train(run, python, *FC)
+
+
+@pytest.mark.faults
 @pytest.mark.parametrize(
     ("name", "command"),
     [
@@ -107,19 +135,19 @@ def test_the_core_alone_generates_and_trains_and_torch_adds_its_network(empty, r
         ("physx_gym", f"generate gym/CartPole-v1 {GENERATE}"),
     ],
 )
-def test_each_plugin_works_with_the_core_alone(name, command, empty, run):
-    python = empty("physx_core", name)
+def test_each_plugin_works_with_the_core_alone(name, command, python, add, run):
+    add(name)
     assert "20 training" in run(*PHYSX, *command.split(), python=python).stderr
 
 
-def test_remote_works_with_the_core_alone(empty, run, tmp_path):
-    python = empty("physx_core", "physx_remote")
+def test_remote_works_with_the_core_alone(python, add, run, tmp_path):
+    add("physx_remote")
     (tmp_path / "program.py").write_text(SERVE)
     assert "1.0 reward" in run("program.py", python=python).stdout
 
 
-def test_the_plugin_of_clusters_works_with_the_core_alone(empty, run):
-    python = empty("physx_core", "physx_cluster")
+def test_the_plugin_of_clusters_works_with_the_core_alone(python, add, run):
+    add("physx_cluster")
     words = ("generate", "toy/spring", *GENERATE.split(), "--environment.launcher")
     for name, library in (("cluster/ray", "Ray"), ("cluster/slurm", "submitit")):
         missing = run(*PHYSX, *words, name, python=python, ok=False)

@@ -40,7 +40,16 @@ def call(python, tmp_path):
     return run
 
 
-@pytest.mark.parametrize("kind", ["environment", "network", "visualizer", "backend", "plugin"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "environment",
+        "visualizer",
+        "plugin",  # with an environment and a network
+        pytest.param("network", marks=pytest.mark.faults),
+        pytest.param("backend", marks=pytest.mark.faults),
+    ],
+)
 def test_a_new_plugin_works_until_it_is_removed(call, tmp_path, kind):
     name = f"wave-{kind}"
     folder = tmp_path / f"physx-{name}"
@@ -57,7 +66,6 @@ def test_a_new_plugin_works_until_it_is_removed(call, tmp_path, kind):
         use(call, kind, name, tmp_path)
     finally:
         call("pip", "uninstall", *options, "--yes", f"physx-{name}")
-    assert name not in call("physx_core", "plugins")
     assert f'No plugin "{name}"' in call("physx_core", "check", name, ok=False)
 
 

@@ -1,20 +1,17 @@
-"""Two nodes of Ray, one of Slurm, and runs of the command line on them."""
+"""Runs of the command line on clusters."""
 
 from __future__ import annotations
 
-import contextlib
 import os
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from one_node_slurm import Slurm, wait_for
+from one_node_slurm import wait_for
 
 from physx_core import Dataset
 
@@ -101,6 +98,22 @@ def is_running(pid):
         return False
 
 
+@pytest.fixture(scope="session")
+def local_rows(tmp_path_factory):
+    """A function that returns the first rows of a run on this machine alone.
+
+    A longer run begins with the rows of a shorter one, so one is made for each number of clients.
+    """
+    made = {}
+
+    def first(clients=2, batches=4):
+        if clients not in made:
+            made[clients] = Runs(tmp_path_factory.mktemp("local")).rows(clients=clients, batches=30)
+        return {name: values[: 10 * batches] for name, values in made[clients].items()}
+
+    return first
+
+
 @pytest.fixture
 def runs(tmp_path):
     runs = Runs(tmp_path)
@@ -109,90 +122,6 @@ def runs(tmp_path):
         for each in (pid, child):
             if is_running(int(each)):  # then the test has failed
                 os.kill(int(each), signal.SIGKILL)
-
-
-class RayCluster:
-    """Ray with two nodes on this machine.
-
-    Attributes:
-        variables: The environment variables by which a run finds it.
-    """
-
-    def __init__(self):
-        from ray.cluster_utils import Cluster
-
-        soon = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500}
-        settings = {**soon, "health_check_failure_threshold": 4}
-        self._cluster = Cluster(
-            initialize_head=True,
-            head_node_args={
-                "num_cpus": 1,
-                "include_dashboard": False,
-                "_system_config": settings,
-            },
-        )
-        self.nodes = [self._cluster.head_node, self.add_node()]
-        self.variables = {"RAY_ADDRESS": self._cluster.address}
-
-    def add_node(self):
-        return self._cluster.add_node(num_cpus=1)
-
-    def raylet_of(self, node):
-        return node.all_processes["raylet"][0].process.pid
-
-    def kill(self, node):
-        """Kill all processes of a node, as if its machine lost its power."""
-        raylet = self.raylet_of(node)
-        for pid in [raylet, *descendants(raylet)]:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-
-    def close(self):
-        import ray
-
-        ray.shutdown()
-        self._cluster.shutdown()
-
-
-def descendants(pid):
-    found, children = [], {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            parent = int(stat.read_text().rpartition(")")[2].split()[1])
-            children.setdefault(parent, []).append(int(stat.parent.name))
-    found += children.get(pid, [])
-    for each in found:  # grows while it is read
-        found += children.get(each, [])
-    return found
-
-
-@pytest.fixture(scope="session")
-def ray_cluster():
-    """Ray with two nodes of one processor each."""
-    pytest.importorskip("ray")
-    folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # the names of sockets must be short
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_TMPDIR", folder)
-        cluster = RayCluster()
-        yield cluster
-        cluster.close()
-    shutil.rmtree(folder, ignore_errors=True)
-
-
-@pytest.fixture(scope="session")
-def slurm():
-    """Slurm with one node of four processors: this machine."""
-    folder = Path(tempfile.mkdtemp(prefix="slurm", dir="/tmp"))
-    cluster = Slurm(folder)
-    reason = cluster.start()
-    try:
-        if reason and os.environ.get("CI") != "true":
-            pytest.skip(reason)
-        assert not reason, reason
-        yield cluster
-    finally:
-        cluster.stop()
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture

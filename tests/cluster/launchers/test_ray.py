@@ -12,6 +12,9 @@ import pytest
 
 pytest.importorskip("ray")
 
+from physx_cluster import RayLauncher
+from physx_core.errors import ClientError, ConfigError
+
 pytestmark = pytest.mark.slow
 
 RAY = ("--environment.launcher", "cluster/ray")
@@ -23,13 +26,11 @@ def on(cluster, *kwargs):
     return (*RAY, *((KWARGS, *kwargs) if kwargs else ()))
 
 
-def test_the_rows_are_those_of_a_local_run(runs, ray_cluster, eventually):
-    expected = runs.rows()
+def test_the_rows_are_those_of_a_local_run(runs, local_rows, ray_cluster, eventually):
+    expected = local_rows()
     assert runs.same(runs.rows(*on(ray_cluster), **ray_cluster.variables), expected)
     nodes = sorted(node for *_, node in runs.clients())
-    assert nodes == sorted(
-        ["here", "here", "here", str(ray_cluster.raylet_of(ray_cluster.nodes[1]))]
-    )
+    assert nodes == sorted(["here", str(ray_cluster.raylet_of(ray_cluster.nodes[1]))])
     said = runs.log.read_text().splitlines()
     assert [line.partition(":")[0] for line in said if "batches" not in line] == [
         *("session", "samples", "next", "next")
@@ -37,8 +38,10 @@ def test_the_rows_are_those_of_a_local_run(runs, ray_cluster, eventually):
     eventually(runs.nothing_is_left)
 
 
-def test_a_killed_node_is_replaced_and_the_rows_stay_the_same(runs, ray_cluster, eventually):
-    expected = runs.rows(batches=20)
+def test_a_killed_node_is_replaced_and_the_rows_stay_the_same(
+    runs, local_rows, ray_cluster, eventually
+):
+    expected = local_rows(batches=20)
     lost = ray_cluster.nodes.pop()
     process = runs.start(
         *on(ray_cluster, "num_cpus=0.5"),
@@ -47,7 +50,7 @@ def test_a_killed_node_is_replaced_and_the_rows_stay_the_same(runs, ray_cluster,
         pace=0.05,
         **ray_cluster.variables,
     )
-    runs.wait_for_clients(4, process)
+    runs.wait_for_clients(2, process)
     time.sleep(1)
     ray_cluster.kill(lost)
     status, said = runs.finish(process)
@@ -55,13 +58,15 @@ def test_a_killed_node_is_replaced_and_the_rows_stay_the_same(runs, ray_cluster,
     assert status == 0, said
     assert "Restart 1 of 1" in said
     assert runs.same(runs.stored(), expected)
-    assert len(runs.clients()) == 5
+    assert len(runs.clients()) == 3
     eventually(runs.nothing_is_left)
 
 
-def test_an_elastic_run_goes_on_without_some_of_its_clients(runs, ray_cluster, eventually):
+def test_an_elastic_run_goes_on_without_some_of_its_clients(
+    runs, local_rows, ray_cluster, eventually
+):
     """Of four clients two find a place, of which one is lost with its node."""
-    expected = runs.rows(batches=30)
+    expected = local_rows(batches=30)
     lost = ray_cluster.nodes.pop()
     process = runs.start(
         *on(ray_cluster, "num_cpus=1"),
@@ -115,26 +120,46 @@ def test_a_cluster_is_started_for_the_run_and_ends_with_it(runs, eventually):
         shutil.rmtree(folder, ignore_errors=True)
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "text"),
-    [
-        (["num_gpus=3"], "a client needs 1 CPU and 3 GPU of one node, and the nodes have up to"),
-        (["num_cpus=1.5"], "has no place on Ray"),
-        (["strategy='STRICT_PACK'"], "2 clients, each with 1 CPU, do not fit the 2 nodes"),
-        (["strategy='AROUND'"], "strategy is 'AROUND', but must be one of"),
-        (["num_cpus=0"], "at least one resource"),
-        (["address='ray://127.0.0.1:10001'"], "address of a Ray client"),
-        (["address='127.0.0.1:1'"], "Ray does not answer at 127.0.0.1:1"),
-    ],
-)
-def test_what_cannot_be_had_is_said_within_seconds(kwargs, text, runs, ray_cluster):
+def test_what_cannot_be_had_is_said_within_seconds(runs, ray_cluster):
     began = time.monotonic()
-    process = runs.start(*on(ray_cluster, *kwargs), **ray_cluster.variables)
+    process = runs.start(*on(ray_cluster, "num_gpus=3"), **ray_cluster.variables)
     status, said = runs.finish(process, 60)
     assert status == 1
+    text = "a client needs 1 CPU and 3 GPU of one node, and the nodes have up to"
     assert text in " ".join(said.split())
     assert time.monotonic() - began < 30
     assert not runs.clients()
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "text"),
+    [
+        ({"num_cpus": 1.5}, "has no place on Ray"),
+        ({"strategy": "STRICT_PACK"}, "2 clients, each with 1 CPU, do not fit the 2 nodes"),
+    ],
+)
+def test_what_has_no_place_is_refused(kwargs, text, ray_cluster):
+    launcher = RayLauncher(address=ray_cluster.variables["RAY_ADDRESS"], **kwargs)
+    launcher.open()
+    try:
+        with pytest.raises(ClientError, match=text):
+            launcher.launch([1, 2], "127.0.0.1:1", "token")
+    finally:
+        launcher.close()
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "text"),
+    [
+        ({"strategy": "AROUND"}, "strategy is 'AROUND', but must be one of"),
+        ({"num_cpus": 0}, "at least one resource"),
+        ({"address": "ray://127.0.0.1:10001"}, "address of a Ray client"),
+        ({"address": "127.0.0.1:1"}, "Ray does not answer at 127.0.0.1:1"),
+    ],
+)
+def test_options_are_checked_before_anything_is_started(kwargs, text):
+    with pytest.raises(ConfigError, match=text):
+        RayLauncher(**kwargs).open()
 
 
 def test_the_run_says_what_its_clients_wait_for(runs, ray_cluster, eventually):
@@ -152,8 +177,8 @@ def test_the_run_says_what_its_clients_wait_for(runs, ray_cluster, eventually):
     runs.finish(first)
 
 
-def test_more_clients_than_processors_share_them(runs, ray_cluster):
-    expected = runs.rows(clients=5)
+def test_more_clients_than_processors_share_them(runs, local_rows, ray_cluster):
+    expected = local_rows(clients=5)
     assert runs.same(runs.rows(*on(ray_cluster), clients=5, **ray_cluster.variables), expected)
 
 

@@ -34,9 +34,8 @@ def data(tmp_path_factory):
     return run.session.path
 
 
-@pytest.fixture
-def training(data):
-    """The table of a training by gradient descent, 8 batches in each of 4 epochs."""
+def descent(data):
+    """Return the table of a training by gradient descent, 8 batches in each of 4 epochs."""
     return {
         "epoch_nb": EPOCHS,
         "batch_size": 10,
@@ -49,21 +48,55 @@ def training(data):
     }
 
 
+def write_study(path, training, *, parameters=None, pipelines=None, run=None, **study):
+    plain = {
+        "study": study,
+        "run": run or {},
+        "parameters": {"training.network.lr": [0.1, 0.3]} if parameters is None else parameters,
+        "pipelines": pipelines or {"linear": {"training": training}},
+    }
+    Path(path).write_text(tomli_w.dumps(plain))
+    return Path(path)
+
+
+@pytest.fixture
+def training(data):
+    """The table of a training by gradient descent."""
+    return descent(data)
+
+
 @pytest.fixture
 def write(training):
     """A function that writes a study's file; its options are those of the table [study]."""
+    return lambda path="sweep.toml", **options: write_study(path, training, **options)
 
-    def write(path="sweep.toml", *, parameters=None, pipelines=None, run=None, **study):
-        plain = {
-            "study": study,
-            "run": run or {},
-            "parameters": {"training.network.lr": [0.1, 0.3]} if parameters is None else parameters,
-            "pipelines": pipelines or {"linear": {"training": training}},
-        }
-        Path(path).write_text(tomli_w.dumps(plain))
-        return Path(path)
 
-    return write
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory, data):
+    """A function that returns the folder of a study that ran to its end; pauses change nothing."""
+    made = {}
+
+    def run(**options):
+        name = repr(options)
+        if name not in made:
+            folder = tmp_path_factory.mktemp("undisturbed")
+            write_study(folder / "sweep.toml", descent(data), run={"parallel": 2}, **options)
+            physx("sweep", folder / "sweep.toml", "--study", folder / "whole")
+            made[name] = folder / "whole"
+        return made[name]
+
+    return run
+
+
+@pytest.fixture
+def whole(undisturbed):
+    """A function that puts the study with some options, run to its end, into studies/whole."""
+
+    def put(**options):
+        Path("studies").mkdir()
+        Path("studies/whole").symlink_to(undisturbed(**options))
+
+    return put
 
 
 def physx(*words, status=0, **variables):

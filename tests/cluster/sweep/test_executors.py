@@ -1,43 +1,42 @@
 """The same study on Ray and by submitit: the same table."""
 
 import os
-import shutil
 import signal
-import tempfile
 import time
 from pathlib import Path
 
 import pytest
-from one_node_slurm import Slurm
+from one_node_slurm import wait_for
 from sweep_kills import processes, start
 
 pytestmark = [pytest.mark.usefixtures("nothing_stays_behind"), pytest.mark.slow]
 
 
 @pytest.fixture
-def slurm(monkeypatch):
-    """Slurm with this machine as its only node."""
-    folder = Path(tempfile.mkdtemp(prefix="slurm", dir="/tmp"))
-    cluster = Slurm(folder)
-    reason = cluster.start()
-    try:
-        if reason and os.environ.get("CI") != "true":
-            pytest.skip(reason)
-        assert not reason, reason
-        monkeypatch.setenv("SLURM_CONF", cluster.variables["SLURM_CONF"])
-        yield cluster
-    finally:
-        cluster.stop()
-        shutil.rmtree(folder, ignore_errors=True)
+def idle_slurm(slurm, monkeypatch):
+    """Slurm with this machine as its only node, where no job is left."""
+    monkeypatch.setenv("SLURM_CONF", slurm.variables["SLURM_CONF"])
+    assert wait_for(lambda: not slurm.ask("squeue", "--noheader"))
+    return slurm
 
 
 @pytest.fixture
-def whole(write, training, physx):
-    """The table of a study, run here."""
+def same_as_whole(whole, parameters_of):
+    """A function that checks that a study on a cluster is the same as one here."""
+    whole()
+
+    def check(study="studies/there"):
+        table = Path("studies/whole/trials.csv").read_bytes()
+        assert Path(study, "trials.csv").read_bytes() == table
+        assert parameters_of(study) == parameters_of("studies/whole")
+
+    return check
+
+
+@pytest.fixture
+def slow(training):
+    """A training whose batches take 5 ms at least, so that kills meet it."""
     training["network"]["optimization_kwargs"] = {"pause": 0.005}
-    write(run={"parallel": 2})
-    physx("sweep", "sweep.toml", "--study", "studies/whole")
-    return Path("studies/whole/trials.csv").read_bytes()
 
 
 def kill_one(study, deadline=120, *, parent=False):
@@ -57,30 +56,31 @@ def kill_one(study, deadline=120, *, parent=False):
     ("executor", "options"),
     [("ray", {"num_cpus": 1, "address": "local"}), ("slurm", {"cluster": "local"})],
 )
-def test_the_table_is_the_same_wherever_trials_run(
-    write, whole, physx, parameters_of, executor, options
-):
+def test_the_table_is_the_same_wherever_trials_run(write, slow, same_as_whole, executor, options):
     pytest.importorskip({"ray": "ray", "slurm": "submitit"}[executor])
     write(run={"parallel": 2, "executor": executor, "options": options})
     sweep = start("sweep.toml", "studies/there")
     kill_one("studies/there")
     assert sweep.wait(200) == 0
-    assert Path("studies/there/trials.csv").read_bytes() == whole
-    assert parameters_of("studies/there") == parameters_of("studies/whole")
+    same_as_whole()
 
 
 @pytest.mark.parametrize(
     ("executor", "options", "texts"),
     [
         ("local", {"cpus": 2}, ['The executor "local" has no option "cpus"']),
-        ("ray", {"address": "local", "cpus": 2}, ["Ray refuses the options", "cpus"]),
+        ("ray", {"address": "of the tests", "cpus": 2}, ["Ray refuses the options", "cpus"]),
         ("ray", {"address": "127.0.0.1:9"}, ["Ray does not answer at 127.0.0.1:9"]),
         ("slurm", {"cluster": "local", "tiem": 3}, ["submitit refuses the options", "tiem"]),
         ("slurm", {"cluster": "slrm"}, ["run.options.cluster is 'slrm'"]),
     ],
 )
-def test_options_that_an_executor_does_not_know(write, physx, executor, options, texts):
+def test_options_that_an_executor_does_not_know(
+    write, physx, executor, options, texts, ray_cluster
+):
     pytest.importorskip({"ray": "ray", "slurm": "submitit"}.get(executor, "physx_core"))
+    if options.get("address") == "of the tests":
+        options = {**options, "address": ray_cluster.variables["RAY_ADDRESS"]}
     write(run={"executor": executor, "options": options})
     said = physx("sweep", "sweep.toml", status=1)
     for text in texts:
@@ -111,7 +111,7 @@ def test_a_sweep_that_is_asked_to_end_leaves_no_trial_behind(write, training, ex
 
 
 def test_slurm_runs_trials_and_keeps_none_when_the_sweep_is_killed(
-    write, whole, parameters_of, slurm
+    write, slow, same_as_whole, idle_slurm
 ):
     pytest.importorskip("submitit")
     write(run={"parallel": 2, "executor": "slurm"})
@@ -120,17 +120,14 @@ def test_slurm_runs_trials_and_keeps_none_when_the_sweep_is_killed(
     sweep.kill()
     sweep.wait()
     deadline = time.monotonic() + 60
-    while processes("studies/there") or slurm.ask("squeue", "--noheader"):
+    while processes("studies/there") or idle_slurm.ask("squeue", "--noheader"):
         assert time.monotonic() < deadline
         time.sleep(0.1)
     assert start("sweep.toml", "studies/there").wait(200) == 0
-    assert Path("studies/there/trials.csv").read_bytes() == whole
-    assert parameters_of("studies/there") == parameters_of("studies/whole")
+    same_as_whole()
 
 
-def test_a_job_that_slurm_preempts_continues_its_trial(
-    write, training, whole, parameters_of, slurm
-):
+def test_a_job_that_slurm_preempts_continues_its_trial(write, training, same_as_whole, idle_slurm):
     pytest.importorskip("submitit")
     training["network"]["optimization_kwargs"] = {"pause": 0.15}
     write(run={"parallel": 1, "executor": "slurm", "options": {"slurm_partition": "low"}})
@@ -139,25 +136,22 @@ def test_a_job_that_slurm_preempts_continues_its_trial(
     while not list(Path("studies").glob("there/trial_0001/network/*/checkpoint.toml")):
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    slurm.ask("sbatch", "-phigh", "-n4", "--output=/dev/null", "--wrap=sleep 1")
+    idle_slurm.ask("sbatch", "-phigh", "-n4", "--output=/dev/null", "--wrap=sleep 1")
     assert sweep.wait(200) == 0
-    assert Path("studies/there/trials.csv").read_bytes() == whole
-    assert parameters_of("studies/there") == parameters_of("studies/whole")
+    same_as_whole()
     output = Path("studies/there/trial_0001/output.txt").read_text()
     assert output.count("session: ") == 2  # the same trial began twice
 
 
-def test_a_worker_that_ray_loses_is_replaced(write, whole, parameters_of):
-    pytest.importorskip("ray")
-    write(run={"executor": "ray", "options": {"address": "local"}})
+def test_a_worker_that_ray_loses_is_replaced(write, slow, same_as_whole, ray_cluster):
+    write(run={"executor": "ray", "options": {"address": ray_cluster.variables["RAY_ADDRESS"]}})
     sweep = start("sweep.toml", "studies/there")
     kill_one("studies/there", parent=True)
     assert sweep.wait(200) == 0
-    assert Path("studies/there/trials.csv").read_bytes() == whole
-    assert parameters_of("studies/there") == parameters_of("studies/whole")
+    same_as_whole()
 
 
-def test_a_job_that_slurm_cannot_run_ends_the_sweep(write, physx, slurm):
+def test_a_job_that_slurm_cannot_run_ends_the_sweep(write, physx, idle_slurm):
     pytest.importorskip("submitit")
     for options, text in (
         ({"slurm_partition": "none"}, "Slurm refuses the job of a trial"),
@@ -165,11 +159,11 @@ def test_a_job_that_slurm_cannot_run_ends_the_sweep(write, physx, slurm):
     ):
         write(run={"executor": "slurm", "options": options})
         assert text in physx("sweep", "sweep.toml", status=1)
-        assert not slurm.ask("squeue", "--noheader")
+        assert not idle_slurm.ask("squeue", "--noheader")
 
 
 def test_without_slurm_the_sweep_says_so(write, physx):
     pytest.importorskip("submitit")
     write(run={"executor": "slurm"})
-    said = physx("sweep", "sweep.toml", status=1, SLURM_CONF="/nowhere/slurm.conf")
+    said = physx("sweep", "sweep.toml", status=1, PATH="/nowhere")
     assert "Slurm does not answer" in said

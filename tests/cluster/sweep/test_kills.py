@@ -30,9 +30,9 @@ def check(parameters_of, whole="studies/whole", killed="studies/killed"):
         assert read_scalars(Path(killed) / trial) == read_scalars(Path(whole) / trial)
 
 
-def test_killed_trials_are_continued_bit_for_bit(write, slow, physx, parameters_of):
+def test_killed_trials_are_continued_bit_for_bit(write, slow, whole, parameters_of):
+    whole()
     write(run={"parallel": 2})
-    physx("sweep", "sweep.toml", "--study", "studies/whole")
     chance = random.Random(1)
     moments = {
         f"trial_{number:04}": sorted(chance.sample(range(1, EPOCHS * BATCHES), 2))
@@ -45,19 +45,22 @@ def test_killed_trials_are_continued_bit_for_bit(write, slow, physx, parameters_
     assert spent - 2 * EPOCHS * BATCHES <= lost <= kills * BATCHES
 
 
-def test_a_killed_sweep_is_continued_by_the_same_command(write, slow, physx, parameters_of):
+def test_a_killed_sweep_is_continued_by_the_same_command(write, slow, whole, parameters_of):
+    whole(seeds=[0, 1])
     write(run={"parallel": 2}, seeds=[0, 1])
-    physx("sweep", "sweep.toml", "--study", "studies/whole")
     _, kills = sweep_with_kills("sweep.toml", "studies/killed", {}, BATCHES, whole=[20, 70])
     assert kills == 2
     check(parameters_of)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_sweep_that_is_asked_to_end_writes_checkpoints(write, slow, physx, parameters_of, number):
+def test_a_sweep_that_is_asked_to_end_writes_checkpoints(
+    write, slow, whole, physx, parameters_of, number
+):
     slow["network"]["optimization_kwargs"] = {"pause": 0.05}
-    write(parameters={"training.network.lr": [0.1]})
-    physx("sweep", "sweep.toml", "--study", "studies/whole")
+    one = {"training.network.lr": [0.1]}
+    whole(parameters=one)
+    write(parameters=one)
     sweep = start("sweep.toml", "studies/killed")
     place = Path("studies/killed/trial_0001.batches")
     deadline = time.monotonic() + 60

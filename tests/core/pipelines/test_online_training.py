@@ -393,8 +393,8 @@ def test_a_training_that_is_killed_while_environments_generate_is_resumed_bit_fo
 @pytest.mark.parametrize(
     "words", [("clients", "once", "fifo"), ("clients", "always", "stream")], ids=" ".join
 )
-def test_a_training_survives_being_killed_at_twenty_moments(words, run_killed):
-    survives(run_killed, random.Random(2), 20, words)
+def test_a_training_survives_being_killed_at_ten_moments(words, run_killed):
+    survives(run_killed, random.Random(2), 10, words)
 
 
 def test_the_command_resumes_with_the_environments_of_the_session(capfd, nothing_stays_behind):

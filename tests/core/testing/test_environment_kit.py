@@ -6,36 +6,38 @@ from physx_core.testing import check_environment
 
 STEPS = "gives every field in each step, finite and of its shape and type"
 WRONG = [
-    ("GlobalRandom", {}, "leaves its process as it was", "NumPy's global random numbers"),
-    ("Unseeded", {}, "gives the same rows with the same seed", '"state"'),
-    ("Shared", {}, "does not disturb another instance", "attribute of the class"),
-    ("NotFinite", {}, STEPS, "step 3"),
-    ("OtherShape", {}, STEPS, "(3,)"),
+    ("GlobalRandom", "leaves its process as it was", "NumPy's global random numbers"),
+    ("Unseeded", "gives the same rows with the same seed", '"state"'),
+    ("Shared", "does not disturb another instance", "attribute of the class"),
+    ("NotFinite", STEPS, "step 3"),
+    ("OtherShape", STEPS, "(3,)"),
     (
         "MissingField",
-        {},
         STEPS,
         "count",
     ),
-    ("Swallows", {}, "refuses unknown options", "misspelling"),
-    ("FirstForEver", {}, "takes its place among the instances", "instance 1 of 1"),
-    ("Meddles", {"what": "directory"}, "leaves its process as it was", "the working directory"),
-    ("Meddles", {"what": "umask"}, "leaves its process as it was", "the umask"),
-    ("Meddles", {"what": "temporary"}, "leaves its process as it was", "temporary files"),
-    ("Meddles", {"what": "variable"}, "leaves its process as it was", "MEDDLED"),
-    ("Meddles", {"what": "signal"}, "leaves its process as it was", "SIGUSR1"),
-    ("Meddles", {"what": "process"}, "leaves its process as it was", "child processes"),
-    ("DrawsRandomly", {}, "draws without an effect on its rows", "with a visualizer"),
-    ("ClosesOnce", {}, "closes at any time, also twice", "before create()"),
-    ("Crashes", {}, "gives the same rows with the same seed", "SIGSEGV"),
-    ("ReplaysAnything", {}, "replays stored rows", "second replay"),
-    ("OtherInClients", {}, "gives the same rows from clients over TCP", '"state"'),
+    ("Swallows", "refuses unknown options", "misspelling"),
+    ("FirstForEver", "takes its place among the instances", "instance 1 of 1"),
+    ("DrawsRandomly", "draws without an effect on its rows", "with a visualizer"),
+    ("ClosesOnce", "closes at any time, also twice", "before create()"),
+    ("Crashes", "gives the same rows with the same seed", "SIGSEGV"),
+    ("ReplaysAnything", "replays stored rows", "second replay"),
+    ("OtherInClients", "gives the same rows from clients over TCP", '"state"'),
 ]
 
 
-@pytest.mark.parametrize(("name", "kwargs", "check", "text"), WRONG)
-def test_what_is_wrong_is_named(name, kwargs, check, text, place, expect_named):
-    expect_named(check_environment(place("wrong_environments", name), **kwargs), check, text)
+@pytest.mark.parametrize(("name", "check", "text"), WRONG)
+def test_what_is_wrong_is_named(name, check, text, place, expect_named):
+    expect_named(check_environment(place("wrong_environments", name)), check, text)
+
+
+def test_all_that_it_did_to_its_process_is_named(place, expect_named):
+    report = check_environment(place("wrong_environments", "Meddles"))
+    for text in (
+        *("the working directory", "the umask", "temporary files", "MEDDLED", "SIGUSR1"),
+        "child processes",
+    ):
+        expect_named(report, "leaves its process as it was", text)
 
 
 def test_nothing_is_found_in_a_right_one(place, expect_right):

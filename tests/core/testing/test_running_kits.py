@@ -10,8 +10,7 @@ from physx_core.testing.process_state import process_state, unchanged
 def test_this_process_stays_as_it_is(place):
     before = process_state()
     with unchanged(before):
-        for what in ("directory", "signal"):
-            assert not check_environment(place("wrong_environments", "Meddles"), what=what).ok
+        assert not check_environment(place("wrong_environments", "Meddles")).ok
 
 
 def test_a_module_that_cannot_be_imported_is_a_result(tmp_path, expect_named):

@@ -299,6 +299,7 @@ def test_two_processes_learn_from_environments_of_the_first_as_one_does():
     assert (failed.epoch, failed.batch) == (0, 4)
 
 
+@pytest.mark.faults
 def test_a_sampler_learns_from_the_losses_of_two_processes_as_from_those_of_one():
     alone()["active"](10, "active", over_tcp=False).execute()
     status, text = ended(start("learning()"))

@@ -37,6 +37,8 @@ _PATIENCE = 45.0
 """Seconds within which clients must have started or ended: a cluster may take a while."""
 _LEFT_PATIENCE = 10.0
 """Seconds within which what belonged to a client that has ended must be gone."""
+_MOMENT = 1.0
+"""Seconds after which a client that was killed with another one has ended."""
 _POLL = 0.02
 
 
@@ -241,8 +243,9 @@ def _one_of_two(subject: Subject) -> None:
         first, second = run.handles
         first.kill()
         expect(first.wait(time.monotonic() + _PATIENCE), "a client has not ended after kill()")
-        status = second.exit_status()
-        expect(status is None, f"kill() of a client ended another one, with the status {status}")
+        ended = second.wait(time.monotonic() + _MOMENT)
+        text = f"kill() of a client ended another one, with the status {second.exit_status()}"
+        expect(not ended, text)
 
 
 def _tells(subject: Subject) -> None:

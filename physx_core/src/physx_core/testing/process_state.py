@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -82,19 +82,25 @@ def unchanged(before: Mapping[str, Any] | None = None) -> Iterator[None]:
         kept[_VARIABLES] |= before[_VARIABLES]  # libraries add some of their own
     threads, processes = set(threading.enumerate()), children()
     yield
-    for what, value in process_state().items():
-        if value != kept[what]:
-            raise AssertionError(f"it changed {what}{_difference(kept[what], value)}")
-    _await(lambda: [each.name for each in set(threading.enumerate()) - threads], "threads")
-    _await(lambda: sorted(children() - processes), "child processes")
+    found = [
+        f"it changed {what}{_difference(kept[what], value)}"
+        for what, value in process_state().items()
+        if value != kept[what]
+    ]
+    found += _left(lambda: [each.name for each in set(threading.enumerate()) - threads], "threads")
+    found += _left(lambda: sorted(children() - processes), "child processes")
+    if found:
+        raise AssertionError("; ".join(found))
 
 
-def _await(left: Any, what: str) -> None:
+def _left(find: Callable[[], list[Any]], what: str) -> list[str]:
+    """Wait for things to go; return a sentence about those that do not."""
     until = time.monotonic() + _PATIENCE
-    while found := left():
+    while found := find():
         if time.monotonic() > until:
-            raise AssertionError(f"{what} are left: {found}")
+            return [f"{what} are left: {found}"]
         time.sleep(0.02)
+    return []
 
 
 def _working_directory() -> str:

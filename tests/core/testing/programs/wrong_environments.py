@@ -75,25 +75,13 @@ class FirstForEver(Right):
 
 
 class Meddles(Right):
-    def __init__(self, *, what, **kwargs):
-        super().__init__(**kwargs)
-        self.what = what
-
     def create(self):
         super().create()
-        {
-            "directory": lambda: os.chdir("/"),
-            "umask": lambda: os.umask(0o022 if os.umask(0) != 0o022 else 0o077),
-            "temporary": self.move_temporary,
-            "variable": lambda: os.environ.update(MEDDLED=str(time.monotonic())),
-            "signal": lambda: signal.signal(signal.SIGUSR1, lambda *_: None),
-            "process": self.start,
-        }[self.what]()
-
-    def move_temporary(self):
+        os.chdir("/")
+        os.umask(0o022 if os.umask(0) != 0o022 else 0o077)
         tempfile.tempdir = f"/tmp/{time.monotonic()}"
-
-    def start(self):
+        os.environ.update(MEDDLED=str(time.monotonic()))
+        signal.signal(signal.SIGUSR1, lambda *_: None)
         self.process = subprocess.Popen(["sleep", "100"])
 
 

@@ -1,4 +1,4 @@
-"""Launchers of which each has one mistake, and one that has none."""
+"""Launchers with mistakes that their names tell, and one that has none."""
 
 import contextlib
 import os
@@ -69,30 +69,29 @@ class Right(Launcher):
         self.folder.cleanup()
 
 
-class ShowsToken(Right):
+class Careless(Right):
+    """Shows the token, forgets last words, starts clients backwards, and none a second time."""
+
     class handle(Handle):
         def command(self, address, token):
             return ["/bin/sh", "-c", '"$@" & wait $!', token, *super().command(address, token)]
 
+        def stderr(self):
+            return ""
 
-class AlwaysWell(Right):
+    def launch(self, instances, address, token):
+        if self.started:
+            raise OSError("out of machines")
+        return super().launch(instances, address, token)[::-1]
+
+
+class Ruthless(Right):
+    """Kills all clients for one, and takes every end for a good one."""
+
     class handle(Handle):
         def exit_status(self):
             return None if super().exit_status() is None else 0
 
-
-class Silent(Right):
-    class handle(Handle):
-        def stderr(self):
-            return ""
-
-
-class WrongOrder(Right):
-    def launch(self, instances, address, token):
-        return super().launch(instances, address, token)[::-1]
-
-
-class KillsAll(Right):
     def launch(self, instances, address, token):
         made = super().launch(instances, address, token)
         for handle in made:
@@ -105,10 +104,3 @@ class LeavesChildren(Right):
         def signal(self, number):
             if self.process.returncode is None:
                 self.process.send_signal(number)
-
-
-class StartsNoSecondTime(Right):
-    def launch(self, instances, address, token):
-        if self.started:
-            raise OSError("out of machines")
-        return super().launch(instances, address, token)
