@@ -15,7 +15,7 @@ from one_node_slurm import free_ports
 
 pytest.importorskip("ray")
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.faults
 
 PAGE = Path(__file__).parents[3] / "docs" / "cluster.md"
 

@@ -31,10 +31,13 @@ def test_the_rows_are_those_of_a_local_run(runs, local_rows, ray_cluster, eventu
     assert runs.same(runs.rows(*on(ray_cluster), **ray_cluster.variables), expected)
     nodes = sorted(node for *_, node in runs.clients())
     assert nodes == sorted(["here", str(ray_cluster.raylet_of(ray_cluster.nodes[1]))])
-    said = runs.log.read_text().splitlines()
-    assert [line.partition(":")[0] for line in said if "batches" not in line] == [
-        *("session", "samples", "next", "next")
+    passing = ("batches", "The run waits for")  # the second one on a busy machine
+    said = [
+        line.partition(":")[0]
+        for line in runs.log.read_text().splitlines()
+        if not any(each in line for each in passing)
     ]
+    assert said == ["session", "samples", "next", "next"]
     eventually(runs.nothing_is_left)
 
 

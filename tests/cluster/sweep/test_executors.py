@@ -127,6 +127,7 @@ def test_slurm_runs_trials_and_keeps_none_when_the_sweep_is_killed(
     same_as_whole()
 
 
+@pytest.mark.faults
 def test_a_job_that_slurm_preempts_continues_its_trial(write, training, same_as_whole, idle_slurm):
     pytest.importorskip("submitit")
     training["network"]["optimization_kwargs"] = {"pause": 0.15}

@@ -416,7 +416,7 @@ def test_the_command_resumes_with_the_environments_of_the_session(capfd, nothing
         (False, "raise", 4),
         (False, "nan", 4),
         (True, "raise", 4),
-        (True, "nan", 4),
+        pytest.param(True, "nan", 4, marks=pytest.mark.faults),
         (True, "kill", 2),
     ],
 )

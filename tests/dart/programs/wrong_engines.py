@@ -1,4 +1,4 @@
-"""Engines of which each has one mistake: Pinocchio, and what is done to it."""
+"""Engines with mistakes: Pinocchio, and what is done to it."""
 
 import os
 import signal
@@ -22,26 +22,15 @@ class Wrong(Backend):
         return world
 
 
-class Heavy(Wrong):
+class InAnotherWorld(Wrong):
+    """Everything is heavier, smoother, and bounces less."""
+
     def changed(self, world):
-        return replace(world, gravity=tuple(1.001 * part for part in world.gravity))
-
-
-class Smooth(Wrong):
-    def changed(self, world):
-        return replace(world, objects=[replace(one, friction=0.3) for one in world.objects])
-
-
-class Elastic(Wrong):
-    def changed(self, world):
-        things = [replace(one, restitution=0.9 * one.restitution) for one in world.objects]
-        return replace(world, objects=things)
-
-
-class ForgetsCommands(Wrong):
-    class made(PinocchioSimulation):
-        def restore(self, state):
-            super().restore(replace(state, commands=0 * state.commands))
+        things = [
+            replace(one, friction=0.3, restitution=0.9 * one.restitution) for one in world.objects
+        ]
+        gravity = tuple(1.001 * part for part in world.gravity)
+        return replace(world, gravity=gravity, objects=things)
 
 
 class KeepsImpulses(Wrong):
@@ -50,11 +39,22 @@ class KeepsImpulses(Wrong):
             pass
 
 
-class ClaimsRays(Wrong):
+class Careless(Wrong):
+    """Forgets commands, claims rays, takes any torques, and is imprecise."""
+
     class made(PinocchioSimulation):
         def __init__(self, world):
             super().__init__(world)
             self.features = self.features | {"raycast"}
+
+        def restore(self, state):
+            super().restore(replace(state, commands=0 * state.commands))
+
+        def set_torques(self, torques):
+            super().set_torques(np.nan_to_num(torques))
+
+        def inverse_dynamics(self, positions, velocities, accelerations):
+            return 1.0001 * super().inverse_dynamics(positions, velocities, accelerations)
 
 
 class Invents(Wrong):
@@ -64,22 +64,10 @@ class Invents(Wrong):
             self.features = self.features | {"antigravity"}
 
 
-class TakesAnything(Wrong):
-    class made(PinocchioSimulation):
-        def set_torques(self, torques):
-            super().set_torques(np.nan_to_num(torques))
-
-
 class LivesOn(Wrong):
     class made(PinocchioSimulation):
         def close(self):
             pass
-
-
-class Imprecise(Wrong):
-    class made(PinocchioSimulation):
-        def inverse_dynamics(self, positions, velocities, accelerations):
-            return 1.0001 * super().inverse_dynamics(positions, velocities, accelerations)
 
 
 class Aliases(Wrong):
