@@ -23,6 +23,9 @@ PRINTED = {  # what an example has to print, as patterns
     "02_train": ("one go: True", r"linear map +\d", r"network +\d"),
     "03_predict": (r"after   0 .* [01]\.[1-9]\d* m", r"after 200 .* 0\.00\d+ m", "30 new clouds"),
     "04_own_network": (r"linear map +\d", r"FC, \d+ parameters +\d", r"deep set, 12867 parameters"),
+    "15_own_loop": (r"theory of small swings +\d", r"FC, width 64 +\d"),
+    "16_deploy_onnx": ("loaded of physx and PyTorch: None", r"100 guesses: [\d.e-]+ m"),
+    "17_two_machines": ("physx client --connect", r"instances \[1 2\], as in one process: True"),
 }
 
 

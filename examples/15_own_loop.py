@@ -1,0 +1,76 @@
+"""Samples from a loop of your own, without an environment.
+
+A pendulum swings far, in a few lines of NumPy that know nothing of physx. Each block of samples
+goes into a dataset as soon as it is there, and is safe from then on, whatever happens to the
+program. From there on everything is as with any other dataset. A network learns where the pendulum
+is a second later, and stands against what is cheaper: the theory of small swings, a linear map,
+narrower networks.
+
+    python examples/15_own_loop.py
+    physx info sessions/pendulum
+"""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+from common import SEEDS, config, learned, options, samples
+from matplotlib.figure import Figure
+from rivals import linear_map, relative_error, verdict
+
+from physx_core import Dataset
+
+FREQUENCY, STEPS = np.sqrt(9.81), 200  # of small swings of 1 m, in rad/s; steps of a second
+
+
+def swing(state: np.ndarray) -> np.ndarray:
+    """Return angles and angular velocities a second later, shape (pendulums, 2), in rad, rad/s."""
+    angle, velocity = state.T.copy()
+    for _ in range(STEPS):  # leapfrog
+        velocity -= 0.5 / STEPS * FREQUENCY**2 * np.sin(angle)
+        angle += velocity / STEPS
+        velocity -= 0.5 / STEPS * FREQUENCY**2 * np.sin(angle)
+    return np.stack([angle, velocity], axis=1)
+
+
+def draw(path, state, later) -> None:
+    """Draw the angle after a second over the state before, as different models say."""
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    for axes, (name, found) in zip(figure.subplots(1, len(later)), later.items(), strict=True):
+        dots = axes.scatter(*state.T, c=found[:, 0], s=3, cmap="twilight", vmin=-3, vmax=3)
+        axes.set(title=name, xlabel="angle in rad", ylabel="velocity in rad/s")
+    figure.colorbar(dots, label="angle a second later in rad")
+    figure.savefig(path)
+
+
+def main() -> int:
+    asked = options(__doc__).parse_args()
+    blocks, epochs = (3, 2) if asked.small else (100, 30)
+    folder, rng = asked.session_dir / "pendulum", np.random.default_rng(0)
+    with Dataset.create(folder) as dataset:
+        for block in range(blocks):
+            state = rng.uniform([-2.5, -3.0], [2.5, 3.0], (100, 2))
+            mode = "validation" if block % 5 == 4 or block == blocks - 1 else "training"
+            dataset.append(mode, {"state": state, "later": swing(state)})
+    inputs, outputs = samples(folder, "training", "state", "later")
+    state, right = samples(folder, "validation", "state", "later")
+
+    turn = np.array([[np.cos(FREQUENCY), -np.sin(FREQUENCY) * FREQUENCY],
+                     [np.sin(FREQUENCY) / FREQUENCY, np.cos(FREQUENCY)]])  # fmt: skip
+    guesses = {"nothing changes": [state], "theory of small swings": [state @ turn]}
+    guesses["linear map"] = [linear_map(inputs, outputs)(state)]
+    for width in (8, 16, 64):
+        sizes = {"layers": [2, width, width, 2], "activation": "Tanh"}
+        net = config("torch/fc", "state", "later", epochs, 0.01, **sizes)
+        tries = [learned(folder, net, "state", epochs, seed, batch_size=128) for seed in SEEDS]
+        guesses[f"FC, width {width}"] = tries
+    errors = {name: [relative_error(g, right) for g in found] for name, found in guesses.items()}
+    if asked.picture:
+        names = ("theory of small swings", "FC, width 64")
+        draw(asked.picture, state, {"exact": right} | {name: guesses[name][0] for name in names})
+    return verdict(errors, "FC, width 64") and not asked.small
+
+
+if __name__ == "__main__":
+    sys.exit(main())
