@@ -39,7 +39,7 @@ FACES = {
     "physx_gym": (
         "",
         *("blocks", "tasks.quantities", "tasks.rewards", "tasks.terminations"),
-        "tasks.randomizations",
+        *("tasks.randomizations", "stable_baselines3"),
     ),
     "physx_remote": ("",),
     "physx_cluster": ("", "sweep"),

@@ -362,13 +362,24 @@ class Learner:
     def save(
         self,
         network_dir: Path,
-        progress: checkpoint.Progress,
+        progress: checkpoint.Progress | None = None,
         buffer: Index | None = None,
         sampler: Array | None = None,
         *,
         best: bool = False,
     ) -> Path:
-        """Write the next checkpoint, or the best one, and return its folder."""
+        """Write the next checkpoint, or the best one, and return its folder.
+
+        Args:
+            network_dir: Folder of the checkpoints.
+            progress: Progress of the training; None: it did not train here.
+            buffer: State of the buffer that draws its batches, if there is one.
+            sampler: State of the sampler that learns from it, if there is one.
+            best: Whether it is the best one so far, which replaces the last best one.
+
+        Raises:
+            CheckpointError: If it cannot be stored.
+        """
         return checkpoint.save(
             network_dir,
             self.config,
@@ -376,7 +387,7 @@ class Learner:
             self._trainer(),
             self.fields,
             self.transformation.normalization,
-            progress,
+            progress or checkpoint.Progress(0, 0, 0, 0),
             buffer,
             sampler,
             best=best,

@@ -1,0 +1,24 @@
+"""What the examples with robots say is so: policies that are saved, gaits, pushes."""
+
+import json
+import re
+
+import pytest
+
+from physx_gym.cli import evaluate
+
+pytestmark = pytest.mark.slow
+
+
+def test_a_policy_is_trained_and_evaluated(root, run, tmp_path, capsys):
+    """The network that is saved acts as the one that was trained."""
+    pytest.importorskip("stable_baselines3", reason="needs stable-baselines3")
+    folder = tmp_path / "policies"
+    words = ["--small", "--seeds", "3", "--session-dir", folder]
+    text = run(root / "examples/12_reinforcement_learning.py", *words).stdout
+    mean, worst = re.search(r"^PPO, seed 3 +([\d.]+) +([\d.]+)$", text, re.MULTILINE).groups()
+    words = ["--env", "physx/Cartpole-v0", "--seed", "20000", "--json"]
+    evaluate.run([str(folder / "Cartpole_3"), *words])
+    found = capsys.readouterr().out
+    figures = json.loads(found)["summary"]["reward"]
+    assert (f"{figures['mean']:.1f}", f"{figures['min']:.1f}") == (mean, worst)
