@@ -39,7 +39,7 @@ from physx_gym.environments.quadruped import STAND
 
 clock = time.perf_counter
 HERE = Path(__file__).parent
-PIPELINE = HERE.parent / "examples" / "quadruped" / "pipeline.toml"
+PIPELINE = HERE.parent / "examples" / "environments" / "quadruped.toml"
 ROUNDS, REPEATS = 5, 12
 SLICE = 0.4
 

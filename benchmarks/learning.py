@@ -2,10 +2,10 @@
 
     python benchmarks/learning.py --env physx/Ant-v0 --seeds 0 1 2
     python benchmarks/learning.py --env physx/Quadruped-v0 --check
-    python benchmarks/learning.py --folder policies --steps 300000 --ppo gamma=0.98
+    python benchmarks/learning.py --folder policies --steps 300000
 
-Trains with `examples/train_ppo.py` once for each seed, `--jobs` at a time, with the settings that
-stand there; then runs deterministic episodes on the engine that it was trained on and on the
+Trains with `examples/12_reinforcement_learning.py` once for each seed, `--jobs` at a time, with the
+settings of `examples/ppo.toml`; then runs deterministic episodes on the engine that it was trained on and on the
 other one. Prints a line for each seed and engine, with the wall time of the training, and the range
 over the seeds. With `--check`, exits with 1 if any seed misses the target on its own engine.
 `--film FILE` shows the first seconds of episodes under the policy of the first seed. Options that
@@ -34,7 +34,7 @@ from physx_gym.bridge.make_env import make_env
 from physx_gym.cli.evaluate import evaluate, summary
 from physx_gym.show.film import write_film
 
-TRAIN = Path(__file__).parent.parent / "examples" / "train_ppo.py"
+TRAIN = Path(__file__).parent.parent / "examples" / "12_reinforcement_learning.py"
 TARGETS = {
     "physx/Cartpole-v0": ("reward", 475.0, 20),
     "physx/Acrobot-v0": ("reward", -100.0, 20),
@@ -50,12 +50,11 @@ NAMES = ("reward", "length", "speed", "success")
 
 def train(env: str, backend: str, more: list[str], place: Path, seed: int) -> tuple[Path, float]:
     """Train a policy, and return its folder and the wall time in s."""
-    folder = place / f"{env.split('/')[1]}_{seed}"
-    words = ["--env", env, "--backend", backend, "--seed", str(seed), "--save", str(folder)]
+    name = env.removeprefix("physx/").removesuffix("-v0")
+    folder = place / f"{name}_{seed}"
+    words = ["--env", name, "--backend", backend, "--seeds", str(seed), "--session-dir", str(place)]
     begin = time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, str(TRAIN), *words, *more], check=False
-    )  # 1: missed threshold
+    done = subprocess.run([sys.executable, str(TRAIN), *words, *more], check=False)  # 1: it lost
     if not (folder / "network").is_dir():
         sys.exit(f"The training with seed {seed} failed with status {done.returncode}.")
     return folder, time.perf_counter() - begin

@@ -145,15 +145,15 @@ def show_environments(folder: Path, *visualizers: Visualizer) -> None:
 
 def show_robots(path: Path) -> None:
     """Write a recording of the pushed box and the walking quadruped of the examples."""
-    pushing, walking = load("push_box.py"), load("quadruped/run.py")
+    pushing, walking = load("11_pushing.py"), load("10_quadruped.py")
     box: Any = gymnasium.make("physx/PushBox-v0").unwrapped
-    robot: Any = physx_gym.load_pipeline(EXAMPLES / "quadruped" / "pipeline.toml")()
+    robot: Any = physx_gym.load_pipeline(walking.ROBOT)()
     for env in (box, robot):
         env.eval()
     observation, _ = box.reset(seed=0)
     for _ in range(12):
         observation, *_ = box.step(pushing.push(observation))
-    walking.walk(robot, 0.5, 0)
+    walking.walk(robot, 0.5)
     logs = []
     for env in (box, robot):
         env.stop()

@@ -6,6 +6,7 @@ import os
 import re
 
 import gallery
+import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
@@ -23,10 +24,16 @@ PRINTED = {  # what an example has to print, as patterns
     "02_train": ("one go: True", r"linear map +\d", r"network +\d"),
     "03_predict": (r"after   0 .* [01]\.[1-9]\d* m", r"after 200 .* 0\.00\d+ m", "30 new clouds"),
     "04_own_network": (r"linear map +\d", r"FC, \d+ parameters +\d", r"deep set, 12867 parameters"),
+    "10_quadruped": (r"standing on dart +0\.\d\d m", r"trotting on pinocchio +[2-9]\.\d\d m"),
+    "11_pushing": (r"nothing +0 +0", r"rule +4 +4"),
+    "12_reinforcement_learning": (r"chance +\d", r"rule +4\d\d", r"PPO, seed 2 +\d"),
     "15_own_loop": (r"theory of small swings +\d", r"FC, width 64 +\d"),
     "16_deploy_onnx": ("loaded of physx and PyTorch: None", r"100 guesses: [\d.e-]+ m"),
     "17_two_machines": ("physx client --connect", r"instances \[1 2\], as in one process: True"),
+    "20_policy_on_a_cluster": ("equal to those learned here: True",),
 }
+SMALL_FILMS = ("10_quadruped", "11_pushing")
+"""Examples whose film is the same at any size, so that it can be compared with the one kept."""
 
 
 def skip_without_libraries(path):
@@ -57,6 +64,17 @@ def assert_not_blank(path):
         assert len(frames) > 1 and frames[0].tobytes() != frames[-1].tobytes()
 
 
+def assert_same_film(path, kept):
+    """Assert that two films show the same, but for what a driver draws otherwise."""
+    films = []
+    for each in (path, kept):
+        with Image.open(each) as image:
+            frames = [frame.convert("L") for frame in ImageSequence.Iterator(image)]
+        films.append(np.array([frame.resize((40, 30)) for frame in frames], float))
+    assert films[0].shape == films[1].shape
+    assert np.abs(films[0] - films[1]).mean(axis=(1, 2)).max() < 5
+
+
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
 def test_an_example_runs_and_draws_its_picture(path, run, tmp_path):
     skip_without_libraries(path)
@@ -68,6 +86,8 @@ def test_an_example_runs_and_draws_its_picture(path, run, tmp_path):
     for pattern in PRINTED.get(path.stem, (".",)):
         assert re.search(pattern, done.stdout), (pattern, done.stdout)
     assert_not_blank(picture)
+    if path.stem in SMALL_FILMS:
+        assert_same_film(picture, gallery.picture(path.stem))
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)

@@ -1,10 +1,6 @@
 """Vector environments whose processes run on the nodes of a cluster."""
 
 import contextlib
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -14,7 +10,6 @@ import physx_gym  # noqa: F401 - registers the environments
 
 pytest.importorskip("ray")
 COUNT = 5
-ROOT = Path(__file__).parents[3]
 
 
 @contextlib.contextmanager
@@ -59,12 +54,3 @@ def test_a_killed_node_is_replaced_and_the_episodes_go_on(ray_cluster):
         ray_cluster.kill(lost)
         ray_cluster.nodes.append(ray_cluster.add_node())
         assert_same(vector, local, 30)
-
-
-@pytest.mark.faults
-def test_a_policy_learns_on_two_nodes():
-    """The example starts its own cluster."""
-    variables = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
-    command = [sys.executable, ROOT / "examples/cluster_ppo.py", "--steps", "8000"]
-    ended = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
-    assert not ended.returncode, ended.stdout + ended.stderr
