@@ -1,9 +1,8 @@
 """A policy learns with environments on the nodes of a Ray cluster, and is the same to the last bit.
 
 A launcher is all that a vector environment needs to have its processes elsewhere: here two nodes of
-one core, started for this run, or any cluster that runs. PPO of stable-baselines3 learns with them
-on the cluster and with processes of this machine: every parameter of both policies is equal. Beside
-their rewards stands chance.
+one core, started for this run, or any cluster that runs. PPO of stable-baselines3 learns on the
+cluster and with processes of this machine: every parameter of both policies is equal.
 
     python examples/20_policy_on_a_cluster.py --picture cluster.png
     python examples/20_policy_on_a_cluster.py --address HOST:PORT      # of a cluster's head node
@@ -53,7 +52,7 @@ def main():
     steps, env, cluster = 1024 if chosen.small else 20_000, gymnasium.make(CARTPOLE), None
     env.action_space.seed(0)
     chance = summary(evaluate(env, lambda _: env.action_space.sample(), range(20)))["reward"]
-    parameters, _ = learn(steps)
+    here, _ = learn(steps)
     if chosen.address is None:
         cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
         cluster.add_node(num_cpus=1)
@@ -63,12 +62,12 @@ def main():
     finally:
         if cluster is not None:
             cluster.shutdown()
-    last, same = ends[-max(1, len(ends) // 10) :, 1].mean(), torch.equal(parameters, there)
+    last, same = ends[-max(1, len(ends) // 10) :, 1].mean(), torch.equal(here, there)
     print(f"\n{len(there)} parameters of the policy, equal to those learned here: {same}")
     print(f"reward of an episode: chance {chance['mean']:.1f}, at last {last:.1f}")
     axes = (figure := Figure((8, 4), layout="constrained")).subplots()
-    axes.plot(*ends.T, ".", label="an episode on the cluster")
-    axes.axhline(chance["mean"], color="0.3", linestyle="--", label="chance")
+    axes.plot(*ends.T, ".", label="on the cluster")
+    axes.axhline(chance["mean"], color="0.3", label="chance")
     axes.set(xlabel="steps", ylabel="reward of an episode", title=CARTPOLE)
     axes.legend()
     if chosen.picture:
