@@ -5,11 +5,11 @@
     python benchmarks/learning.py --folder policies --steps 300000
 
 Trains with `examples/12_reinforcement_learning.py` once for each seed, `--jobs` at a time, with the
-settings of `examples/ppo.toml`; then runs deterministic episodes on the engine that it was trained on and on the
-other one. Prints a line for each seed and engine, with the wall time of the training, and the range
-over the seeds. With `--check`, exits with 1 if any seed misses the target on its own engine.
-`--film FILE` shows the first seconds of episodes under the policy of the first seed. Options that
-are not its own are passed on to the example. Needs stable-baselines3.
+settings of `examples/ppo.toml`; then runs deterministic episodes on the engine that it was trained
+on and on the other one. Prints a line for each seed and engine, with the wall time of the training,
+and the range over the seeds. With `--check`, exits with 1 if any seed misses the target on its own
+engine. `--film FILE` shows the first seconds of episodes under the policy of the first seed.
+Options that are not its own are passed on to the example. Needs stable-baselines3.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers.vector import DictInfoToList
 
-from physx_core import Field, NetworkConfig, Normalization, files
+from physx_core import Closeable, Field, NetworkConfig, Normalization, files
 from physx_core.errors import ConfigError, MissingLibraryError, PhysxError, UsageError
 from physx_core.pipelines import Learner
 
@@ -36,7 +36,7 @@ __all__ = ["GymnasiumVecEnv", "save_policy"]
 _LOG = logging.getLogger("physx")
 
 
-class GymnasiumVecEnv(VecEnv):
+class GymnasiumVecEnv(VecEnv, Closeable):
     """A vector environment of Gymnasium, for the algorithms of stable-baselines3.
 
     ::

@@ -158,6 +158,9 @@ def test_monitored_episodes_and_what_is_refused():
     for _ in range(3):
         infos = monitored.step(np.zeros((COUNT, 1), np.float32))[3]
     assert [info["episode"]["l"] for info in infos] == [3] * COUNT
+    with envs:
+        assert not envs.vector.closed
+    assert envs.vector.closed
     envs.close()
 
 
