@@ -1,4 +1,4 @@
-"""Runs the code of README.md and of the pages in docs/, each in a folder of its own.
+"""Runs the code of all README.md and of the pages in docs/, each in a folder of its own.
 
 python docs/run_pages.py [PAGE ...]    # all pages, or some; says which block failed, and how
 
@@ -44,6 +44,7 @@ ROOT = Path(__file__).resolve().parent.parent
 LEARN = sorted((ROOT / "docs/learn").glob("*.md"))
 PAGES = [
     ROOT / "README.md",
+    *sorted(ROOT.glob("physx_*/README.md")),
     *sorted(page for page in (ROOT / "docs").rglob("*.md") if "_build" not in page.parts),
 ]
 BOOKS = [LEARN, *([page] for page in PAGES if page not in LEARN)]

@@ -1,4 +1,4 @@
-"""README.md and the pages in docs/: their code runs, and what they claim to be complete is."""
+"""The READMEs and the pages in docs/: their code runs, and what they claim to be complete is."""
 
 import inspect
 import re

@@ -24,8 +24,8 @@ from physx_remote.serving.client_link import RequestLink
 from physx_remote.serving.protocol import find_protocol
 
 PAGE = Path(__file__).parents[2] / "docs" / "remote.md"
+README = Path(__file__).parents[2] / "physx_remote" / "README.md"
 TEXT = PAGE.read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```python\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
 PROJECT = Path(__file__).parent / "programs" / "godot"
 SEEN = """
 assert seen["positions"].shape == (2,) and seen["positions"].any()
@@ -33,9 +33,15 @@ assert env.action_space.contains(env.action_space.sample()) and isinstance(termi
 """
 
 
-def block(word, address=None):
+def blocks(page):
+    """Return the programs of a page."""
+    text = page.read_text(encoding="utf-8")
+    return re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+def block(word, address=None, page=PAGE):
     """Return the only program with a word in it, for another address than the page's."""
-    (found,) = (each for each in BLOCKS if word in each)
+    (found,) = (each for each in blocks(page) if word in each)
     if address is not None:
         host, port = address
         found, places = re.subn(r'"127\.0\.0\.1:\d+"', f'"{host}:{port}"', found)
@@ -51,8 +57,8 @@ def run(text):
 
 def test_there_are_no_other_programs():
     words = ("class Pole", "env.reset(seed=1)", "service.poll", "worlds.reset", "write_launcher")
-    assert {block(word) for word in (*words, "godot.reset")} == set(BLOCKS)
-    assert len(BLOCKS) == 6
+    assert {block(word) for word in (*words, "godot.reset")} == set(blocks(PAGE))
+    assert len(blocks(PAGE)) == 6
 
 
 @pytest.fixture
@@ -82,9 +88,10 @@ def test_several_worlds(tmp_path, monkeypatch, worlds_in_thread):
     token.write_text(secrets.token_hex(32))
     monkeypatch.chdir(tmp_path)
     service = worlds_in_thread("gym/CartPole-v1", num_worlds=16, token_file="token")
-    names = run(block("worlds.reset", service.address))
-    assert names["observations"].shape == (16, 4)
-    assert names["worlds"].closed
+    for page in (PAGE, README):
+        names = run(block("worlds.reset", service.address, page))
+        assert names["observations"].shape == (16, 4)
+        assert names["worlds"].closed
 
 
 @pytest.fixture
