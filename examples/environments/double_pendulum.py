@@ -1,0 +1,56 @@
+"""A double pendulum with viscous and dry friction in its joints, and a model of it without."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from rivals import linear_map, relative_error
+
+from physx_core import JointSettings, Robot, Simulation, World, plugins
+
+JOINTS, VISCOUS, DRY = ("shoulder", "elbow"), np.array([0.3, 0.15]), np.array([0.2, 0.1])
+Function = Callable[..., torch.Tensor]
+
+
+def pendulum(engine: str, *, friction: bool) -> Simulation:
+    """Build the double pendulum."""
+    joints = {
+        name: JointSettings(damping=friction * viscous, friction=friction * dry)
+        for name, viscous, dry in zip(JOINTS, VISCOUS, DRY, strict=True)
+    }
+    world = World([Robot("double_pendulum", joints=joints)])
+    return plugins.resolve("backend", engine).build(world)
+
+
+def as_torch(function: Callable[..., np.ndarray]) -> Function:
+    """Return a function of arrays as one of tensors, without gradients."""
+    return lambda *given: torch.from_numpy(function(*(each.detach().numpy() for each in given)))
+
+
+def measure(simulation: Simulation, samples: int, seed: int) -> list[torch.Tensor]:
+    """Return random q, v and torques, and the accelerations that they cause, shape (n, 2) each."""
+    rng = np.random.default_rng(seed)
+    q = torch.from_numpy(rng.uniform(-np.pi, np.pi, (samples, 2)))
+    v, torque = torch.from_numpy(rng.uniform(-4, 4, (2, samples, 2)))
+    return [q, v, torque, as_torch(simulation.forward_dynamics_batch)(q, v, torque)]
+
+
+def missing(model: Simulation, samples: list[torch.Tensor]) -> torch.Tensor:
+    """Return the torques that a model lacks in samples, shape (n, 2), by its inverse dynamics."""
+    q, v, torque, acceleration = (each.numpy() for each in samples)
+    found = np.array(list(map(model.inverse_dynamics, q, v, acceleration)))
+    return torch.from_numpy(torque - found)
+
+
+def linear(given: list[torch.Tensor], wanted: torch.Tensor) -> Function:
+    """Return the linear map from several tensors to one."""
+    fitted = as_torch(linear_map(torch.hstack(given).numpy(), wanted.numpy()))
+    return lambda *values: fitted(torch.hstack(values))
+
+
+def error(acceleration: Function, samples: list[torch.Tensor]) -> float:
+    """Return the relative error of accelerations in samples."""
+    *given, exact = samples
+    return relative_error(acceleration(*given).detach().numpy(), exact.numpy())
