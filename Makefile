@@ -1,4 +1,4 @@
-# make demo    install into .venv and run the main job: examples/arm_dynamics
+# make demo    install into .venv and run the main job: examples/09_robot_arm.py
 # make test    install into .venv and run the tests; PYTEST_ARGS are handed on
 # make lint    ruff, mypy and import-linter
 # make docs    build the site: docs/_build/docs/index.html
@@ -15,7 +15,7 @@ PROJECTS := $(wildcard physx_*/pyproject.toml) constraints.txt
 .PHONY: demo test lint docs bench clean
 
 demo: .venv/packages
-	$(BIN)/python examples/arm_dynamics/run.py $(DEMO_ARGS)
+	$(BIN)/python examples/09_robot_arm.py $(DEMO_ARGS)
 
 test: .venv/tools
 	$(BIN)/python -m pytest $(PYTEST_ARGS)

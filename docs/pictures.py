@@ -1,10 +1,7 @@
 """Draws the pictures of the documentation that show environments and examples.
 
 python docs/pictures.py    # writes environments.png, replay.png, examples.png beside this file
-python docs/pictures.py --demo PICTURE    # compares a picture of the demo with arm.png
-python docs/pictures.py --film sessions/arm/tracking.rrd    # writes arm.webp, in some minutes
-
-``make demo DEMO_ARGS="--picture docs/arm.png"`` draws arm.png.
+python docs/pictures.py --demo PICTURE    # compares a picture of the demo with its kept film
 """
 
 from __future__ import annotations
@@ -27,6 +24,7 @@ from physx_rerun import RerunVisualizer, render_picture
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parent / "examples"
+DEMO = HERE / "examples" / "09_robot_arm.webp"
 sys.path.insert(0, str(EXAMPLES))  # their modules import each other
 GUESSES = {"ground_truth": "prediction", "correction": "correction"}
 NAMES = ("Cartpole", "Acrobot", "Ant", "Quadruped", "ArmReach", "PushBox")
@@ -131,7 +129,7 @@ def play(environment: Any, number: int, steps: int) -> Iterator[list[Event]]:
 def show_environments(folder: Path, *visualizers: Visualizer) -> None:
     """Show the arm, the beam and the cloud of the examples, side by side."""
     scenes = (
-        play(load("arm_dynamics/run.py").ComparedArm, 1, 100),
+        play(load("environments/arm.py").ComparedArm, 1, 100),
         play(load("environments/beam.py").Beam, 2, 10),
         play(load("environments/cloud.py").Cloud, 3, 4),
     )
@@ -204,9 +202,11 @@ def shares(picture: np.ndarray) -> dict[str, float]:
 
 
 def check_demo(path: Path) -> None:
-    """Check that a picture of the demo shows what arm.png does, maybe at another time."""
-    for file in (path, HERE / "arm.png"):
-        drawn = np.asarray(Image.open(file).convert("RGB"))
+    """Check that a picture of the demo shows what its kept film does, maybe at another time."""
+    for file in (path, DEMO):
+        with Image.open(file) as image:
+            image.seek(getattr(image, "n_frames", 1) // 2)  # of a film
+            drawn = np.asarray(image.convert("RGB"))
         height, width = drawn.shape[:2]
         row = drawn[height // 30 : height * 52 // 90]  # the windows without their titles
         arms = [shares(each) for each in np.array_split(row, 3, axis=1)]
@@ -217,23 +217,7 @@ def check_demo(path: Path) -> None:
         assert curves["blue"] > 5e-4 and curves["orange"] > 5e-4, (file, "the plot", curves)
 
 
-def film(recording: Path, path: Path) -> None:
-    """Write a film of a recording of the demo: the three arms, at every 16th of 800 steps."""
-    frames = []
-    with tempfile.TemporaryDirectory() as folder:
-        for step in range(0, 800, 16):
-            file = render_picture(recording, Path(folder, f"{step}.png"), (900, 540), at=step)
-            picture = Image.open(file).convert("RGB")
-            frames.append(picture.crop((0, 0, picture.width, 508)))  # without the controls
-    frames[0].save(
-        path, quality=60, method=6, save_all=True, append_images=frames[1:], duration=80, loop=0
-    )
-
-
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--film"]:
-        film(Path(sys.argv[2]), HERE / "arm.webp")
-        sys.exit(0)
     if sys.argv[1:2] == ["--demo"]:
         check_demo(Path(sys.argv[2]))
         sys.exit(0)

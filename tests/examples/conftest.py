@@ -1,3 +1,4 @@
+import importlib
 import os
 import subprocess
 import sys
@@ -12,6 +13,18 @@ ROOT = Path(__file__).resolve().parents[2]
 def root():
     """The repository."""
     return ROOT
+
+
+@pytest.fixture
+def module(root, monkeypatch):
+    """Import a module of the examples, as their scripts do."""
+    monkeypatch.syspath_prepend(root / "examples")
+    before = set(sys.modules)
+    yield importlib.import_module
+    own = {path.stem for path in (root / "examples").iterdir()}
+    for name in set(sys.modules) - before:
+        if name.partition(".")[0] in own:
+            del sys.modules[name]
 
 
 @pytest.fixture

@@ -1,25 +1,11 @@
 """The flow on a grid and the heat in a mesh are right, and the graph network keeps to its mesh."""
 
-import importlib
-import sys
-
 import numpy as np
 import pytest
 
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
 
 torch = pytest.importorskip("torch")
-
-
-@pytest.fixture
-def module(root, monkeypatch):
-    """Import a module of the examples, as their scripts do."""
-    monkeypatch.syspath_prepend(root / "examples")
-    before = set(sys.modules)
-    yield importlib.import_module
-    for name in set(sys.modules) - before:
-        if name.partition(".")[0] in ("environments", "networks"):
-            del sys.modules[name]
 
 
 @pytest.fixture

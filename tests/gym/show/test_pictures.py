@@ -40,7 +40,7 @@ def test_a_picture_of_each_environment_is_as_documented(place):
 
 
 def test_the_picture_of_the_demo_shows_the_arms_and_their_errors():
-    PICTURES["check_demo"](DOCS / "arm.png")
+    PICTURES["check_demo"](PICTURES["DEMO"])
 
 
 @pytest.mark.slow

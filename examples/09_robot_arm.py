@@ -1,0 +1,79 @@
+"""A robot arm that learned its own dynamics.
+
+Two clients move a Franka Panda at random and store 40 000 samples (q, v, a) -> torque. A network
+learns them, and its torque helps a weak joint controller (PD) along trajectories that it has never
+seen. Its rivals do without a network, or with a narrower one; the exact model is the reference.
+
+    python examples/09_robot_arm.py             # some minutes on 2 cores
+    python examples/09_robot_arm.py --small     # some seconds, to see that it works
+    python examples/09_robot_arm.py --picture arm.webp     # a film; arm.png: a picture
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from common import SEEDS, config, generate, options, samples, trained
+from environments.arm import (
+    SHOWN,
+    TRAJECTORIES,
+    ComparedArm,
+    Torque,
+    draw,
+    predicted,
+    tracking_error,
+)
+from rivals import linear_map, verdict
+
+from physx_core import EnvironmentConfig, NetworkConfig, Prediction
+from physx_dart import DartArm
+
+NETWORK, EXACT = "PD + network, width 256", "PD + exact model"
+
+
+def show(session: Path, name: str, steps: int) -> Path:
+    """Let three arms follow a trajectory, one with a trained network; return the recording."""
+    recording, nets = session / "tracking.rrd", str(session / "networks")
+    arms = EnvironmentConfig(
+        ComparedArm,
+        env_kwargs={"trajectory": TRAJECTORIES[0]},
+        num_clients=len(SHOWN),
+        visualizer="rerun",
+        visualizer_kwargs={"path": str(recording), "every": 4},
+    )
+    Prediction(NetworkConfig(), arms, session_dir=nets, session_name=name, step_nb=steps).execute()
+    return recording
+
+
+def main() -> int:
+    """Do the job; the exit status says whether the network is better than its best rival."""
+    chosen = options(__doc__).parse_args()
+    rows, epochs, steps = (4000, 8, 100) if chosen.small else (40_000, 30, 800)
+    seeds = SEEDS[:1] if chosen.small else SEEDS
+    session = generate(DartArm, rows, chosen.session_dir, num_clients=2)
+    errors: dict[str, list[float]] = {}
+
+    def follow(name: str, torque: Torque) -> None:
+        found = [tracking_error(torque, trajectory, steps) for trajectory in TRAJECTORIES]
+        print(f"{name:28}" + "".join(f"{error:10.3f}" for error in found), flush=True)
+        errors.setdefault(name, []).append(float(np.mean(found)))
+
+    print("error in mrad, on trajectory" + "".join(f"{number:10}" for number in TRAJECTORIES))
+    follow("PD alone", "none")
+    follow("PD + linear map", linear_map(*samples(session, "training", "state", "torque")))
+    follow("PD + exact gravity", "gravity")
+    for width in (64, 128, 256):
+        sizes = {"layers": [27, width, width, width, 9], "activation": "SiLU"}
+        network = config("torch/fc", "state", "torque", epochs, 2e-3, **sizes)
+        for seed in seeds:
+            training = trained(session, network, epochs, seed, batch_size=256)
+            follow(f"PD + network, width {width}", predicted(training.learner))
+    follow(EXACT, "model")
+    draw(show(session, training.session.name, steps), chosen.picture, steps)
+    what = {"what": "error in mrad, by seed", "form": ".3f", "references": [EXACT]}
+    return int(verdict(errors, NETWORK, **what) and not chosen.small)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
