@@ -49,7 +49,7 @@ class Timed(Prediction):
 
 def main():
     chosen = options(__doc__).parse_args()
-    session = generate(Beam, 40 if chosen.small else 2000, chosen.session_dir, num_clients=2)
+    session = generate(Beam, 40 if chosen.small else 1600, chosen.session_dir, num_clients=2)
     known = samples(session, "training", "forces", "displacement")
     given, exact, missing = samples(session, "validation", "forces", "displacement", "correction")
     linear = exact - missing
@@ -62,7 +62,7 @@ def main():
     recording = {"visualizer": "rerun", "visualizer_kwargs": {"path": f"{session}/beam.rrd"}}
     beam = EnvironmentConfig(Beam, as_tcp_ip_client=False, seed=1, **recording)
     place = {"session_dir": f"{session}/networks", "session_name": f"{OWN} {SEEDS[0]}"}
-    shown = Timed(NetworkConfig(), beam, step_nb=10 if chosen.small else 60, **place)
+    shown = Timed(NetworkConfig(), beam, step_nb=10 if chosen.small else 40, **place)
     shown.execute()
     if chosen.picture:
         step = int(np.argmax(shown.found, 0)[0]) + 1
