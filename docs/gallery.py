@@ -20,9 +20,11 @@ import textwrap
 from pathlib import Path
 
 import kept
+from PIL import Image
 
 HERE = Path(__file__).resolve().parent
 EXAMPLES = HERE.parent / "examples"
+GREATEST = 150_000  # size of a picture in bytes with as many colors as it likes
 TEST = "<!-- tested by tests/examples/test_all.py -->"
 
 
@@ -68,8 +70,19 @@ def picture(name: str) -> Path:
 
 def run(name: str) -> int:
     """Run an example in full in an empty folder, keep its picture, and return its exit status."""
-    path, drawn = path_of(name), picture(name)
+    drawn = picture(name)
     drawn.parent.mkdir(exist_ok=True)
+    status = draw(name, drawn)
+    if drawn.suffix == ".png" and drawn.is_file() and drawn.stat().st_size > GREATEST:
+        with Image.open(drawn) as image:
+            few = image.convert("RGB").quantize(256)
+        few.save(drawn, optimize=True)
+    return status
+
+
+def draw(name: str, drawn: Path) -> int:
+    """Run an example in full in an empty folder, and keep what it prints and draws."""
+    path = path_of(name)
     with tempfile.TemporaryDirectory() as folder:
         if path.suffix == ".py":
             words = [sys.executable, str(path), "--picture", str(drawn)]
