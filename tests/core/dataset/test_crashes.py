@@ -138,8 +138,8 @@ def test_a_reader_beside_a_writer_sees_only_committed_rows(tmp_path):
 
 
 @pytest.mark.faults
-def test_a_reader_beside_a_writer_for_half_a_minute(tmp_path, record_property):
-    record_property("opened", read_beside_a_writer(tmp_path, 30))
+def test_a_reader_beside_a_writer_for_a_while(tmp_path, record_property):
+    record_property("opened", read_beside_a_writer(tmp_path, 15))
 
 
 # Full disks -------------------------------------------------------------------------------------

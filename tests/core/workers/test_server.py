@@ -130,7 +130,7 @@ def test_a_client_does_not_trust_a_server_without_the_token():
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nonsense", "127.0.0.1:port", "a.invalid:80"])
 def test_nothing_at_the_address_is_an_error_that_names_it(address):
     with pytest.raises(ConnectionRefusedByPeerError, match=address):
-        run_client(address, "token" * 5)
+        run_client(address, "token" * 5, patience=1.0)
 
 
 def test_a_port_in_use_is_named(clients):
