@@ -16,6 +16,7 @@ import rivals
 import torch
 from common import SEEDS, config, generate, learned, options, samples
 from environments.vortices import POINTS, Vortices
+from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 
@@ -28,13 +29,14 @@ class FNO(neuralop.models.FNO):
 
 def draw(picture: Path, fields: dict[str, np.ndarray]) -> None:
     """Draw fields of the same samples beside each other, one sample in a row."""
-    rows = len(fields["exact"])
+    rows, colors = len(fields["exact"]), colormaps["RdBu"].resampled(15)
     figure = Figure(figsize=(12, 2.05 * rows + 0.25), layout="constrained")
     places = figure.subplots(rows, len(fields))
     for row, line in enumerate(places):
         for place, (name, field) in zip(line, fields.items(), strict=True):
-            place.imshow(field[row, ..., 0].T, "RdBu", vmin=-3, vmax=3, interpolation="bicubic")
-            place.set(title=name if row == 0 else "", xticks=[], yticks=[])
+            place.imshow(field[row, ..., 0].T, colors, vmin=-3, vmax=3, interpolation="bicubic")
+            place.set(title=name if row == 0 else "")
+            place.axis("off")
     figure.savefig(picture, dpi=80)
 
 

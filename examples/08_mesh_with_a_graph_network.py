@@ -28,8 +28,9 @@ def draw(picture: Path, fields: dict[str, np.ndarray]) -> None:
     for row, line in enumerate(places):
         for place, (name, field) in zip(line, fields.items(), strict=True):
             colors = {} if "m²/s" in name else {"cmap": "coolwarm", "vmin": -2, "vmax": 2}
-            place.tripcolor(*nodes.T, triangles, field[row], shading="gouraud", **colors)
-            place.triplot(*nodes.T, triangles, color="black", linewidth=0.2)
+            place.tripcolor(*nodes.T, triangles, field[row], **colors)
+            if place is line[0]:
+                place.triplot(*nodes.T, triangles, color="black", linewidth=0.3)
             place.set(title=name if row == 0 else "", aspect="equal")
             place.axis("off")
     figure.savefig(picture, dpi=80)
@@ -54,7 +55,8 @@ def main() -> int:
         guess = guesses["graph network"][0]
         shown = {"temperature, K": before[..., 0], "conductivity, m²/s": before[..., 1]}
         shown |= {"exact": after[..., 0], "graph network": guess[..., 0]}
-        shown |= {"linear map": linear[..., 0], "error of the network": (guess - after)[..., 0]}
+        shown |= {"its error": (guess - after)[..., 0]}
+        shown |= {"error of the linear map": (linear - after)[..., 0]}
         draw(asked.picture, {name: field[:2] for name, field in shown.items()})
     errors = {
         name: [rivals.relative_error(each, after) for each in found]
