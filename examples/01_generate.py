@@ -2,8 +2,8 @@
 
 An environment is a class whose step sets one sample; here, a random cloud of points and its spread.
 One in this process fills a dataset that knows fields, units and statistics. Then one and four
-clients do, processes of their own, with steps that take 5 ms: four are four times as fast, and a
-row still tells which instance made it. Row r of n instances is that of instance r modulo n, however
+clients do, processes of their own, with steps that take 5 ms: four make about four times as many.
+Each row tells which instance made it: row r of n instances is that of instance r modulo n, however
 fast each is, so the same seed makes the same rows.
 
     python examples/01_generate.py
@@ -65,7 +65,8 @@ def main() -> None:
         config = EnvironmentConfig(Cloud, {"delay": 0.005}, num_clients=clients, seed=0)
         generation = Timed(config, batch_nb=batches, batch_size=20, **place)
         generation.execute()
-        print(f"{clients} client{'s' * (clients > 1):1}:      {generation.rate:6.0f} samples/s")
+        who = f"{clients} client{'s' * (clients > 1)}:"
+        print(f"{who:16} {generation.rate:6.0f} samples/s")
     with Dataset.open(generation.session.path) as dataset:
         print(f"instances that made the first rows: {dataset['training']['env_id'][:8]}")
 

@@ -18,7 +18,7 @@ SHARED = {path.stem for path in EXAMPLES.rglob("*.py")}
 PRINTED = {  # what an example has to print, as patterns
     "01_generate": (
         r"input +200 x \(10, 3\) m",
-        r"1 client : .*samples/s\n4 clients: .*samples/s",
+        r"1 client: .*samples/s\n4 clients: .*samples/s",
         r"first rows: \[1 2 3 4 1 2 3 4\]",
     ),
     "02_train": ("one go: True", r"linear map +\d", r"network +\d"),
