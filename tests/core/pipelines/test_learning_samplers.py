@@ -81,7 +81,7 @@ RESERVOIR = {
 
 
 @pytest.mark.parametrize("online", [{}, RESERVOIR], ids=["stream", "reservoir"])
-@pytest.mark.parametrize("delay", [0, 1, 3])
+@pytest.mark.parametrize("delay", [0, pytest.param(1, marks=pytest.mark.faults), 3])
 def test_simulations_are_the_same_in_process_in_clients_and_with_random_delays(
     tmp_path, delay, online
 ):

@@ -269,9 +269,23 @@ def result(run, name):
     return stored(name), run.learner.network.weights, numbers
 
 
-@pytest.mark.parametrize("options", [{}, {"refuse": 3, "record_wrong_samples": True}], ids=str)
-@pytest.mark.parametrize("always", [False, True])
-@pytest.mark.parametrize("over_tcp", [False, True])
+REFUSING = {"refuse": 3, "record_wrong_samples": True}
+
+
+@pytest.mark.parametrize(
+    ("over_tcp", "always", "options"),
+    [  # each pair of settings; the others are campaigns
+        (False, False, REFUSING),
+        (False, True, {}),
+        (True, False, {}),
+        (True, True, REFUSING),
+        pytest.param(False, False, {}, marks=pytest.mark.faults),
+        pytest.param(False, True, REFUSING, marks=pytest.mark.faults),
+        pytest.param(True, False, REFUSING, marks=pytest.mark.faults),
+        pytest.param(True, True, {}, marks=pytest.mark.faults),
+    ],
+    ids=str,
+)
 def test_an_interrupted_training_is_resumed_while_environments_generate(
     over_tcp, always, options, nothing_stays_behind
 ):
