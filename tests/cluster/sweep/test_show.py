@@ -6,7 +6,7 @@ from typing import ClassVar
 import pytest
 
 from physx_cluster.sweep import Definition, Study, run_study
-from physx_cluster.sweep.show import draw_figure, record_curves, summary
+from physx_cluster.sweep.show import draw_figure, record_curves, show_status, summary
 from physx_core import Visualizer
 from physx_core.errors import StudyError, UsageError
 
@@ -67,6 +67,18 @@ def test_the_figure_shows_the_results(study):
         assert f"<!-- {part} -->" in text
     with pytest.raises(UsageError, match=r"cannot be written"):
         draw_figure(study, Path("study.what"))
+
+
+def test_curves_are_as_short_as_the_columns_beside_them_need(write, training, capsys):
+    name = "a_pipeline_whose_name_leaves_so_little_room"
+    definition = Definition.read(
+        write(pipelines={name: {"training": training}}, parameters={"training.network.lr": [0.1]})
+    )
+    show_status(run_study(definition, Path("study"), lambda line: None))
+    _, line, *_ = capsys.readouterr().out.splitlines()
+    words = line.split()
+    assert words[:5] == ["*1", name, "0.1", "0", "complete"]
+    assert len(words[-1]) < 4 and len(line) <= 100, "the curve of 4 epochs"
 
 
 def test_a_study_without_results_has_neither(write, training):

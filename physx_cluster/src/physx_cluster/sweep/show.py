@@ -12,10 +12,11 @@ from physx_cluster.sweep.results import COMPLETE, PRUNED, Trial
 from physx_cluster.sweep.runner import describe_trial
 from physx_cluster.sweep.study import Best, Study
 from physx_core import plugins, read_scalars
-from physx_core.cli import show, show_table, spark_line
+from physx_core.cli import show, show_table, spark_line, width
 from physx_core.errors import MissingLibraryError, SessionError, StudyError, UsageError
 
 _BARS = 16
+_GAP = 2  # columns between those of a table
 _MARK = "*"
 
 
@@ -24,16 +25,19 @@ def show_status(study: Study) -> None:
     names = study.definition.columns
     best = study.best()
     marked = {trial.number for trial in best.trials} if best is not None else set()
-    rows = []
-    for number, trial in sorted(study.trials.items()):
+    trials, rows = [trial for _, trial in sorted(study.trials.items())], []
+    for trial in trials:
         values = [_text(trial.values.get(name)) for name in names]
-        mark = _MARK if number in marked else ""
-        place = (f"{mark}{number}", trial.pipeline, *values, str(trial.seed))
+        mark = _MARK if trial.number in marked else ""
+        place = (f"{mark}{trial.number}", trial.pipeline, *values, str(trial.seed))
         rows.append((*place, *_outcome(study, trial)))
     short = [name.rpartition(".")[2] for name in names]
     columns = [s if short.count(s) == 1 else n for s, n in zip(short, names, strict=True)]
     head = ("trial", "pipeline", *columns, "seed", "state", "epochs", study.definition.study.result)
-    show_table((*head, ""), rows, numbers=("trial", *columns, "seed", *head[-2:]), curve="")
+    bars = _room([head, *rows])
+    curves = [spark_line(list(numbers_of(study, trial).values()), bars) for trial in trials]
+    lines = [(*row, curve) for row, curve in zip(rows, curves, strict=True)]
+    show_table((*head, ""), lines, numbers=("trial", *columns, "seed", *head[-2:]), curve="")
     show()
     for line in summary(study):
         show(line)
@@ -59,16 +63,21 @@ def _describe(study: Study, best: Best) -> str:
     return f"{settings}: {study.definition.study.result} {best.value:.6g}{mean}"
 
 
-def _outcome(study: Study, trial: Trial) -> tuple[str, str, str, str]:
-    """Return state, epochs, result and curve of a trial."""
+def _room(rows: Sequence[Sequence[str]]) -> int:
+    """Return how many bars a curve may have beside the columns of a table."""
+    taken = sum(max(map(len, column)) + _GAP for column in zip(*rows, strict=True))
+    return min(max(width() - taken, 1), _BARS)
+
+
+def _outcome(study: Study, trial: Trial) -> tuple[str, str, str]:
+    """Return state, epochs and result of a trial."""
     result, numbers = study.results.get(trial.number), numbers_of(study, trial)
-    curve = spark_line(list(numbers.values()), _BARS)
     if result is not None:
         epochs = "" if result.epochs is None else str(result.epochs)
         value = result.error if math.isnan(result.value) else f"{result.value:.5g}"
-        return result.state, epochs, value, curve
+        return result.state, epochs, value
     state = "running" if study.is_running(trial) else "interrupted" if numbers else "waiting"
-    return state, str(max(numbers, default=0)), "", curve
+    return state, str(max(numbers, default=0)), ""
 
 
 def numbers_of(study: Study, trial: Trial) -> dict[int, float]:

@@ -5,3 +5,4 @@ from .command import main as main
 from .commands.stats import spark_line as spark_line
 from .output import show as show
 from .output import show_table as show_table
+from .output import width as width
