@@ -15,12 +15,23 @@ pytestmark = pytest.mark.slow
 pytest.importorskip("torch")
 
 
+LONG = ("gym", "online", "sweep", "testing", "howto/network", "howto/other_tools")
+"""Pages whose commands take many seconds; they run with the campaigns."""
+
+
 def books():
-    """Each page, with those that it builds on; those marked start more processes than others."""
+    """Each page, with those that it builds on."""
     for pages in run_pages.BOOKS:
         name = str(pages[-1].relative_to(run_pages.ROOT))
-        marks = [pytest.mark.faults] if name == "docs/sweep.md" else []
-        yield pytest.param(pages, id=name, marks=marks)
+        long = name.removeprefix("docs/").removesuffix(".md") in LONG
+        yield pytest.param(pages, id=name, marks=[pytest.mark.faults] if long else [])
+
+
+def test_each_block_is_run_or_says_by_what():
+    for page in run_pages.PAGES:
+        run_pages.check(run_pages.read(page))
+    names = {str(page.relative_to(run_pages.ROOT)) for page in run_pages.PAGES}
+    assert {f"docs/{name}.md" for name in LONG} <= names
 
 
 @pytest.mark.parametrize("pages", books())

@@ -65,6 +65,7 @@ def test_a_killed_node_is_replaced_and_the_rows_stay_the_same(
     eventually(runs.nothing_is_left)
 
 
+@pytest.mark.faults
 def test_an_elastic_run_goes_on_without_some_of_its_clients(
     runs, local_rows, ray_cluster, eventually
 ):

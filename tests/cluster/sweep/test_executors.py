@@ -89,7 +89,12 @@ def test_options_that_an_executor_does_not_know(
 
 @pytest.mark.parametrize(
     ("executor", "options"),
-    [("ray", {"num_cpus": 1, "address": "local"}), ("slurm", {"cluster": "local"})],
+    [
+        pytest.param(
+            "ray", {"num_cpus": 1, "address": "local"}, marks=pytest.mark.faults, id="ray"
+        ),
+        pytest.param("slurm", {"cluster": "local"}, id="slurm"),
+    ],
 )
 def test_a_sweep_that_is_asked_to_end_leaves_no_trial_behind(write, training, executor, options):
     pytest.importorskip({"ray": "ray", "slurm": "submitit"}[executor])
