@@ -15,7 +15,8 @@ So does a comment on the line before the block:
 
 =================================  ================================================================
 ``<!-- file: NAME -->``            the block is written to that file, or added to it if the page
-                                   has written it before; a command or program after it must name it
+                                   has written it before; a command or program after it must name
+                                   it, and so should the text: readers do not see the comment
 ``<!-- fails -->``                 the last command must fail
 ``<!-- tested by PATH::TEST -->``  the block is shown only: that test, or script, runs it
 ``<!-- not run: REASON -->``       it is shown only: it is another project's code

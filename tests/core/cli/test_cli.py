@@ -142,6 +142,19 @@ def test_help_shows_the_arguments_without_names_and_examples(verb, arguments, ca
     assert sum(line.startswith(f"  physx {verb} ") for line in text.splitlines()) == 3
 
 
+@pytest.mark.parametrize(
+    ("verb", "text"),
+    [
+        ("generate", "None: as many as `num_clients`, or `min_clients` if that is more."),
+        ("train", "if the dataset has a validation mode or `validation_split` holds samples back;"),
+    ],
+)
+def test_help_breaks_lines_only_where_they_are_full(verb, text, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    assert main([verb, "--help"]) == 0
+    assert text in capsys.readouterr().out
+
+
 def test_help_imports_nothing_heavy():
     code = (
         "import sys; from physx_core.cli import main; main(['--help']); "

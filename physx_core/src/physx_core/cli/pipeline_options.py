@@ -11,6 +11,7 @@ import textwrap
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, TypeVar
 
 import tyro
@@ -147,6 +148,7 @@ def _options_of(
         hint = hints[option.name]
         if name != option.name:
             hint = _configuration(make, option.name)
+            _set_help(hint)
             if default is None:
                 asked = any(word.startswith(f"--{name}.") for word in words)
                 if name == "environment" and not asked:
@@ -179,8 +181,18 @@ def _configuration(make: type[Pipeline], python_name: str) -> Any:
     return next((c for c in typing.get_args(hint) if dataclasses.is_dataclass(c)), hint)
 
 
+def _set_help(cls: type[Any]) -> None:
+    """Give tyro the docstrings of a configuration as they are: its own reading breaks lines."""
+    docs = _docstrings(cls)
+    for option in _dataclass_fields(cls):
+        option.metadata = MappingProxyType({**option.metadata, "help": docs.get(option.name, "")})
+
+
 def _docstrings(cls: type[Any]) -> dict[str, str]:
-    """Return the docstrings below the attributes in the source of a class and its bases."""
+    """Return the docstrings below the attributes in the source of a class and its bases.
+
+    Each is one line.
+    """
     docs: dict[str, str] = {}
     for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__)):
         tree = ast.parse(inspect.getsource(sys.modules[base.__module__]))
@@ -189,5 +201,6 @@ def _docstrings(cls: type[Any]) -> dict[str, str]:
         for statement, following in itertools.pairwise(body):
             if isinstance(statement, ast.AnnAssign) and isinstance(following, ast.Expr):
                 name, text = ast.unparse(statement.target), following.value
-                docs[name] = str(text.value) if isinstance(text, ast.Constant) else ""
+                words = str(text.value).split() if isinstance(text, ast.Constant) else []
+                docs[name] = " ".join(words)
     return docs
