@@ -59,3 +59,10 @@ def test_least_squares_identifies_the_exact_model_if_the_geometry_is_known(arm):
     known, unseen = np.vstack(rows[:100]), np.vstack(rows[100:])
     found = np.linalg.lstsq(known, np.hstack(torques[:100]), rcond=1e-10)[0]
     np.testing.assert_allclose(unseen @ found, np.hstack(torques[100:]), atol=1e-6)
+
+
+def test_the_readme_shows_what_the_last_full_run_printed(root):
+    kept = (root / "docs/examples/09_robot_arm.txt").read_text()
+    table = "error in mrad, by seed" + kept.partition("error in mrad, by seed")[2]
+    lines = table.partition("\n\n")[0]
+    assert f"```text\n{lines}\n```" in (root / "README.md").read_text()
