@@ -15,8 +15,8 @@ pytest.importorskip("optuna")
 pytest.importorskip("matplotlib")
 
 SMALLER = {
-    "trials = 6": "trials = 2",
-    "batch = 3": "batch = 1",
+    "trials = 4": "trials = 2",
+    "batch = 2": "batch = 1",
     "seeds = [0, 1]": "seeds = [0]",
     "epoch_nb = 10": "epoch_nb = 1",
 }
