@@ -4,6 +4,7 @@ import ast
 import importlib.util
 import os
 import re
+import shlex
 
 import gallery
 import numpy as np
@@ -88,6 +89,10 @@ def test_an_example_runs_and_draws_its_picture(path, run, tmp_path):
     assert_not_blank(picture)
     if path.stem in SMALL_FILMS:
         assert_same_film(picture, gallery.picture(path.stem))
+    for line in gallery.commands(path.stem).splitlines():  # what to do with what it left
+        if line.startswith("physx ") and not line.startswith("physx view"):
+            then = run("-m", "physx_core", *shlex.split(line, comments=True)[1:])
+            assert then.returncode == 0, (line, then.stdout + then.stderr)
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
