@@ -66,7 +66,7 @@ def main():
     shown.execute()
     if chosen.picture:
         step = int(np.argmax(shown.found, 0)[0]) + 1
-        render_picture(f"{session}/beam.rrd", chosen.picture, (1000, 500), at=step)
+        render_picture(f"{session}/beam.rrd", chosen.picture, (900, 450), at=step)
     text = "{:.1f} by finite elements, {:.2f} by linear elasticity, {:.2f} more for its correction"
     print("ms of the CPU for a push:", text.format(*1e3 * np.median(shown.found, 0)[1:]))
     worst = {n: max(map(relative_error, g[0][:, None], exact[:, None])) for n, g in guesses.items()}
