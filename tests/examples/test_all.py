@@ -113,6 +113,12 @@ def test_the_gallery_has_everything_there_is():
     assert there - shared == set(gallery.names())
 
 
+@pytest.mark.parametrize("name", [name for name in gallery.names() if name[0].isdigit()])
+def test_a_full_run_of_each_example_is_kept_with_its_picture(name):
+    assert (gallery.PAGE.kept / f"{name}.txt").is_file(), f"python docs/gallery.py {name}"
+    assert gallery.picture(name).is_file(), f"python docs/gallery.py {name}"
+
+
 def test_each_picture_and_each_run_that_is_kept_belongs_to_an_example():
     kept = {path for path in gallery.PAGE.kept.iterdir() if path.suffix != ".txt"}
     assert kept <= {gallery.picture(name) for name in gallery.names()}
