@@ -1,7 +1,7 @@
 """A soft beam bends: a network learns what linear elasticity gets wrong.
 
-Two clients push a clamped rubber beam at random places and find its equilibrium, bent by up to
-three quarters of its length, with felupe's hyperelastic finite elements. Linear elasticity, its
+Two clients push a clamped rubber beam at random places and find its equilibrium, its end moved by
+up to most of its length, with felupe's hyperelastic finite elements. Linear elasticity, its
 stiffness factorized once, needs no samples and almost no time, but is wrong where a beam bends far.
 A small network that corrects it beats larger ones that learn the whole displacement. Then it takes
 part in the running environment: orange, over the solver's gray beam and linear elasticity's blue.

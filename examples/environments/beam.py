@@ -7,7 +7,7 @@ from environments.beam_solver import GRID, ElasticBeam, NoEquilibriumError
 
 from physx_core import Environment, Field
 
-GREATEST_FORCE = 100.0  # N, which bends the beam by three quarters of its length
+GREATEST_FORCE = 100.0  # N; some such pushes move its end by most of its length
 COLORS = {"linear elasticity": "dodgerblue", "network": "orange"}
 PATCH = 0.12  # m, the standard deviation of the forces around the center of a push
 
