@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from physx_cluster.sweep.parameters import Range
 from physx_cluster.sweep.results import COMPLETE, PRUNED, Trial
 from physx_cluster.sweep.runner import describe_trial
 from physx_cluster.sweep.study import Best, Study
@@ -152,7 +153,7 @@ def draw_figure(study: Study, path: Path) -> None:
         raise StudyError(f"No trial of {study.folder} has a result yet.")
     names = study.definition.columns
     figure = Figure(figsize=(5.0 * (1 + len(names)), 4.0), layout="constrained")
-    first, *others = figure.subplots(1, 1 + len(names), squeeze=False)[0]
+    first, *others = figure.subplots(1, 1 + len(names), squeeze=False, sharey=True)[0]
     _draw_progress(first, study, done)
     for axes, name in zip(others, names, strict=True):
         _draw_parameter(axes, study, done, name)
@@ -182,7 +183,9 @@ def _draw_parameter(axes: Any, study: Study, done: dict[int, float], name: str) 
     values = [study.trials[number].values[name] for number in numbers]
     if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values):
         places: list[Any] = values
-        if min(values) > 0 and max(values) > 30 * min(values):
+        known = [each.parameters.get(name) for each in study.definition.pipelines.values()]
+        is_log = any(isinstance(each, Range) and each.log for each in known)
+        if is_log or (min(values) > 0 and max(values) > 30 * min(values)):
             axes.set_xscale("log")
     else:
         places = [_text(value) for value in values]
