@@ -58,7 +58,7 @@ def main() -> None:
     session = training.session
 
     config = EnvironmentConfig(
-        Cloud, num_clients=3, as_tcp_ip_client=False, visualizer="rerun", seed=1
+        Cloud, num_clients=2, as_tcp_ip_client=False, visualizer="rerun", seed=1
     )
     taking_part = Prediction(
         NetworkConfig(), config, session_name=session.name, step_nb=steps, record=True, **place
