@@ -405,10 +405,12 @@ def test_a_training_that_is_killed_while_environments_generate_is_resumed_bit_fo
 
 @pytest.mark.faults
 @pytest.mark.parametrize(
-    "words", [("clients", "once", "fifo"), ("clients", "always", "stream")], ids=" ".join
+    ("words", "kills"),
+    [(("clients", "once", "fifo"), 20), (("clients", "always", "stream"), 10)],
+    ids=["clients once fifo", "clients always stream"],
 )
-def test_a_training_survives_being_killed_at_ten_moments(words, run_killed):
-    survives(run_killed, random.Random(2), 10, words)
+def test_a_training_survives_being_killed_at_many_moments(words, kills, run_killed):
+    survives(run_killed, random.Random(2), kills, words)
 
 
 def test_the_command_resumes_with_the_environments_of_the_session(capfd, nothing_stays_behind):
