@@ -55,6 +55,7 @@ clean:
 
 .venv/packages: $(PROJECTS)
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "physx needs Python 3.11 or later: make PYTHON=...")'
+	@echo Installing into .venv: one to three minutes.
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(PACKAGES)
 	touch $@

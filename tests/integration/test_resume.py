@@ -145,7 +145,7 @@ def test_what_cannot_be_resumed(training):
     with pytest.raises(SessionError, match="no session"):
         training(1, session_name="none", resume=True).execute()
     Path("sessions/empty").mkdir(parents=True)
-    with pytest.raises(CheckpointError, match="no checkpoint"):
+    with pytest.raises(CheckpointError, match="no network in"):
         training(1, session_name="empty", resume=True).execute()
     spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, always_produce=True)
     options = {"epoch_nb": 1, "batch_nb": 1, "batch_size": 5, "session_name": "online"}

@@ -1,6 +1,10 @@
 """Creating, opening and closing: folders, locks, options, and a dataset's info."""
 
+import fcntl
 import os
+import subprocess
+import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +40,33 @@ def test_not_found_lists_what_is_there(tmp_path):
         Dataset.open(tmp_path)
     with pytest.raises(DatasetNotFoundError, match=r"does not exist.*notes\.txt"):
         Dataset.open(tmp_path / "missing")
+
+
+LEAVES_A_COPY = """
+import os, signal, sys
+from physx_core import Dataset
+
+dataset = Dataset.open(sys.argv[1], writable=True)
+if os.fork():
+    os.kill(os.getpid(), signal.SIGKILL)
+print("copied", flush=True)
+sys.stdin.readline()
+"""
+
+
+def test_the_copy_that_a_killed_writer_left_may_take_a_moment_to_end(dataset, folder):
+    dataset.close()
+    words = [sys.executable, "-c", LEAVES_A_COPY, folder]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, **pipes) as killed:
+        assert killed.stdout.readline() == "copied\n"
+        killed.wait()
+        with (folder / "dataset.lock").open() as file, pytest.raises(BlockingIOError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with pytest.raises(DatasetLockedError, match=f"Process {killed.pid}"):
+            Dataset.open(folder, writable=True)  # it stays
+        threading.Timer(0.1, killed.stdin.close).start()
+        Dataset.open(folder, writable=True).close()
 
 
 def test_two_writers_are_rejected_and_readers_are_not(dataset, folder):

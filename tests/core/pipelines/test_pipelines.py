@@ -315,7 +315,7 @@ def test_prediction_uses_the_session_configured():
     with pytest.raises(SessionError, match='no session "training"'):
         Prediction(NetworkConfig(), SPRING, step_nb=1).execute()
     generate(session_name="training")
-    with pytest.raises(CheckpointError, match="no checkpoint"):
+    with pytest.raises(CheckpointError, match="no network in"):
         Prediction(NetworkConfig(), SPRING, step_nb=1).execute()
 
 

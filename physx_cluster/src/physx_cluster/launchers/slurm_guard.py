@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from physx_core.processes import ChildProcess
 
 _PATIENCE = 20.0  # for jobs to leave the queue
+_KINDNESS = 3.0  # for processes to heed Ctrl-C, which they ignore if the run did
 _PAUSE = 0.1
 # What the processes of submitit's local executor run; the folder's path may hold any word.
 _MODULES = {b"submitit.local._local", b"submitit.core._submit"}
@@ -61,7 +62,7 @@ def main(descriptor: int, folder: Path, name: str) -> None:
     if name:
         _end_jobs(name, until)
     else:
-        _end_processes(folder, until)
+        _end_processes(folder, time.monotonic() + _KINDNESS)
     while folder.exists() and time.monotonic() < until:  # a job may be writing its last lines
         shutil.rmtree(folder, ignore_errors=True)
         time.sleep(_PAUSE)

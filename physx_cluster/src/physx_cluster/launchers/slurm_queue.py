@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import re
+import signal
 import subprocess
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,6 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from physx_core.errors import ConfigError
+from physx_core.processes import descendants_of
 
 _SOON = ("PENDING", "REQUEUED", "REQUEUE_HOLD", "REQUEUE_FED", "SPECIAL_EXIT", "CONFIGURING")
 _NOW = ("RUNNING", "SUSPENDED", "STOPPED", "SIGNALING", "STAGE_OUT", "RESIZING")
@@ -125,8 +129,12 @@ class LocalQueue:
 
     def interrupt(self, job: Any) -> None:
         """End the job, within a second: see `Queue.interrupt`."""
-        if job.job_id not in self._interrupted:  # a second time would cut its end short
-            self._interrupted.add(job.job_id)
+        if job.job_id in self._interrupted:  # a second time would cut its end short
+            return
+        self._interrupted.add(job.job_id)
+        if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # so its processes ignore it, too
+            _kill(int(job.job_id))
+        else:
             job.cancel()
 
     def cancel(self, jobs: Iterable[Any]) -> None:
@@ -151,6 +159,12 @@ def find_controller() -> str:
             'launcher_kwargs={"cluster": "local"}.'
         )
     return found[2] or found[1]
+
+
+def _kill(process: int) -> None:
+    for number in (process, *descendants_of(process)):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(number, signal.SIGKILL)
 
 
 def _parse(line: str) -> tuple[str, JobState]:

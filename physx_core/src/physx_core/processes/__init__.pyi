@@ -2,6 +2,7 @@
 
 from .child import ChildProcess as ChildProcess
 from .descendants import children as children
+from .descendants import descendants_of as descendants_of
 from .descendants import kill_descendants as kill_descendants
 from .folder import TemporaryFolder as TemporaryFolder
 from .interrupt import Interrupt as Interrupt

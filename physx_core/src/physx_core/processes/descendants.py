@@ -17,8 +17,8 @@ def kill_descendants() -> None:
     so it cannot kill its whole group as a launched one can.
     """
     WATCHDOG.release()
-    while descendants := _descendants(os.getpid()):
-        for number in descendants:
+    while found := descendants_of(os.getpid()):
+        for number in found:
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.kill(number, signal.SIGKILL)
 
@@ -35,7 +35,8 @@ def children() -> set[int]:
     return found
 
 
-def _descendants(ancestor: int) -> list[int]:
+def descendants_of(ancestor: int) -> list[int]:
+    """Return the numbers of a process's descendants, if there is a /proc file system."""
     children: dict[int, list[int]] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         with contextlib.suppress(OSError):

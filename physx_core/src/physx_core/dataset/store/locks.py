@@ -15,24 +15,32 @@ from physx_core.errors import DatasetError, DatasetLockedError
 LOCK = "dataset.lock"
 MANIFEST_LOCK = "dataset.json.lock"
 _PATIENCE = 20.0
+_MOMENT = 2.0  # for what a killed writer was about to start
 _PAUSE = 0.02
 
 
-def lock(directory: Path) -> int:
+def lock(directory: Path, patience: float = _MOMENT) -> int:
     """Acquire a dataset's lock for a single writer; closing the descriptor releases it.
+
+    A writer that was killed while it started a process may have left a copy of itself, which holds
+    the lock for the moment until it becomes that process.
+
+    Args:
+        directory: Folder of the dataset.
+        patience: How long to wait in s while the writer that holds the lock runs no more.
 
     Raises:
         DatasetLockedError: If there is another writer.
     """
     descriptor = files.open_regular(directory / LOCK, os.O_RDWR | os.O_CREAT)
+    until = time.monotonic() + patience
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        while not _try_lock(descriptor):
+            if time.monotonic() > until or _owner_runs(descriptor):
+                raise _locked(directory, descriptor)
+            time.sleep(_PAUSE)
         files.resize(descriptor, 0)
         files.write_at(descriptor, str(os.getpid()).encode(), 0)
-    except BlockingIOError:
-        error = _locked(directory, descriptor)
-        files.close(descriptor)
-        raise error from None
     except BaseException:
         files.close(descriptor)
         raise
@@ -50,7 +58,7 @@ def lock_shared(directory: Path) -> tuple[int, bool]:
         DatasetLockedError: If an exclusive writer has the dataset open.
     """
     with contextlib.suppress(DatasetLockedError):
-        return lock(directory), True
+        return lock(directory, 0.0), True
     descriptor = files.open_regular(directory / LOCK, os.O_RDWR | os.O_CREAT)
     try:
         share(directory, descriptor)
@@ -116,8 +124,30 @@ def lock_manifest(directory: Path) -> Iterator[None]:
         files.close(descriptor)
 
 
+def _try_lock(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _owner(descriptor: int) -> str:
+    return os.pread(descriptor, 20, 0).decode(errors="replace")
+
+
+def _owner_runs(descriptor: int) -> bool:
+    try:
+        os.kill(int(_owner(descriptor)), 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except (PermissionError, ValueError):  # of another user; or not written yet
+        return True
+    return True
+
+
 def _locked(directory: Path, descriptor: int) -> DatasetLockedError:
-    owner = os.pread(descriptor, 20, 0).decode(errors="replace") or "unknown"
+    owner = _owner(descriptor) or "unknown"
     return DatasetLockedError(
         f"Process {owner} is writing to the dataset in {directory}. Wait until it has closed the "
         "dataset, or open it for reading only. For several writers at the same time, open it "
