@@ -195,7 +195,8 @@ def test_a_worker_that_breaks_is_started_again(local, clients, taking, said, fau
     settings = {"num_clients": 3, "env_kwargs": {"pace": 0.002}}
     timeout = unhurried(2.0) if fault == "stop" else 60.0
     broken = {**settings, "env_kwargs": {"pace": 0.002, "fault": fault, "at": 7}}
-    with clients(WANDERER, max_clients=2, timeout=timeout, restarts=1, **broken) as source:
+    both = {"min_clients": 2, "max_clients": 2}  # to one that joins later a worker would be moved
+    with clients(WANDERER, timeout=timeout, restarts=1, **both, **broken) as source:
         rows = taking(source)
         rows.take(60)
     rows.check(local(WANDERER, **settings))
