@@ -1,7 +1,13 @@
 """Environments: what a step costs beside the physics, and how they compare with gym_jiminy's.
 
     python benchmarks/gym.py
-    python benchmarks/gym.py --jiminy /path/to/an/environment/with/gym_jiminy/bin/python
+    python benchmarks/gym.py --jiminy PYTHON    # an interpreter that has gym_jiminy
+
+Without `--jiminy`, gym_jiminy is taken from the virtual environment .venv/jiminy where there is
+one. It needs an older NumPy than physx:
+
+    python3.11 -m venv .venv/jiminy
+    .venv/jiminy/bin/pip install -r benchmarks/requirements-jiminy.txt
 
 The bare loop is what a user of the engine would write: torques set, `step(n)`, positions and
 velocities read into arrays that are there; under the same torques from the same state, so the
@@ -39,6 +45,7 @@ from physx_gym.environments.quadruped import STAND
 
 clock = time.perf_counter
 HERE = Path(__file__).parent
+JIMINY = HERE.parent / ".venv" / "jiminy" / "bin" / "python"
 PIPELINE = HERE.parent / "examples" / "environments" / "quadruped.toml"
 ROUNDS, REPEATS = 5, 12
 SLICE = 0.4
@@ -469,7 +476,8 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--check", action="store_true", help="exit with 1 if a target is missed")
-    parser.add_argument("--jiminy", metavar="PYTHON", help="interpreter that has gym_jiminy")
+    found = str(JIMINY) if JIMINY.exists() else None
+    parser.add_argument("--jiminy", metavar="PYTHON", default=found, help="has gym_jiminy")
     chosen = parser.parse_args()
     gc.disable()
     met = overheads()

@@ -1,8 +1,9 @@
 """Learning: what PPO reaches in the registered environments, over several seeds.
 
+    python benchmarks/learning.py                                   # all of them: hours
     python benchmarks/learning.py --env physx/Ant-v0 --seeds 0 1 2
-    python benchmarks/learning.py --env physx/Quadruped-v0 --check
-    python benchmarks/learning.py --folder policies --steps 300000
+    python benchmarks/learning.py --env physx/Quadruped-v0 --check --film quadruped.webp
+    python benchmarks/learning.py --env physx/Ant-v0 --folder policies --steps 300000
 
 Trains with `examples/12_reinforcement_learning.py` once for each seed, `--jobs` at a time, with the
 settings of `examples/ppo.toml`; then runs deterministic episodes on the engine that it was trained
@@ -106,9 +107,39 @@ def row(label: str, found: dict[str, dict[str, float]], seconds: str) -> None:
     print(f"{label:20}{seconds:>10}" + "".join(f"{text:>18}" for text in texts), flush=True)
 
 
+def measure(env: str, chosen: argparse.Namespace, words: list[str], place: Path) -> bool:
+    """Train and evaluate the policies of an environment; return whether its target is met."""
+    other = {"dart": "pinocchio", "pinocchio": "dart"}[chosen.backend]
+    results: dict[str, list[dict[str, Any]]] = {chosen.backend: [], other: []}
+    lines = []
+    run = partial(train, env, chosen.backend, words, place)
+    with ThreadPoolExecutor(chosen.jobs) as pool:
+        policies = list(pool.map(run, chosen.seeds))
+    for seed, (folder, seconds) in zip(chosen.seeds, policies, strict=True):
+        for engine, kept in results.items():
+            found = figures(env, engine, folder)
+            if found is not None:
+                kept.append(found)
+                time_of = f"{seconds:.0f}" if engine == chosen.backend else ""
+                lines.append((f"{seed} on {engine}", found, time_of))
+    if chosen.film:
+        film(env, chosen.backend, policies[0][0], chosen.film)
+    print(f"\n{env}, PPO on {chosen.backend}: mean ± standard deviation of the episodes")
+    print(f"{'seed':20}{'time (s)':>10}" + "".join(f"{name:>18}" for name in NAMES))
+    for line in lines:
+        row(*line)
+    name, target, _ = TARGETS[env]
+    for engine, kept in results.items():
+        values = [found[name]["mean"] for found in kept]
+        if values:
+            print(f"{engine}: {name} {min(values):.4g} to {max(values):.4g} over the seeds")
+    least = min(found[name]["mean"] for found in results[chosen.backend])
+    return claim(f"least {name} of the seeds", least, at_least=target)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--env", default="physx/Ant-v0", choices=TARGETS)
+    parser.add_argument("--env", nargs="+", default=list(TARGETS), choices=TARGETS)
     parser.add_argument("--backend", default="dart", choices=("dart", "pinocchio"))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--folder", type=Path, help="where to keep the policies")
@@ -116,37 +147,12 @@ def main() -> None:
     parser.add_argument("--film", type=Path, metavar="FILE", help=".webp or .gif to write")
     parser.add_argument("--check", action="store_true")
     chosen, words = parser.parse_known_args()
+    if chosen.film and len(chosen.env) > 1:
+        parser.error("--film shows one environment: name it with --env")
     torch.set_num_threads(1)
-    other = {"dart": "pinocchio", "pinocchio": "dart"}[chosen.backend]
-    results: dict[str, list[dict[str, Any]]] = {chosen.backend: [], other: []}
-    lines = []
     with tempfile.TemporaryDirectory() as temporary:
         place = chosen.folder or Path(temporary)
-        run = partial(train, chosen.env, chosen.backend, words, place)
-        with ThreadPoolExecutor(chosen.jobs) as pool:
-            policies = list(pool.map(run, chosen.seeds))
-        for seed, (folder, seconds) in zip(chosen.seeds, policies, strict=True):
-            for engine, kept in results.items():
-                found = figures(chosen.env, engine, folder)
-                if found is not None:
-                    kept.append(found)
-                    time_of = f"{seconds:.0f}" if engine == chosen.backend else ""
-                    lines.append((f"{seed} on {engine}", found, time_of))
-        if chosen.film:
-            film(chosen.env, chosen.backend, policies[0][0], chosen.film)
-    print(f"\n{chosen.env}, PPO on {chosen.backend}: mean ± standard deviation of the episodes")
-    print(f"{'seed':20}{'time (s)':>10}" + "".join(f"{name:>18}" for name in NAMES))
-    for line in lines:
-        row(*line)
-    met = []
-    name, target, _ = TARGETS[chosen.env]
-    for engine, kept in results.items():
-        values = [found[name]["mean"] for found in kept]
-        if values:
-            print(f"{engine}: {name} {min(values):.4g} to {max(values):.4g} over the seeds")
-        if engine == chosen.backend:
-            met.append(claim(f"least {name} of the seeds", min(values), at_least=target))
-    finish(met)
+        finish([measure(env, chosen, words, place) for env in chosen.env])
 
 
 if __name__ == "__main__":
