@@ -107,11 +107,15 @@ class RowBuffer:
                 field's type.
         """
         row = self.count
-        if sample.keys() != self._names:
+        if len(sample) != len(self._slots):
             check_names(self._names, sample, instance_id, step)
         for name, array, shape, dtype, field in self._slots:
-            value = sample[name]
-            if type(value) is not np.ndarray or value.shape != shape or value.dtype != dtype:
+            try:
+                value = sample[name]
+            except KeyError:
+                check_names(self._names, sample, instance_id, step)
+                raise
+            if type(value) is not np.ndarray or value.dtype is not dtype or value.shape != shape:
                 value = field.convert(value, instance_id=instance_id, step=step)
             if finite and not is_finite(value):
                 raise field.not_finite(instance_id=instance_id, step=step)

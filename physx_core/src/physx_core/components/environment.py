@@ -115,6 +115,7 @@ class Environment(Closeable):
 
     step_time: float | None = None
     runs_programs: ClassVar[bool] = False
+    _has_seed: bool | None = None  # until the constructor has run
 
     def __init__(
         self,
@@ -424,7 +425,7 @@ def explain_missing_attribute(error: AttributeError) -> str:
     owner, name = error.obj, str(error.name)
     if not isinstance(owner, (Environment, Factory)):
         return ""
-    if isinstance(owner, Environment) and "_has_seed" not in vars(owner):
+    if isinstance(owner, Environment) and owner._has_seed is None:
         return f" {type(owner).__name__}.__init__() must first call super().__init__(**kwargs)."
     if name in _OTHER_NAMES:
         return f" In its place: {_OTHER_NAMES[name]}."

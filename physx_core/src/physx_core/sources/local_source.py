@@ -62,6 +62,7 @@ class LocalSource(Source):
         self._skip = skip
         self._last = range(0)
         self._last_steps = [-1] * self.instance_nb
+        self._redraws = config.redraw > 0
 
     @property
     def fields(self) -> list[Field]:
@@ -90,18 +91,17 @@ class LocalSource(Source):
             buffer.clear()
             if buffer.capacity < size:
                 buffer = self._buffer = RowBuffer(buffer.fields[: -len(ROW_FIELDS)], size)
-        count = self.instance_nb
-        self._last = range(self._next, self._next + size)
-        for row in range(size):
+        first, count = self._next, self.instance_nb
+        self._last = range(first, first + size)
+        while self._next < first + size:
             place = self._next % count
-            while True:
-                given = None if stored is None else copy_row(stored, row)
-                try:
-                    self._make_row(self._instances[place], given, size)
-                    break
-                except PhysxError as error:
-                    self._redraw(place, error)
-            self._next += 1
+            given = None if stored is None else copy_row(stored, self._next - first)
+            try:
+                self._make_row(place, given, size)
+            except PhysxError as error:
+                self._redraw(place, error)
+            else:
+                self._next += 1
         buffer = self._buffer
         if buffer is None:
             raise UsageError(f"A batch must have at least one row, not {size}.")
@@ -116,18 +116,15 @@ class LocalSource(Source):
     def _choose(self, instance_id: int, episode: int) -> dict[str, Any]:
         return self.sets.choose(instance_id, episode, self._next)
 
-    def _make_row(self, instance: Instance, stored: Sample | None, size: int) -> None:
+    def _make_row(self, place: int, stored: Sample | None, size: int) -> None:
+        instance = self._instances[place]
         sample = instance.step(stored)
-        if self._buffer is None:
-            self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
-        self._buffer.put(
-            sample,
-            instance.instance_id,
-            instance.last_episode,
-            instance.last_step,
-            finite=self._config.redraw > 0,
-        )
-        self._last_steps[instance.instance_id - 1] = instance.last_step
+        buffer = self._buffer
+        if buffer is None:
+            buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
+        episode, step = instance.last_episode, instance.last_step
+        buffer.put(sample, place + 1, episode, step, finite=self._redraws)
+        self._last_steps[place] = step
 
     def _redraw(self, place: int, error: PhysxError) -> None:
         """Continue with an instance's next parameters, or raise the error of its simulation."""
@@ -153,7 +150,7 @@ class LocalSource(Source):
         while self._next < self._skip.rows:
             place = self._next % self.instance_nb
             try:
-                self._make_row(self._instances[place], None, size)
+                self._make_row(place, None, size)
             except PhysxError as error:
                 self._redraw(place, error)
                 continue

@@ -213,7 +213,7 @@ class Instance(Closeable):
             raise UsageError(
                 f"{self._reference!r} made {environment!r}, which is not an Environment."
             )
-        if "_has_seed" not in vars(environment):
+        if environment._has_seed is None:
             raise UsageError(f"{name}.__init__() must call super().__init__(**kwargs).")
         given = (environment.instance_id, environment.instance_nb, environment._has_seed)
         if given != (self._arguments["instance_id"], self._arguments["instance_nb"], True):
@@ -239,20 +239,27 @@ class Instance(Closeable):
             EnvironmentFailedError: If the environment raises.
         """
         environment = self._alive()
-        place, values = -1, {}
-        if stored is not None and SET in stored:
-            place = int(stored[SET])
-            values = {name: stored[name] for name in stored if name.startswith(PARAMETER)}
-            stored = {name: stored[name] for name in stored if name not in values}
         environment.sample = stored
-        if place >= 0 and environment._defined_parameters:
-            values = {name.removeprefix(PARAMETER): values[name] for name in values if name != SET}
-            self._call("reset_parameters", environment.replay_episode, place, values)
-        elif not environment._has_begun_episodes:
+        if stored is not None and SET in stored:
+            self._replay(environment, stored)
+        if not environment._has_begun_episodes:
             self._call("reset_parameters", environment.begin_episodes, self._first_episode)
         wrong = 0
         while True:
-            sample, accepted = self._simulate(environment)
+            method = "step"
+            try:
+                if self._sub_steps:
+                    self._simulate_before(environment)
+                result = environment.step()
+                if result is not None:
+                    self._finish(result)
+                sample = environment.take_sample()
+                method = "check_sample"
+                accepted = environment.check_sample()
+                if accepted is not True:
+                    accepted = _verdict(accepted)
+            except Exception as error:
+                raise self._failure(method, error) from error
             if stored is not None and not environment._has_read_sample:
                 raise UsageError(
                     f"{type(environment).__name__} never reads Environment.sample, so its samples "
@@ -299,26 +306,21 @@ class Instance(Closeable):
                 self._runner.close()
                 self._runner = None
 
-    def _simulate(self, environment: Environment) -> tuple[dict[str, Any], bool]:
-        """Run the sub-steps and the step; return the sample, and whether it was accepted."""
-        method = "step"
-        try:
-            if self._sub_steps:
-                environment.compute_training_data = False
-                for _ in range(self._sub_steps):
-                    self._finish(environment.step())
-                environment.compute_training_data = True
-            result = environment.step()
-            if result is not None:
-                self._finish(result)
-            sample = environment.take_sample()
-            method = "check_sample"
-            accepted: Any = environment.check_sample()
-            if accepted is None:
-                raise UsageError("check_sample() returned None but must return True or False.")
-            return sample, bool(accepted)
-        except Exception as error:
-            raise self._failure(method, error) from error
+    def _replay(self, environment: Environment, stored: Sample) -> None:
+        """Give the environment a stored row, and the parameters that it was made with."""
+        values = {name: stored[name] for name in stored if name.startswith(PARAMETER)}
+        environment.sample = {name: stored[name] for name in stored if name not in values}
+        place = int(values.pop(SET))
+        if place >= 0 and environment._defined_parameters:
+            values = {name.removeprefix(PARAMETER): values[name] for name in values}
+            self._call("reset_parameters", environment.replay_episode, place, values)
+
+    def _simulate_before(self, environment: Environment) -> None:
+        """Run the sub-steps before the step that makes the sample."""
+        environment.compute_training_data = False
+        for _ in range(self._sub_steps):
+            self._finish(environment.step())
+        environment.compute_training_data = True
 
     def _finish(self, result: Any) -> None:
         """Run the coroutine that `step` returned, if it is one."""
@@ -354,6 +356,13 @@ class Instance(Closeable):
         if self.environment is None:
             raise UsageError(f"Instance {self.instance_id} is not open.")
         return self.environment
+
+
+def _verdict(accepted: Any) -> bool:
+    """Return what `check_sample` returned as a boolean."""
+    if accepted is None:
+        raise UsageError("check_sample() returned None but must return True or False.")
+    return bool(accepted)
 
 
 def _warn_of_misspelt_methods(cls: type[Environment]) -> None:
