@@ -346,14 +346,16 @@ class ParameterSets:
             The record of the sets that begin, field name to array; and the places, in the record of
             the whole run, of earlier sets that failed.
         """
-        begun = [{**one, "mode_index": MODES.index(mode)} for one in self._begun]
-        failed = self._failed
+        begun, failed = self._begun, self._failed
         self._begun, self._failed = [], []
+        if not begun:
+            return {}, failed
+        begun = [{**one, "mode_index": MODES.index(mode)} for one in begun]
         columns = {
             field.name: np.array([one[field.name] for one in begun], field.numpy_dtype)
             for field in self.fields
         }
-        return (columns if begun else {}), failed
+        return columns, failed
 
     def _settle(self, number: int, waiting: dict[int, Mapping[str, Any]]) -> None:
         """Account for a set that gets no more rows."""
