@@ -148,12 +148,12 @@ class ComponentNotFoundError(PhysxError):
         known: Names of the existing components.
     """
 
-    def __init__(self, kind: str, name: str, place: str, known: Iterable[str]) -> None:
+    def __init__(
+        self, kind: str, name: str, place: str, known: Iterable[str], hint: str = ""
+    ) -> None:
         self.kind, self.name, self.known = kind, name, sorted(known)
-        super().__init__(
-            f'{place} has no {kind} "{name}".{nearest(name, self.known)} '
-            f"It has: {_listed_near(name, self.known)}."
-        )
+        hint = hint or f"It has: {_listed_near(name, self.known)}."
+        super().__init__(f'{place} has no {kind} "{name}".{nearest(name, self.known)} {hint}')
 
 
 class ContractError(PhysxError):

@@ -1,4 +1,4 @@
-"""What stable-baselines3 needs of physx: vector environments to train in, and policies in files.
+"""Adapters for stable-baselines3: vector environments to train in, policies saved as sessions.
 
 Needs the extra ``physx-gym[stable-baselines3]``; to save policies, `physx_torch`, too.
 """

@@ -300,6 +300,17 @@ def test_references_that_lead_nowhere(reference, error):
         plugins.resolve("environment", reference)
 
 
+def test_a_module_of_the_working_directory_is_named_as_the_script_that_it_is(tmp_path, monkeypatch):
+    """The command `physx` does not look for modules there."""
+    (tmp_path / "rooms").mkdir()
+    (tmp_path / "rooms/tidy.py").write_text("class Room(Environment): pass")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ComponentNotFoundError, match='give "rooms/tidy.py:Room"'):
+        plugins.resolve("environment", "rooms.tidy:Room")
+    with pytest.raises(ComponentNotFoundError, match="PYTHONPATH"):
+        plugins.resolve("environment", "halls.tidy:Room")
+
+
 def test_all_forms_of_a_reference(tmp_path):
     script = tmp_path / "mine.py"
     script.write_text("from physx_core import Environment\nclass Mine(Environment): pass\n")

@@ -1,1 +1,1 @@
-"""Where clients run, and where they reach the run's server."""
+"""Placement of clients: the nodes that have what each needs, and the run's address for them."""

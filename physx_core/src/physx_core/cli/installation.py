@@ -1,4 +1,4 @@
-"""What is installed, from where, and what is in its way: what a report of a bug needs."""
+"""The installation as `physx info` shows it: versions, plugins, drivers, and what is wrong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What engines of articulated bodies share: models of robots, and the simulation around them.
+"""Base classes of engines for articulated bodies: robot models, algorithms and simulations.
 
 An engine implements `RobotEngine` for one robot or object, `Algorithms` for a world in any state,
 and `RobotSimulation.advance` for the steps.

@@ -346,7 +346,11 @@ def _module(kind: str, place: str) -> ModuleType:
         return importlib.import_module(place)
     except ModuleNotFoundError as error:
         if error.name is not None and (place == error.name or place.startswith(error.name + ".")):
-            raise ComponentNotFoundError(kind, place, "Python's module path", []) from error
+            hint = "Install the package that has this module, or set PYTHONPATH."
+            script = f"{place.replace('.', '/')}.py"
+            if Path(script).is_file():  # commands do not look for modules in the working directory
+                hint = f"There is a script here: give {_listed_classes(script)}."
+            raise ComponentNotFoundError(kind, place, "Python's module path", [], hint) from error
         raise
 
 

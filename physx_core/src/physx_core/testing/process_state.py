@@ -1,4 +1,4 @@
-"""What a component may change in its process only for the time that it works, if at all."""
+"""The state of a process, such as signal handlers and locale, which components leave as it is."""
 
 from __future__ import annotations
 
