@@ -122,7 +122,7 @@ def raw_pinocchio(title: str, world: World, held: np.ndarray) -> Work:
         with plugins.resolve("backend", "pinocchio").build(world) as simulation:
             begin(simulation, title)
             robot = simulation._robots[0]
-            model, (q, v) = robot._free, robot.native()
+            model, (q, v) = robot._model, robot.native()
             data, dt = model.createData(), world.period
             tau, free = np.zeros(model.nv), model.nv - len(held)
             yield 0

@@ -38,7 +38,7 @@ def act() -> None:
     sizes = [27, 64, 64, 8]
     layers = [torch.nn.Linear(*pair) for pair in itertools.pairwise(sizes)]
     policy = torch.nn.Sequential(layers[0], torch.nn.Tanh(), layers[1], torch.nn.Tanh(), layers[2])
-    env = gymnasium.make_vec("physx/Ant-v0", 8, processes=2)
+    env = gymnasium.make_vec("physx/Ant-v0", 8, num_processes=2)
     observations, _ = env.reset(seed=0)
     for _ in sys.stdin:
         begin, steps = time.perf_counter(), 0

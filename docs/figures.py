@@ -14,8 +14,8 @@ import kept
 
 HERE = Path(__file__).resolve().parent
 BENCHMARKS = HERE.parent / "benchmarks"
-# Those that others start:
-OTHERS = {"compare", "jiminy_zoo", "many_clients", "remote_servers", "transport_costs"}
+# Those that others start, that compare two versions, or that write a page of their own:
+OTHERS = {"compare", "jiminy_zoo", "many_clients", "remote_servers", "robots", "transport_costs"}
 
 
 def names() -> list[str]:
