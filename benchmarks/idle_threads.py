@@ -2,8 +2,8 @@
 
     python benchmarks/idle_threads.py
 
-A policy's network and a vector environment in two processes take turns, as in reinforcement
-learning: with the time for which GNU's OpenMP lets threads spin that have nothing to do, with the
+A policy's network, so wide that its library uses several threads, and a vector environment in two
+processes take turns, as in reinforcement learning: with the time for which GNU's OpenMP lets threads spin that have nothing to do, with the
 shorter one that physx asks for, and with one thread, which leaves none idle. And a training on
 stored samples, whose pieces of work follow each other at once, with the first two.
 """
@@ -35,7 +35,7 @@ def act() -> None:
     """Step ants with a policy; for each line that is read print the steps per second."""
     import torch
 
-    sizes = [27, 64, 64, 8]
+    sizes = [27, 512, 512, 8]
     layers = [torch.nn.Linear(*pair) for pair in itertools.pairwise(sizes)]
     policy = torch.nn.Sequential(layers[0], torch.nn.Tanh(), layers[1], torch.nn.Tanh(), layers[2])
     env = gymnasium.make_vec("physx/Ant-v0", 8, num_processes=2)

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import os
 
-_SPINS = "10000"
-"""About 0.2 ms: long enough to reach a network's next layer, too short to delay a simulation."""
+_SPINS = "30000"
+"""A tenth of GNU's own: long enough to reach a network's next layer, too short to delay a
+simulation. It is about a millisecond where a processor pauses for long in each turn."""
 
 
 def limit_openmp_spin() -> None:
