@@ -3,9 +3,10 @@
     python benchmarks/idle_threads.py
 
 A policy's network, so wide that its library uses several threads, and a vector environment in two
-processes take turns, as in reinforcement learning: with the time for which GNU's OpenMP lets threads spin that have nothing to do, with the
-shorter one that physx asks for, and with one thread, which leaves none idle. And a training on
-stored samples, whose pieces of work follow each other at once, with the first two.
+processes take turns, as in reinforcement learning: with the time for which GNU's OpenMP lets
+threads spin that have nothing to do, with the shorter one that physx asks for, and with one thread,
+which leaves none idle. And a training on stored samples, whose pieces of work follow each other at
+once, with the first two.
 """
 
 from __future__ import annotations
