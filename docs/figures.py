@@ -1,12 +1,13 @@
 """Runs benchmarks, keeps what they print in docs/figures/, and shows it in docs/figures.md.
 
 python docs/figures.py NAME ...    # runs benchmarks/NAME.py: minutes, on a quiet machine
-python docs/figures.py             # writes the page from what is kept
+python docs/figures.py             # writes the page, and the README's table, from what is kept
 """
 
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from pathlib import Path
 
@@ -40,7 +41,73 @@ def section(name: str) -> str:
     return f"### {name}\n\n```text\n{told}\n```\n\n{PAGE.printed(name)}"
 
 
+CLAIMS = {
+    "data generation, 5 floats a sample, in process": ("generation", "in process"),
+    "the same with 2 clients over TCP, their start included": (
+        "generation", "2 clients, start included"
+    ),
+    "training, FC [5, 5, 5, 1], batch 16, from the stored dataset": ("training", "physx"),
+    "training, FC [3000, 64, 3], batch 16": ("training", "physx#2"),
+    "5 ms of simulation a sample in a client, against the simulation alone": (
+        "transport", "ratio#2"
+    ),
+    "predictions a second over TCP, 48 bytes, against a raw blocking ping-pong": (
+        "transport", "1/get_prediction takes as many times as long"
+    ),
+    "environment steps a second, cartpole, acrobot, ant, against gym_jiminy 1.8.13": (
+        "gym", "ratio", "ratio#3", "ratio#5"
+    ),
+    "a vector environment of 8 ants, 2 processes against 1; with `send` and `recv` of 4": (
+        "gym", "2 processes against 1", "with send and recv"
+    ),
+    "a vector environment of 64 cartpoles against Gymnasium's asynchronous, synchronous one": (
+        "gym", "physx against AsyncVectorEnv", "physx against SyncVectorEnv"
+    ),
+    "as many batches a second while clients simulate as the slower of both alone": (
+        "online", "both against the slower alone"
+    ),
+    "training on data of twice the memory, rows of 48 B, of 48 kB, against reading the files": (
+        "larger_than_memory", "training", "training#2"
+    ),
+}  # fmt: skip
+"""What the tables show: the benchmark, and the names of its values, as `measure.claim` prints them;
+the n-th of that name, or the inverse."""
+SHORT = 7
+"""How many of them README.md shows."""
+
+
+def value(name: str, of: str) -> str:
+    """Return a value that a kept run of a benchmark claims, with two digits."""
+    wanted, _, place = of.removeprefix("1/").partition("#")
+    text = (HERE / "figures" / f"{name}.txt").read_text(encoding="utf-8")
+    found = re.findall(rf"^  {re.escape(wanted)}: ([^,]+), target", text, re.MULTILINE)
+    number = float(found[int(place or 1) - 1])
+    return f"{1 / number if of.startswith('1/') else number:#.2g}"
+
+
+def tables() -> tuple[str, str]:
+    """Return the tables of README.md and of the page."""
+    short, long = ["| | physx / bare loop |", "|---|---|"], ["| | | benchmark |", "|---|---|---|"]
+    for place, (text, (name, *values)) in enumerate(CLAIMS.items()):
+        numbers = ", ".join(value(name, of) for of in values)
+        long.append(f"| {text} | {numbers} | {name} |")
+        if place < SHORT:
+            short.append(f"| {text} | {numbers} |")
+    return "\n".join(short), "\n".join(long)
+
+
+def with_table(page: Path, table: str) -> str:
+    """Return a page's text with this table in the place of its own."""
+    begin, end = "<!-- table: written by docs/figures.py -->", "<!-- end of table -->"
+    before, _, rest = page.read_text(encoding="utf-8").partition(begin)
+    return f"{before}{begin}\n\n{table}\n\n{end}{rest.partition(end)[2]}"
+
+
+README = HERE.parent / "README.md"
 PAGE = kept.Page(HERE / "figures.md", HERE / "figures", names, run, section)
 
 if __name__ == "__main__":
-    sys.exit(PAGE.main(__doc__ or ""))
+    status = PAGE.main(__doc__ or "")
+    for path, table in zip((README, PAGE.path), tables(), strict=True):
+        path.write_text(with_table(path, table), encoding="utf-8")
+    sys.exit(status)

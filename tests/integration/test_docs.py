@@ -149,3 +149,5 @@ def test_every_error_has_a_cause_and_a_cure(root):
 
 def test_the_page_of_figures_is_what_the_benchmarks_say():
     assert figures.PAGE.path.read_text() == figures.PAGE.text()
+    for page, table in zip((figures.README, figures.PAGE.path), figures.tables(), strict=True):
+        assert page.read_text() == figures.with_table(page, table)
