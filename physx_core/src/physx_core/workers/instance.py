@@ -271,16 +271,8 @@ class Instance(Closeable):
             environment.step_index += 1
             if accepted or self._accepts_all:
                 return sample
-            if self.rejected is not None:
-                self.rejected.add(sample, self.last_episode, self.last_step)
             wrong += 1
-            if wrong > self._max_wrong_samples:
-                raise WrongSamplesError(
-                    f"check_sample() rejected {wrong} samples in a row; "
-                    f"max_wrong_samples_per_step is {self._max_wrong_samples}.",
-                    instance_id=self.instance_id,
-                    step=self.last_step,
-                )
+            self._reject(sample, wrong)
 
     def apply(self, prediction: Sample) -> None:
         """Pass a prediction in physical units to the environment.
@@ -321,6 +313,18 @@ class Instance(Closeable):
         for _ in range(self._sub_steps):
             self._finish(environment.step())
         environment.compute_training_data = True
+
+    def _reject(self, sample: dict[str, Any], wrong: int) -> None:
+        """Keep a sample that `check_sample` rejected, as the `wrong`-th in a row."""
+        if self.rejected is not None:
+            self.rejected.add(sample, self.last_episode, self.last_step)
+        if wrong > self._max_wrong_samples:
+            raise WrongSamplesError(
+                f"check_sample() rejected {wrong} samples in a row; "
+                f"max_wrong_samples_per_step is {self._max_wrong_samples}.",
+                instance_id=self.instance_id,
+                step=self.last_step,
+            )
 
     def _finish(self, result: Any) -> None:
         """Run the coroutine that `step` returned, if it is one."""
