@@ -2,7 +2,7 @@
 # make test    install into .venv and run the tests; PYTEST_ARGS are handed on
 # make lint    ruff, mypy and import-linter
 # make docs    build the site: docs/_build/docs/index.html
-# make bench   print the measured ratios of benchmarks/
+# make bench   print the measured ratios of benchmarks/: 20 minutes
 # make clean   remove .venv and everything that was built
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -37,6 +37,8 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/transport.py
 	$(BIN)/python benchmarks/faults.py
 	$(BIN)/python benchmarks/dataset.py
+	$(BIN)/python benchmarks/larger_than_memory.py
+	$(BIN)/python benchmarks/online.py
 	$(BIN)/python benchmarks/crash.py
 	$(BIN)/python benchmarks/checkpoint.py
 	$(BIN)/python benchmarks/cluster_sweep.py
