@@ -90,9 +90,31 @@ def test_a_killed_run_keeps_its_numbers(tmp_path):
     assert len(batches) >= 10 * len(epochs)
 
 
+def test_a_resumed_training_has_the_numbers_of_all_batches(tmp_path):
+    script = tmp_path / "killed.py"
+    script.write_text(
+        "import os, sys\n"
+        "from physx_core import *\n"
+        "class Killed(Training):\n"
+        "    def batch_begin(self):\n"
+        "        if self.batch_id in (3, 8) and self.batch_id > self._resumed.batch:\n"
+        "            os.kill(os.getpid(), 9)\n"
+        "spring = EnvironmentConfig('toy/spring', as_tcp_ip_client=False)\n"
+        "Killed(NetworkConfig('toy/linear'), None, spring, epoch_nb=1, batch_nb=10,\n"
+        "       batch_size=10, checkpoint_every=1, new_session='resume' not in sys.argv,\n"
+        "       resume='resume' in sys.argv).execute()\n"
+    )
+    for words, status in (([], -9), (["resume"], -9), (["resume"], 0)):
+        command = [sys.executable, str(script), *words]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == status, done.stderr
+    found = read_scalars(tmp_path / "sessions" / "training")
+    assert list(found["batch", "loss/batch"]) == list(range(1, 11))
+
+
 # Failing observers ------------------------------------------------------------------------------
 
-METHODS = ["begin", "advance", "end", "scalars", "histograms", "note", "events", "close"]
+METHODS = ["begin", "advance", "end", "scalars", "histograms", "flush", "note", "events", "close"]
 
 
 def failing(*methods):

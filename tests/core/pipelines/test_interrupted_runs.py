@@ -148,7 +148,7 @@ PIPELINES = {
 }
 
 
-def signaled(text, sent, *, words=("script.py",)):
+def signaled(text, sent, *, pause=0.6, words=("script.py",)):
     """Run a program, send it signals once it is at work, and return its status and its errors."""
     Path("script.py").write_text(text)
     process = subprocess.Popen(
@@ -161,7 +161,7 @@ def signaled(text, sent, *, words=("script.py",)):
             break
     for number in sent:
         process.send_signal(number)
-        time.sleep(0.1)
+        time.sleep(pause)
     _, errors = process.communicate(timeout=60)
     return process.returncode, errors
 
@@ -218,6 +218,13 @@ def test_a_second_signal_ends_a_training_at_once():
     code, _ = signaled(text, [signal.SIGTERM, signal.SIGTERM])
     assert code == 143 and time.monotonic() - began < 25
     assert not Path("sessions/new/network").exists()
+
+
+def test_a_signal_that_is_sent_to_the_process_and_to_its_group_is_one():
+    text = saying(PIPELINES["training"], "batch_end")
+    text = text.replace("close()", "close(); import time; time.sleep(0.2)")
+    code, text = signaled(text, [signal.SIGTERM, signal.SIGTERM], pause=0.05)
+    assert code == 143 and set(LEFT["training"]) <= set(text.splitlines())
 
 
 @pytest.mark.parametrize("busy", ["optimize", "batch_produce"])

@@ -45,6 +45,18 @@ def test_closing_ends_the_process_and_those_that_it_started(tmp_path):
     process.close()
 
 
+def test_a_process_is_asked_to_end_only_once(tmp_path):
+    trap = f"trap 'echo . >> {tmp_path}/asked' TERM"
+    script = f"{trap}; touch {tmp_path}/ready; sleep 60 & wait; sleep 1"
+    process = ChildProcess(["sh", "-c", script])
+    wait_until((tmp_path / "ready").exists)
+    process.ask_to_end()
+    wait_until((tmp_path / "asked").exists)
+    process.ask_to_end()
+    process.close()
+    assert (tmp_path / "asked").read_text() == ".\n"
+
+
 def test_a_process_that_ignores_a_polite_signal_is_killed(tmp_path):
     script = f"trap '' TERM; touch {tmp_path}/ready; while true; do sleep 0.05; done"
     process = ChildProcess(["sh", "-c", script])

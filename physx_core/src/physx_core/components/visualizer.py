@@ -89,6 +89,9 @@ class Observer(Closeable):
             timeline: ``epoch``.
         """
 
+    def flush(self) -> None:
+        """Called before a checkpoint: store what a killed run is to have that resumes from it."""
+
     def note(self, text: str) -> None:
         """Receive a message, for example that a training stopped early."""
 

@@ -22,8 +22,8 @@ _LONGEST_LINE = 2**16
 class ScalarsFile(Observer):
     """Appends rows (timeline, step, name, value) to ``stats/scalars.csv`` of the session.
 
-    Rows are flushed five times a second, and those of an epoch at once, so that a killed run keeps
-    its statistics.
+    Rows are flushed five times a second, before each checkpoint, and those of an epoch at once, so
+    that a killed run keeps its statistics.
     """
 
     def __init__(self) -> None:
@@ -55,10 +55,12 @@ class ScalarsFile(Observer):
             self._flushed = now
             self._stream.flush()
 
-    def end(self) -> None:
+    def flush(self) -> None:
         """Flush the file."""
         if self._stream is not None:
             self._stream.flush()
+
+    end = flush
 
     def close(self) -> None:
         """Close the file."""

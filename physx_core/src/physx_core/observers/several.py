@@ -76,6 +76,10 @@ class Observers(Observer):
         ignored = Observer.predictions
         return any(type(each).predictions is not ignored for each in self._observers)
 
+    def flush(self) -> None:
+        """Have what was passed on stored."""
+        self._call("flush")
+
     def note(self, text: str) -> None:
         """Pass on a message."""
         self._call("note", text)

@@ -364,6 +364,7 @@ class Training(NewSessionPipeline):
         return Path(self.group.tell(written))
 
     def _write_own(self, *, best: bool = False) -> Path:
+        self.observers.flush()
         progress = Progress(
             self.epoch_id,
             self.batch_id,

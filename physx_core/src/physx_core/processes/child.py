@@ -55,7 +55,7 @@ class ChildProcess(Closeable):
         """
         if shutil.which(command[0]) is None:
             raise FileNotFoundError(errno.ENOENT, "there is no such program", command[0])
-        self._owner, self._is_over = os.getpid(), False
+        self._owner, self._is_over, self._is_asked = os.getpid(), False, False
         with WATCHDOG.lock:
             self._process = subprocess.Popen(
                 ["/bin/sh", "-c", _WAIT_AND_BEGIN, "sh", *command],
@@ -97,6 +97,12 @@ class ChildProcess(Closeable):
         if self._is_mine() and self._process.returncode is None:
             _signal_group(self.pid, number)
 
+    def ask_to_end(self) -> None:
+        """Send SIGTERM, but never a second one, which would end it at once."""
+        if not self._is_asked:
+            self._is_asked = True
+            self.send_signal(signal.SIGTERM)
+
     def close(self, patience: float = 3.0) -> None:
         """End the process; none of its group is left when this returns.
 
@@ -105,7 +111,7 @@ class ChildProcess(Closeable):
         """
         try:
             if patience > 0:
-                self.send_signal(signal.SIGTERM)
+                self.ask_to_end()
                 self.wait(patience)
         finally:
             self.send_signal(signal.SIGKILL)

@@ -5,11 +5,16 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
 from typing import Any
 
 from physx_core.errors import PhysxError
+
+_REPETITION = 0.5
+"""Time in s within which a signal is the same one again: schedulers, terminals and ``timeout`` send
+it to a process and to its group."""
 
 
 class Terminated(SystemExit):
@@ -27,7 +32,7 @@ class Interrupt:
     """
 
     def __init__(self) -> None:
-        self.number = 0
+        self.forget()
 
     def __bool__(self) -> bool:
         """Return whether the run is to end."""
@@ -35,9 +40,23 @@ class Interrupt:
 
     def take(self, number: int, frame: FrameType | None) -> None:
         """Note the first signal, and raise the exception of a second one."""
+        if self.is_repeated():
+            return
         if self.number:
             _raise(number, frame)
-        self.number = number
+        self.note(number)
+
+    def forget(self) -> None:
+        """Be as before any signal."""
+        self.number, self._came = 0, float("-inf")
+
+    def note(self, number: int) -> None:
+        """Note a signal."""
+        self.number, self._came = number, time.monotonic()
+
+    def is_repeated(self) -> bool:
+        """Return whether a signal that comes now is the noted one again."""
+        return time.monotonic() - self._came < _REPETITION
 
     def end(self) -> None:
         """Raise the exception that the signal ends a run with.
@@ -57,13 +76,13 @@ _LAST = Interrupt()
 def deferred_interrupt() -> Iterator[Interrupt]:
     """Defer the first Ctrl-C or SIGTERM, and yield what tells whether it came.
 
-    A second one ends the run at once. Outside the main thread, and for a signal that is already
-    handled, nothing changes.
+    A second one, half a second later or more, ends the run at once. Outside the main thread, and
+    for a signal that is already handled, nothing changes.
     """
     interrupt = Interrupt()
     usual: dict[int, tuple[Any, ...]] = {
         signal.SIGINT: (signal.default_int_handler,),
-        signal.SIGTERM: (signal.SIG_DFL, _raise),
+        signal.SIGTERM: (signal.SIG_DFL, _raise_first),
     }
     with _handled(interrupt.take, usual):
         yield interrupt
@@ -74,12 +93,13 @@ def raised_at_sigterm() -> Iterator[None]:
     """Raise `Terminated` at SIGTERM, so that everything is closed before the process exits.
 
     An exception in the middle of an import may become any other: what leaves this context after
-    SIGTERM is `Terminated`, with a note about an error of physx. A further SIGTERM is raised again.
-    Outside the main thread, and if SIGTERM is already handled, nothing changes.
+    SIGTERM is `Terminated`, with a note about an error of physx. A further SIGTERM, half a second
+    later or more, is raised again. Outside the main thread, and if SIGTERM is already handled,
+    nothing changes.
     """
-    with _handled(_raise, {signal.SIGTERM: (signal.SIG_DFL,)}) as before:
+    with _handled(_raise_first, {signal.SIGTERM: (signal.SIG_DFL,)}) as before:
         if before:
-            _LAST.number = 0
+            _LAST.forget()
         try:
             yield
         except Exception as error:
@@ -91,8 +111,13 @@ def raised_at_sigterm() -> Iterator[None]:
             raise terminated from error
 
 
+def _raise_first(number: int, frame: FrameType | None) -> None:
+    if not _LAST.is_repeated():
+        _raise(number, frame)
+
+
 def _raise(number: int, frame: FrameType | None) -> None:
-    _LAST.number = number
+    _LAST.note(number)
     raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
 

@@ -89,7 +89,7 @@ class ClientProcess(ClientHandle):
     def terminate(self) -> None:
         """Ask the process and those that it started to exit."""
         if self._process is not None:
-            self._process.send_signal(signal.SIGTERM)
+            self._process.ask_to_end()
 
     def kill(self) -> None:
         """Kill the process and those that it started."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-import signal
 import socket
 import subprocess
 import sys
@@ -266,7 +265,7 @@ class Workers:
                 link.process.wait(_EXIT_TIME if orderly else 0.0)
         finally:
             for link in self._links:
-                link.process.send_signal(signal.SIGTERM)
+                link.process.ask_to_end()
             for link in self._links:
                 link.process.close(_LAST_WORDS_TIME)
 
@@ -281,7 +280,7 @@ class Workers:
     def _silence_of(self, number: int) -> ClientError:
         """Return the error for a worker whose entry takes too long."""
         link, doing = self._links[number], self._describe_entry(number)
-        link.process.send_signal(signal.SIGTERM)  # it writes where it was
+        link.process.ask_to_end()  # it writes where it was
         link.process.wait(_LAST_WORDS_TIME)
         text = (
             f"sent nothing for {self._timeout:g} s {doing}. If that takes so long, raise timeout."

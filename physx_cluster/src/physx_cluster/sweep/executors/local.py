@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -78,7 +77,7 @@ class LocalJob(Job):
 
     def ask_to_end(self) -> None:
         """Ask it to end, without waiting."""
-        self.process.send_signal(signal.SIGTERM)
+        self.process.ask_to_end()
 
     def close(self) -> None:
         """End it."""
