@@ -2,8 +2,10 @@
 
 import contextlib
 import os
+import random
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -52,6 +54,15 @@ def pytest_collection_modifyitems(config, items):
         rest = ends[number + 1] - len(items)
         items += short[:rest]
         del short[:rest]
+
+
+@pytest.fixture
+def port():
+    """A port where nobody listens, and which no connection of another test is given by itself."""
+    while True:
+        number = random.randrange(20_000, 32_000)
+        with contextlib.suppress(OSError), socket.create_server(("0.0.0.0", number)):
+            return number
 
 
 class Machine:

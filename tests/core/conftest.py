@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -208,13 +207,6 @@ def process_ids():
         return found
 
     return find
-
-
-@pytest.fixture
-def port():
-    """A port where nobody listens."""
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        return listener.getsockname()[1]
 
 
 # Kills ------------------------------------------------------------------------------------------

@@ -29,12 +29,6 @@ CART = f"{Path(__file__).with_name('envs.py')}:Cart"
 
 
 @pytest.fixture
-def port():
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return free.getsockname()[1]
-
-
-@pytest.fixture
 def beside():
     """Run a function in a thread, and wait for it at the end."""
     threads = []
