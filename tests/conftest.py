@@ -140,7 +140,7 @@ def nothing_stays_behind(monkeypatch):
 def running_children():
     """Return the process ids of the children of this process, also of those that ended."""
     found = set()
-    for each in Path("/proc/self/task").glob("*/children"):
+    for each in (folder / "children" for folder in Path("/proc/self/task").glob("*")):
         with contextlib.suppress(OSError):  # the thread has ended
             found.update(map(int, each.read_text().split()))
     return found
@@ -155,7 +155,7 @@ def children():
 def marked(mark):
     """Command lines of the other processes with a mark in their environment."""
     found = []
-    for environ in Path("/proc").glob("[0-9]*/environ"):
+    for environ in (folder / "environ" for folder in Path("/proc").glob("[0-9]*")):
         try:
             if mark in environ.read_bytes() and int(environ.parent.name) != os.getpid():
                 found.append((environ.parent / "cmdline").read_bytes())

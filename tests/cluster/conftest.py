@@ -58,7 +58,7 @@ class RayCluster:
 
 def descendants(pid):
     found, children = [], {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
+    for stat in (folder / "stat" for folder in Path("/proc").glob("[0-9]*")):
         with contextlib.suppress(OSError):
             parent = int(stat.read_text().rpartition(")")[2].split()[1])
             children.setdefault(parent, []).append(int(stat.parent.name))

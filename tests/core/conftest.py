@@ -194,7 +194,7 @@ def process_ids():
 
     def find(parent=None):
         found = {}
-        for command in Path("/proc").glob("[0-9]*/cmdline"):
+        for command in (folder / "cmdline" for folder in Path("/proc").glob("[0-9]*")):
             try:
                 words = command.read_bytes().split(b"\0")
                 started_by = int(

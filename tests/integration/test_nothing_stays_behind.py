@@ -37,7 +37,7 @@ TIME = 3.0
 def marked(mark):
     """Return the command lines of the processes with a mark in their environment."""
     found = []
-    for environ in Path("/proc").glob("[0-9]*/environ"):
+    for environ in (folder / "environ" for folder in Path("/proc").glob("[0-9]*")):
         try:
             if mark.encode() in environ.read_bytes():
                 found.append((environ.parent / "cmdline").read_bytes())

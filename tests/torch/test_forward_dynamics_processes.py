@@ -41,7 +41,7 @@ os.kill(os.getpid(), signal.SIGKILL) if sys.argv[1] == "kill" else None
 def workers():
     """Return the processes that compute batches for this one."""
     found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
+    for stat in (folder / "stat" for folder in Path("/proc").glob("[0-9]*")):
         with contextlib.suppress(OSError):
             parent = int(stat.read_text().rpartition(")")[2].split()[1])
             command = stat.with_name("cmdline").read_bytes()

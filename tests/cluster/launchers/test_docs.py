@@ -52,7 +52,7 @@ def test_three_commands_lead_to_two_nodes(runs, local_rows):
 
 def end_processes_with(text):
     """Kill the processes on whose command lines a text stands: `ray stop` would end all of Ray."""
-    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+    for entry in (folder / "cmdline" for folder in Path("/proc").glob("[0-9]*")):
         try:
             if text.encode() in entry.read_bytes():
                 os.kill(int(entry.parent.name), 9)

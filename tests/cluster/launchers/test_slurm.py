@@ -33,7 +33,7 @@ LOCAL = slurm_words("cluster='local'")
 def jobs_of(folder):
     """Return the processes that submitit started for the jobs of runs in a folder."""
     found = []
-    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+    for entry in (folder / "cmdline" for folder in Path("/proc").glob("[0-9]*")):
         try:
             command = entry.read_bytes()
         except OSError:
@@ -109,7 +109,11 @@ def test_the_token_is_where_only_its_user_reads_it(runs, slurm):
         assert not holders[0].stat().st_mode & 0o077
         assert list(folder.glob("*_submitted.pkl"))
         assert not list(filter(holds_token, slurm.folder.rglob("*")))
-        assert not [path for path in Path("/proc").glob("[0-9]*/cmdline") if holds_token(path)]
+        assert not [
+            path
+            for path in (folder / "cmdline" for folder in Path("/proc").glob("[0-9]*"))
+            if holds_token(path)
+        ]
     finally:
         process.send_signal(signal.SIGINT)
         runs.finish(process)

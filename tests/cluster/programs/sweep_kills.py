@@ -19,7 +19,7 @@ def start(file, study):
 def processes(study):
     """Return the process ids of the trials that run, by name."""
     found = {}
-    for cmdline in Path("/proc").glob("[0-9]*/cmdline"):
+    for cmdline in (folder / "cmdline" for folder in Path("/proc").glob("[0-9]*")):
         try:
             words = cmdline.read_bytes().split(b"\0")
         except OSError:

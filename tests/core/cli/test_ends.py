@@ -41,6 +41,8 @@ def end(words, is_running, number, is_ending=None):
                 assert process.poll() is None, process.stderr.read()
                 assert time.monotonic() < deadline
                 time.sleep(0.01)
+            if condition is is_ending:
+                time.sleep(0.6)  # what comes sooner is the first one again
             process.send_signal(number)
         error = process.communicate(timeout=60)[1]
     status, how = WAYS[number]

@@ -40,7 +40,7 @@ def test_what_is_wrong_is_named(name, place, expect_named, nothing_stays_behind)
 def end_sleepers():
     """Kill what a wrong launcher, as it must, has left; other processes of pytest test, too."""
     mine = f"PYTEST_XDIST_WORKER={os.environ.get('PYTEST_XDIST_WORKER', '')}".rstrip("=").encode()
-    for environ in Path("/proc").glob("[0-9]*/environ"):
+    for environ in (folder / "environ" for folder in Path("/proc").glob("[0-9]*")):
         try:
             variables = environ.read_bytes().split(b"\0")
             marked = any(each.startswith(b"PHYSX_KIT_MARK=") for each in variables)

@@ -299,7 +299,7 @@ def test_clients_by_hand_leave_when_the_server_is_killed(join, port, pace):
 
 def children_of(parent):
     found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
+    for stat in (folder / "stat" for folder in Path("/proc").glob("[0-9]*")):
         with contextlib.suppress(OSError):
             if int(stat.read_text().rpartition(")")[2].split()[1]) == parent:
                 found.append(int(stat.parent.name))

@@ -89,7 +89,7 @@ def tensorboard():
 
 
 def commands():
-    for path in Path("/proc").glob("[0-9]*/cmdline"):
+    for path in (folder / "cmdline" for folder in Path("/proc").glob("[0-9]*")):
         try:
             if int((path.parent / "stat").read_text().rpartition(")")[2].split()[1]) == os.getpid():
                 yield path.read_bytes()

@@ -93,11 +93,11 @@ def _end_processes(folder: Path, until: float) -> None:
 
 def _processes_of(folder: Path) -> list[int]:
     mark, found = os.fsencode(folder), []
-    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+    for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            words = entry.read_bytes().split(b"\0")
+            words = (process / "cmdline").read_bytes().split(b"\0")
             if mark in words and _MODULES.intersection(words):
-                found.append(int(entry.parent.name))
+                found.append(int(process.name))
     return found
 
 

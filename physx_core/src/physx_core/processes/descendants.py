@@ -29,20 +29,20 @@ def children() -> set[int]:
     Among them are those that ended but that nobody has waited for.
     """
     found: set[int] = set()
-    for each in Path("/proc/self/task").glob("*/children"):
+    for thread in Path("/proc/self/task").glob("*"):
         with contextlib.suppress(OSError):  # the thread has ended
-            found.update(map(int, each.read_text().split()))
+            found.update(map(int, (thread / "children").read_text().split()))
     return found
 
 
 def descendants_of(ancestor: int) -> list[int]:
     """Return the numbers of a process's descendants, if there is a /proc file system."""
     children: dict[int, list[int]] = {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
+    for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            state, parent = stat.read_text().rpartition(")")[2].split()[:2]
+            state, parent = (process / "stat").read_text().rpartition(")")[2].split()[:2]
             if state not in "ZX":  # not dead already
-                children.setdefault(int(parent), []).append(int(stat.parent.name))
+                children.setdefault(int(parent), []).append(int(process.name))
     found = children.get(ancestor, [])
     for number in found:  # grows while it is read
         found += children.get(number, [])

@@ -183,9 +183,9 @@ def _hides_token(subject: Subject) -> None:
 
 def _processes(what: str) -> Iterator[tuple[int, bytes]]:
     """Yield the number and the environment or command line of every process that we may see."""
-    for path in Path("/proc").glob(f"[0-9]*/{what}"):
+    for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            yield int(path.parent.name), path.read_bytes()
+            yield int(process.name), (process / what).read_bytes()
 
 
 def _marked(mark: str) -> list[str]:
