@@ -17,6 +17,7 @@ HERE = Path(__file__).resolve().parent
 BENCHMARKS = HERE.parent / "benchmarks"
 # Those that others start, that compare two versions, or that write a page of their own:
 OTHERS = {"compare", "jiminy_zoo", "many_clients", "remote_servers", "robots", "transport_costs"}
+FENCE = "<!-- not run: benchmarks take minutes -->\n```sh"
 
 
 def names() -> list[str]:
@@ -38,7 +39,7 @@ def section(name: str) -> str:
     """Return what the page says of a benchmark."""
     source = (BENCHMARKS / f"{name}.py").read_text(encoding="utf-8")
     told = ast.get_docstring(ast.parse(source)) or ""
-    return f"### {name}\n\n```text\n{told}\n```\n\n{PAGE.printed(name)}"
+    return f"### {name}\n\n{kept.markdown(told, FENCE)}\n\n{PAGE.printed(name)}"
 
 
 CLAIMS = {

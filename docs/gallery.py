@@ -16,7 +16,6 @@ import re
 import shutil
 import sys
 import tempfile
-import textwrap
 from pathlib import Path
 
 import kept
@@ -96,23 +95,13 @@ def draw(name: str, drawn: Path) -> int:
     return status
 
 
-def markdown(told: str) -> str:
-    """Return a docstring as Markdown, its indented parts as commands."""
-    parts = []
-    for part in told.split("\n\n"):
-        if part.startswith("    "):
-            parts.append(f"{TEST}\n```sh\n{textwrap.dedent(part)}\n```")
-        else:
-            parts.append(part)
-    return "\n\n".join(parts)
-
-
 def section(name: str) -> str:
     """Return what the page says of an example."""
     title, _, told = beginning(name).partition("\n")
     path, drawn = path_of(name), picture(name)
     place = f"../examples/{path.name}" + ("/README.md" if path.is_dir() else "")
-    parts = [f"## {title.rstrip('.')}", f"[examples/{path.name}]({place})", markdown(told.strip())]
+    told = kept.markdown(told.strip(), f"{TEST}\n```sh")
+    parts = [f"## {title.rstrip('.')}", f"[examples/{path.name}]({place})", told]
     if drawn.is_file():
         parts.append(f"![{title.rstrip('.')}](examples/{drawn.name})")
     if (PAGE.kept / f"{name}.txt").is_file():

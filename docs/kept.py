@@ -7,10 +7,20 @@ import os
 import platform
 import subprocess
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+
+
+def markdown(told: str, fence: str) -> str:
+    """Return a docstring as Markdown: what begins a block of its indented parts is given."""
+    parts = told.split("\n\n")
+    for place, part in enumerate(parts):
+        if part.startswith("    "):
+            parts[place] = f"{fence}\n{textwrap.dedent(part)}\n```"
+    return "\n\n".join(parts)
 
 
 @dataclass(frozen=True)

@@ -73,7 +73,7 @@ def expected(dtype, shape, value):
         return FieldShapeError
     if array.shape != shape:
         return FieldShapeError
-    if not array.size and isinstance(value, list):
+    if not array.size and isinstance(value, list | tuple):
         return []
     kind, given_kind = np.dtype(dtype).kind, array.dtype.kind
     if given_kind not in ORDER or ORDER[given_kind] > ORDER[kind]:
@@ -199,6 +199,7 @@ def store(tmp_path_factory):
 @example("bool", 1, False)
 @example("float64", 1j, False)
 @example("float64", [[1, 2], [3]], False)
+@example("bool", (), False)
 def test_every_way_in_has_the_same_rule(store, dtype, value, other):
     try:
         shape = np.asarray(value).shape

@@ -3,7 +3,7 @@ import zlib
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
@@ -109,6 +109,37 @@ def test_any_history_gives_what_all_rows_give(shape, history, offset):
         assert (statistics.minimum == rows.min(axis=0)).all()
         assert (statistics.maximum == rows.max(axis=0)).all()
         assert statistics.mean.shape == shape
+
+
+HUGE = np.finfo(np.float64).max
+
+
+@settings(max_examples=200)
+@given(st.lists(st.lists(st.floats(-HUGE, HUGE), min_size=1, max_size=5), min_size=1, max_size=5))
+@example([[HUGE, -HUGE], [HUGE]])
+@example([[1e200], [-1e200, 0.0]])
+@example([[0.0], [1e154, 1e155]])
+def test_numbers_of_any_size_have_finite_statistics(blocks):
+    statistics, merged = RunningStatistics(), RunningStatistics()
+    for block in map(np.array, blocks):
+        statistics.update(block)
+        merged = RunningStatistics.from_dict(merged.to_dict())
+        merged.merge(statistics_of(block))
+    rows = np.concatenate(blocks)
+    least, most = float(rows.min()), float(rows.max())
+    rounding = 1e-15 * max(-least, most) + 1e-300
+    for found in (statistics, merged):
+        assert (found.minimum, found.maximum) == (least, most)
+        assert 0 <= found.std / 2 <= most / 4 - least / 4 + rounding
+        assert least - rounding <= found.mean <= most + rounding
+
+
+def test_a_dataset_of_huge_numbers_is_opened_again(tmp_path):
+    with Dataset.create(tmp_path / "data") as dataset:
+        dataset.append("training", {"x": np.array([1e200, -1e200, 1e300])})
+    with Dataset.open(tmp_path / "data") as dataset:
+        assert dataset.verify() == []
+        assert np.isfinite(dataset.normalization["x"].std)
 
 
 def test_plain_data_bring_it_back_and_it_goes_on():

@@ -99,7 +99,7 @@ class Field:
           (float64 holds all of them up to 2**53). A number that is too large for the type becomes
           infinite, and infinite numbers are rejected where rows are checked: see `is_finite`.
         - Byte order and memory layout do not matter. Texts, objects and dates do not fit any field.
-        - An empty list fits a field of any type.
+        - An empty list or tuple fits a field of any type.
 
         Args:
             values: One value, or an array of them; numbers, sequences and arrays.

@@ -14,6 +14,7 @@ from physx_core.typing import Array
 
 Doubles = NDArray[np.float64]
 _WIDTH = 512
+_QUIET = np.errstate(over="ignore", invalid="ignore")
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,8 @@ class RunningStatistics:
     Blocks are combined by the update of Chan, Golub and LeVeque (1979), "Updating formulae and a
     pairwise algorithm for computing sample variances". Values are relative to the first row, so
     that a large offset costs no precision and a constant component has a deviation of exactly 0.
+    Where squares overflow, beyond 1e150 or so, the mean is taken for the middle of minimum and
+    maximum, and the deviation for half of their distance, which it cannot exceed.
 
     Attributes:
         count: Number of rows so far.
@@ -70,14 +73,16 @@ class RunningStatistics:
     @property
     def mean(self) -> Doubles:
         """Mean of each component, of the field's shape, in the field's unit."""
-        return np.asarray(self._origin + self._mean)
+        mean = self._origin + self._mean
+        return np.where(np.isfinite(mean), mean, self._minimum / 2 + self._maximum / 2)
 
     @property
     def std(self) -> Doubles:
         """Standard deviation (of the population) of each component, in the field's unit."""
         if self._std is not None:
             return self._std
-        return np.asarray(np.sqrt(self._squares / max(self.count, 1)))
+        std = np.sqrt(self._squares / max(self.count, 1))
+        return np.where(np.isfinite(std), std, self._maximum / 2 - self._minimum / 2)
 
     @property
     def minimum(self) -> Doubles:
@@ -89,6 +94,7 @@ class RunningStatistics:
         """Largest value of each component, in the field's unit."""
         return self._maximum
 
+    @_QUIET
     def update(self, block: Array) -> None:
         """Add rows.
 
@@ -107,6 +113,7 @@ class RunningStatistics:
         squares = _over_rows(np.add, np.square(deviations, out=deviations))
         self._combine(count, mean, squares)
 
+    @_QUIET
     def merge(self, other: RunningStatistics) -> None:
         """Add the rows that `other` has seen."""
         if not other.count:
@@ -136,6 +143,7 @@ class RunningStatistics:
         return {"count": self.count} | {name: array.tolist() for name, array in values.items()}
 
     @classmethod
+    @_QUIET
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:
         """Return the statistics that `to_dict` described.
 

@@ -41,6 +41,7 @@ def test_the_rows_are_those_of_a_local_run(runs, local_rows, ray_cluster, eventu
     eventually(runs.nothing_is_left)
 
 
+@pytest.mark.faults
 def test_a_killed_node_is_replaced_and_the_rows_stay_the_same(
     runs, local_rows, ray_cluster, eventually
 ):

@@ -188,6 +188,7 @@ def test_a_run_whose_jobs_are_queued_says_so_and_leaves_none(runs, busy, eventua
     eventually(runs.nothing_is_left)
 
 
+@pytest.mark.faults
 def test_a_job_is_not_queued_for_longer_than_it_may(runs, busy):
     status, said = runs.finish(runs.start(*slurm_words("queue_time=2"), **busy.variables))
     assert status == 1

@@ -133,6 +133,7 @@ def test_clients_make_the_training_of_environments_in_this_process(online):
         assert np.array_equal(read_drawn_rows(one), read_drawn_rows(other))
 
 
+@pytest.mark.faults
 def test_a_first_batch_that_waits_for_many_rows_takes_them_in_several_blocks():
     options = {"capacity": 3000, "watermark": 2600, "views": 2}
     batches = []

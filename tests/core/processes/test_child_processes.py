@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from physx_core.processes import ChildProcess, TemporaryFolder, kill_descendants
+from physx_core.processes import ChildProcess, TemporaryFolder
 from physx_core.processes.watchdog import WATCHDOG
 
 pytestmark = pytest.mark.usefixtures("nothing_stays_behind")
@@ -226,9 +226,9 @@ def test_all_descendants_are_killed_and_their_files_removed(tmp_path):
         "subprocess.Popen(['sleep', '60'], start_new_session=True)",
         "child, folder = ChildProcess(['sleep', '60']), TemporaryFolder('held-')",
         "kill_descendants()",
+        "kill_descendants()  # there are none any more",
         "print(child.exit_status(), folder.path.exists())",
     )
     owner = start(tmp_path, *lines)
     assert owner.communicate(timeout=60)[0] == b"-9 False\n"
     assert [path.name for path in tmp_path.iterdir()] == ["owner.py"]
-    kill_descendants()  # there are none
