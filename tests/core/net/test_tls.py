@@ -156,7 +156,8 @@ def test_what_is_cut_or_changed_on_its_way_is_a_beginning_of_what_was_sent_and_a
         client, server = map(stack.enter_context, shake_hands(near, far))
         message = os.urandom(data.draw(st.integers(1, 60_000)))
         encrypted = relay.hold(client, message)
-        place = data.draw(st.integers(0, len(encrypted) - 1))
+        # What waits before it, of the handshake, differs from time to time.
+        place = data.draw(st.integers(0, 2**20)) % len(encrypted)
         if data.draw(st.booleans()):
             encrypted[place] ^= data.draw(st.integers(1, 255))
         else:
