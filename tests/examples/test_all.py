@@ -15,6 +15,7 @@ pytestmark = pytest.mark.slow
 
 EXAMPLES = gallery.EXAMPLES
 SCRIPTS = sorted(EXAMPLES.glob("[0-9][0-9]_*.py"))
+LONG = {"20_policy_on_a_cluster": pytest.mark.faults}
 SHARED = {path.stem for path in EXAMPLES.rglob("*.py")}
 PRINTED = {  # what an example has to print, as patterns
     "01_generate": (
@@ -76,7 +77,10 @@ def assert_same_film(path, kept):
     assert np.abs(films[0] - films[1]).mean(axis=(1, 2)).max() < 5
 
 
-@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, id=path.stem, marks=LONG.get(path.stem, ())) for path in SCRIPTS],
+)
 def test_an_example_runs_and_draws_its_picture(path, run, tmp_path):
     skip_without_libraries(path)
     picture = tmp_path / gallery.picture(path.stem).name

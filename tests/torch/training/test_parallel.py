@@ -274,6 +274,7 @@ def test_two_processes_train_as_one_with_the_doubled_batch():
     assert all(torch.equal(value, resumed[name]) for name, value in parameters("two", 1).items())
 
 
+@pytest.mark.faults
 def test_two_processes_learn_from_environments_of_the_first_as_one_does():
     script = alone()
     generating, reservoir = script["generating"], script["RESERVOIR"]
