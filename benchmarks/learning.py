@@ -55,7 +55,8 @@ def train(env: str, backend: str, more: list[str], place: Path, seed: int) -> tu
     folder = place / f"{name}_{seed}"
     words = ["--env", name, "--backend", backend, "--seeds", str(seed), "--session-dir", str(place)]
     begin = time.perf_counter()
-    done = subprocess.run([sys.executable, str(TRAIN), *words, *more], check=False)  # 1: it lost
+    command = [sys.executable, str(TRAIN), *words, *more]
+    done = subprocess.run(command, stdout=sys.stderr, check=False)  # 1: it lost
     if not (folder / "network").is_dir():
         sys.exit(f"The training with seed {seed} failed with status {done.returncode}.")
     return folder, time.perf_counter() - begin

@@ -35,7 +35,7 @@ def test_each_block_is_run_or_says_by_what():
     assert {str(page.relative_to(run_pages.ROOT)) for page in run_pages.PAGES} >= LONG
 
 
-@pytest.mark.parametrize("pages", books())
+@pytest.mark.parametrize("pages", list(books()))
 def test_the_code_of_a_page_runs(pages, tmp_path):
     run_pages.run(pages, tmp_path)
 

@@ -109,7 +109,9 @@ class Slurm:
         return done.stdout
 
     def stop(self) -> None:
-        """End all jobs and the daemons."""
+        """End all jobs and the daemons, if any were started."""
+        if not self._daemons:
+            return
         self.ask("scancel", "--me", "--quiet")
         wait_for(lambda: not self.ask("squeue", "--noheader"), 15)
         for daemon in reversed(self._daemons):
