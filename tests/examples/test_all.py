@@ -15,7 +15,9 @@ pytestmark = pytest.mark.slow
 
 EXAMPLES = gallery.EXAMPLES
 SCRIPTS = sorted(EXAMPLES.glob("[0-9][0-9]_*.py"))
-LONG = {"20_policy_on_a_cluster": pytest.mark.faults}
+LONG = dict.fromkeys(
+    ["07_field_on_a_grid", "09_robot_arm", "20_policy_on_a_cluster"], pytest.mark.faults
+)
 SHARED = {path.stem for path in EXAMPLES.rglob("*.py")}
 PRINTED = {  # what an example has to print, as patterns
     "01_generate": (

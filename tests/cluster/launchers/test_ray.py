@@ -91,7 +91,9 @@ def test_an_elastic_run_goes_on_without_some_of_its_clients(
     eventually(runs.nothing_is_left)
 
 
-@pytest.mark.parametrize("way", ["error", "SIGINT", "SIGTERM", "SIGKILL"])
+@pytest.mark.parametrize(
+    "way", ["error", pytest.param("SIGINT", marks=pytest.mark.faults), "SIGTERM", "SIGKILL"]
+)
 def test_nothing_is_left_on_any_node(way, runs, ray_cluster, eventually):
     fail_at = 5 if way == "error" else -1
     process = runs.start(
